@@ -1,0 +1,42 @@
+# Each target sets up .venv/ by itself, once, and again when the pins change. Python 3.11 or newer and make are all it needs.
+PYTHON ?= python3
+VENV := .venv
+PY := $(VENV)/bin/python
+READY := $(VENV)/.ready
+# There while pip works: an install that was cut off is made again from nothing.
+CUT_OFF := $(VENV)/.installing
+PIP := $(PY) -m pip --disable-pip-version-check --no-input install -qq -c constraints.txt
+
+.PHONY: demo test lint types FORCE
+.DELETE_ON_ERROR:
+
+demo: $(READY)
+	@$(PY) -m hdev_jax.demo --out out/demo
+
+test: $(READY)
+	@$(PY) -m pytest $(ARGS)
+
+lint: $(READY)
+	@$(PY) -m ruff check .
+	@$(PY) -m ruff format --check .
+
+types: $(READY)
+	@$(PY) -m pyright
+
+$(READY): pyproject.toml constraints.txt $(if $(wildcard $(PY)),,FORCE)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	    { echo "hdev needs Python 3.11 or newer: $$($(PYTHON) --version 2>&1 | head -n 1). Try: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@if [ -e $(CUT_OFF) ] || ! $(PY) -m pip --version >/dev/null 2>&1; then \
+	    echo "setting up $(VENV)/ with $$($(PYTHON) --version)"; \
+	    $(PYTHON) -m venv --clear $(VENV) || \
+	    { echo "hdev needs Python's venv module (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }; \
+	fi
+	@touch $(CUT_OFF)
+	@echo "installing $$(grep -c == constraints.txt) pinned packages into $(VENV)/ (a few minutes the first time)"
+	@$(PIP) hatchling editables
+	@$(PIP) --no-build-isolation -e '.[test,dev]'
+	@rm -f $(CUT_OFF)
+	@touch $@
+	@echo "$(VENV)/ is ready"
+
+FORCE:

@@ -1,0 +1,272 @@
+"""`hdev`: the verbs of the toolkit on a user's own logs. Each verb is the function of `hdev_jax.api` of that name.
+
+Results go to standard output, progress and errors to standard error. Exit status 0: done, also when nothing was found;
+2: the input is at fault, one line says what to do; 1: our fault; 130: interrupted.
+"""
+
+import argparse
+import io
+import os
+import shutil
+import sys
+import textwrap
+import traceback
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from hdev_jax import __version__
+from hdev_jax.errors import InputError
+
+__all__ = ["main", "parser"]
+
+TARGETS = ("energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n")
+
+_ABOUT = """\
+Give it a measured log of an electric vehicle and a sheet of what you know about
+the vehicle; it calibrates the sheet, finds what the model misses, names the
+cause, adds it, and shows the error before and after."""
+
+_EXAMPLES = """\
+to begin:
+  hdev check trips.csv                          what was read from the log, no fit
+  hdev check other.csv --skeleton > a.toml      a log with other column names: fill in a.toml ...
+  hdev check other.csv --adapter a.toml         ... and look again
+  hdev diagnose trips.csv --vehicle truck.toml --out result
+                                                then open result/report.html
+  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out new_predicted.csv
+
+`hdev VERB --help` explains a verb. HDEV_DEBUG=1 shows the traceback of an error."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status; argparse's own exits (`--help`, usage) raise SystemExit."""
+    arguments = vars(parser().parse_args(argv))
+    verb = arguments.pop("verb")
+    try:
+        _print(_run(verb, arguments))
+    except KeyboardInterrupt:
+        resumes = verb in ("diagnose", "calibrate")
+        return _fail("interrupted; the same command resumes" if resumes else "interrupted", 130)
+    except BrokenPipeError:  # `hdev effects | head`: the reader has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except InputError as e:
+        return _fail(str(e), 2)
+    except Exception as e:
+        what = " ".join(f"{type(e).__name__}: {e}".split())
+        return _fail(f"internal error: {textwrap.shorten(what, 300)} (HDEV_DEBUG=1 shows the traceback)", 1)
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line: one subparser a verb, whose options are the arguments of the function of that name."""
+    top = _Parser(prog="hdev", description=_ABOUT, epilog=_EXAMPLES)
+    top.add_argument("--version", action="version", version=f"hdev {__version__}")
+    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
+
+    check = verbs.add_parser(
+        "check",
+        help="what was read from the logs: columns, units, trips, kWh/km; no fit",
+        description="Read the logs and say what is in them: columns and units, trips, what was dropped, filled or "
+        "clipped and why, and the energy per km of each trip. Nothing is fitted and no file is written.",
+        epilog="examples:\n  hdev check trips.csv\n  hdev check day1.csv.gz day2.csv.gz --vehicle truck.toml\n"
+        "  hdev check other.mat --skeleton > adapter.toml",
+    )
+    _logs(check, vehicle_required=False)
+    check.add_argument(
+        "--skeleton", action="store_true", help="print an adapter for these files, to be filled in, and stop"
+    )
+
+    diagnose = verbs.add_parser(
+        "diagnose",
+        help="calibrate, find what the model misses, add it, show the error before and after",
+        description="Calibrate the vehicle on the training trips, trace what is left to effects that the sheet does "
+        "not declare, add those that hold, and report the error before and after on trips that no choice has seen.",
+        epilog="examples:\n  hdev diagnose trips.csv --vehicle truck.toml --out result\n"
+        "  hdev diagnose day*.csv --vehicle truck.toml --train-trips mon,tue --test-trips wed --out result\n\n"
+        "The folder gets report.html, diagnosis.json, figures/ and augmented_vehicle.toml, a sheet with the effects\n"
+        "in it. A run that was stopped goes on with the same command.",
+    )
+    _logs(diagnose)
+    _split(diagnose)
+    diagnose.add_argument(
+        "--effects", type=Path, metavar="FILE.py", help="effects of your own, searched besides the library's"
+    )
+    diagnose.add_argument("--only", type=_names, metavar="ID,ID", help="search these effects and no others")
+    diagnose.add_argument("--exclude", type=_names, metavar="ID,ID", help="leave these effects out of the search")
+    diagnose.add_argument(
+        "--fdr", type=_share, default=0.05, metavar="Q", help="accepted rate of false discoveries (default: 0.05)"
+    )
+    _out(diagnose)
+
+    calibrate = verbs.add_parser(
+        "calibrate",
+        help="the sheet's coefficients with their uncertainty, from the tabular values and the log",
+        description="Estimate the coefficients to which the sheet gives an sd, from their tabular values and the "
+        "training trips, with standard errors. No effect is added.",
+        epilog="example:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated",
+    )
+    _logs(calibrate)
+    _split(calibrate)
+    calibrate.add_argument(
+        "--method", choices=["map"], default="map", help="map: Levenberg-Marquardt with the priors (default: map)"
+    )
+    calibrate.add_argument(
+        "--noise",
+        choices=["normal", "student_t"],
+        default="normal",
+        help="student_t: outliers count less (default: normal)",
+    )
+    _out(calibrate)
+
+    predict = verbs.add_parser(
+        "predict",
+        help="what a vehicle sheet predicts for each row of a log, with an interval",
+        description="Predict the target for each row of the logs, which need not have measured it.",
+        epilog="example:\n  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out predicted.csv",
+    )
+    _logs(predict)
+    _target(predict)
+    predict.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the file to write (.csv, .csv.gz or .parquet): trip_id, time_s, predicted, lower, upper, level",
+    )
+    predict.add_argument(
+        "--level", type=_share, default=0.9, metavar="P", help="probability inside the interval (default: 0.9)"
+    )
+
+    verbs.add_parser(
+        "effects",
+        help="the library of effects: id, stage, equation, parameters and units, channels needed",
+        description="List the effects that a diagnosis searches and a vehicle sheet can declare.",
+    )
+    return top
+
+
+def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> None:
+    verb.add_argument(
+        "logs", nargs="+", type=Path, metavar="LOG", help="log files (.csv, .csv.gz, .parquet, .mat), read as one log"
+    )
+    verb.add_argument(
+        "--vehicle", type=Path, required=vehicle_required, metavar="V.toml", help="the vehicle sheet: what is known"
+    )
+    verb.add_argument(
+        "--adapter", type=Path, metavar="A.toml", help="how to read files whose columns have other names or units"
+    )
+
+
+def _target(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--target", choices=TARGETS, help="what to explain (default: what the log measures nearest the battery)"
+    )
+
+
+def _split(verb: argparse.ArgumentParser) -> None:
+    _target(verb)
+    verb.add_argument(
+        "--train-trips", type=_names, metavar="A,B", help="trips to learn from; alone: all others are the test"
+    )
+    verb.add_argument(
+        "--test-trips",
+        type=_names,
+        metavar="C,D",
+        help="trips to test on; alone: all others train; with neither, every third trip is the test",
+    )
+
+
+def _out(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
+    verb.add_argument("--seed", type=_count, default=0, metavar="N", help="of everything drawn at random (default: 0)")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(part.strip() for part in text.split(","))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"expected names with commas between them, found {text!r}")
+    return names
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, found {text!r}")
+    return value
+
+
+def _count(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 2^32 - 1, found {text!r}")
+    return int(text)
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with its errors on one line, no guessing of abbreviated options, and examples kept as typed."""
+
+    def __init__(self, **options: Any):
+        super().__init__(formatter_class=_Help, allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+class _Help(argparse.HelpFormatter):
+    """Text with line breaks of its own is kept as it is; a single line is wrapped."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return textwrap.indent(text, indent) if "\n" in text else super()._fill_text(text, width, indent)
+
+
+def _run(verb: str, arguments: dict[str, Any]) -> Any:
+    import jax
+
+    from hdev_jax import api, progress
+
+    jax.config.update("jax_enable_x64", True)
+    with progress.shown():
+        return getattr(api, verb)(**arguments)
+
+
+def _print(result: Any) -> None:
+    """The result's own text; a list of rows as a table."""
+    if result is None:
+        return
+    rows = isinstance(result, Sequence) and not isinstance(result, str) and all(isinstance(r, Mapping) for r in result)
+    sys.stdout.write((_table(result) if rows else str(result)).rstrip("\n") + "\n")
+    sys.stdout.flush()
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Columns under their names. Long cells wrap on a terminal; in a pipe a row stays one line."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in rows[0] if rows else ():
+        table.add_column(str(name), overflow="fold")
+    for row in rows:
+        cells = (", ".join(map(str, c)) if isinstance(c, list | tuple) else str(c) for c in row.values())
+        table.add_row(*map(Text, cells))
+    terminal = sys.stdout.isatty()
+    text = io.StringIO()
+    width = shutil.get_terminal_size().columns if terminal else 100_000
+    Console(file=text, width=width, force_terminal=terminal, highlight=False).print(table)
+    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+
+
+def _fail(message: str, status: int) -> int:
+    if os.environ.get("HDEV_DEBUG", "") not in ("", "0"):
+        traceback.print_exc()
+    print("hdev:", " ".join(message.split()), file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

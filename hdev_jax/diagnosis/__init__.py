@@ -1,0 +1,3 @@
+"""The loop: residual, candidates, evidence, selection, and what is left."""
+
+__all__: list[str] = []

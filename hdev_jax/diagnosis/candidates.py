@@ -1,0 +1,206 @@
+"""Candidates: what each effect that the vehicle lacks would add to every row, without refitting anything."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdev_jax.inference import insert
+from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unavailable
+from hdev_jax.physics.vehicle import Target
+from hdev_jax.segments import Segments
+
+__all__ = ["Candidate", "Column", "columns", "realised"]
+
+FIXED = ("shape", "choice")  # what has no column of its own
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to have an effect: which of its sizes, at which shapes. `columns` are its places in the matrix.
+
+    `kind` "size": the column is the derivative in the size, its coefficient is the size. "limit": the column is the
+    difference that the switch at `shapes` makes, its coefficient should be near 1.
+    """
+
+    effect: type[Effect]
+    sizes: tuple[str, ...]
+    groups: tuple[int | None, ...]
+    shapes: tuple[tuple[str, float], ...]
+    kind: str
+    columns: tuple[int, ...]
+
+    @property
+    def id(self) -> str:
+        """Id of the effect."""
+        return self.effect.id
+
+    @property
+    def freedoms(self) -> int:
+        """How many numbers it fits, those chosen on a grid included."""
+        chosen = sum(len(p.grid) > 1 for p in self.effect.parameters if p.kind in FIXED and _matters(p, self.sizes))
+        return len(self.columns) + chosen
+
+    def parameter(self, name: str) -> Parameter:
+        """The effect's parameter of that name."""
+        return next(p for p in self.effect.parameters if p.name == name)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column to compute: an effect's size (and group) at given shapes, or the difference a limit makes."""
+
+    effect_id: str
+    name: str
+    group: int | None
+    shapes: tuple[tuple[str, float], ...]
+    kind: str
+
+
+def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
+    """Whether a shape acts on these sizes; hvac's two thresholds belong to one size each."""
+    owner = {"heat_c": "below_w_per_k", "cool_c": "above_w_per_k"}.get(shape.name)
+    return owner is None or owner in sizes
+
+
+def _grid(p: Parameter, segments: Segments, row_s: float) -> tuple[float, ...]:
+    if p.name == "at_trip":
+        trips = np.unique(np.asarray(segments.trip))
+        return tuple(float(t) for t in trips[2:-1]) if len(trips) >= 6 else ()
+    return tuple(g * row_s if p.in_rows else g for g in p.grid)
+
+
+def _of_effect(effect: type[Effect], segments: Segments, row_s: float) -> Iterable[tuple[Any, ...]]:
+    """`(sizes, groups, shapes, kind)` for each way to have the effect."""
+    by_name = {p.name: p for p in effect.parameters}
+    sizes = tuple(p.name for p in effect.parameters if p.kind not in FIXED)
+    for variant in effect.variants or (sizes,):
+        shapes = [p for p in effect.parameters if p.kind in FIXED and _matters(p, variant)]
+        grids = [[(p.name, g) for g in _grid(p, segments, row_s)] for p in shapes]
+        for at in product(*grids):
+            first = by_name[variant[0]]
+            if first.kind == "limit":
+                for g in _grid(first, segments, row_s):
+                    yield variant, (None,), (*at, (first.name, g)), "limit"
+            elif first.by == "gear":
+                gear = np.asarray(segments.channels["gear"]).astype(int)
+                seen = [int(k) for k, n in zip(*np.unique(gear, return_counts=True), strict=True) if n > 0.02 * len(gear)]
+                if len(seen) > 1:  # one gear is the reference: the overall efficiency is declared already
+                    most = max(seen, key=lambda k: int(np.sum(gear == k)))
+                    groups = tuple(k for k in seen if k != most)
+                    yield variant * len(groups), groups, at, "size"
+            else:
+                yield variant, (None,) * len(variant), at, "size"
+
+
+def _row_level(effect: Effect) -> bool:
+    return not any(effect.overrides(h) for h in ("across", "observe", "derive"))
+
+
+def columns(
+    vehicle: Vehicle, effects: Sequence[type[Effect]], segments: Segments, rows: int, target: Target
+) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
+    """Every candidate's columns on the first `rows` rows of padded segments.
+
+    Effects of one row share one vehicle with all of them at their null value, so that one compiled `jvp` serves all;
+    what acts across rows has a vehicle of its own.
+
+    **Returns:** candidates, their columns in the target's unit, and why the other effects were left out.
+    """
+    left_out: dict[str, str] = {}
+    usable = []
+    for c in effects:
+        if vehicle.has(c.id):
+            continue
+        if why := unavailable(c, segments, vehicle.entry):
+            left_out[c.id] = why
+        else:
+            usable.append(c)
+    row_s = float(np.median(np.asarray(segments.duration_s)[:rows]))
+    gears = int(np.max(np.asarray(segments.channels["gear"]))) if segments.has("gear") else 1
+    nulls = {c.id: at_null(c, gears=gears) for c in usable}
+    shared = [e for e in nulls.values() if _row_level(e)]
+    groups = ([shared] if shared else []) + [[e] for e in nulls.values() if not _row_level(e)]
+
+    found: list[Candidate] = []
+    data: list[np.ndarray] = []
+    place: dict[Column, int] = {}
+    segments = jax.tree.map(jnp.asarray, segments)
+    for group in groups:
+        car = vehicle.plus(*group)
+        structure, null = _structure(group)
+        base = None
+        for e in group:
+            for sizes, subs, shapes, kind in _of_effect(type(e), segments, row_s):
+                keys = [Column(e.id, s, g, shapes, kind) for s, g in zip(sizes, subs, strict=True)]
+                for key in keys:
+                    if key in place:
+                        continue
+                    values = null.copy()
+                    for name, v in shapes:
+                        values[_index(structure, e.id, name, None)] = v
+                    if kind == "limit":
+                        base = np.asarray(_predict(car, structure, target, segments, null)) if base is None else base
+                        column = np.asarray(_predict(car, structure, target, segments, values)) - base
+                    else:
+                        tangent = np.zeros_like(null)
+                        tangent[_index(structure, e.id, key.name, key.group)] = 1.0
+                        column = np.asarray(_slope(car, structure, target, segments, values, tangent))
+                    place[key] = len(data)
+                    data.append(np.nan_to_num(column[:rows], posinf=0.0, neginf=0.0))
+                found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
+    matrix = np.stack(data, axis=1) if data else np.zeros((rows, 0))
+    return found, matrix, left_out
+
+
+def _structure(effects: Sequence[Effect]) -> tuple[tuple[Any, ...], np.ndarray]:
+    structure, null = [], []
+    for e in effects:
+        for p in e.parameters:
+            leaf = getattr(e, p.name)
+            count = len(leaf.values) if isinstance(leaf, Grouped) else None
+            for g in range(count) if count is not None else (None,):
+                structure.append((f"effects.{e.id}.{p.name}", g, -np.inf, np.inf))
+                null.append(p.null)
+    return tuple(structure), np.array(null)
+
+
+def _index(structure: Sequence[Any], effect_id: str, name: str, group: int | None) -> int:
+    return next(i for i, s in enumerate(structure) if s[0] == f"effects.{effect_id}.{name}" and s[1] in (group, None))
+
+
+@eqx.filter_jit
+def _predict(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Array) -> Array:
+    return insert(car, structure, jnp.asarray(values)).predict(segments, target)
+
+
+@eqx.filter_jit
+def _slope(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Array, tangent: Array) -> Array:
+    def predict(x: Array) -> Array:
+        return insert(car, structure, x).predict(segments, target)
+
+    return jax.jvp(predict, (jnp.asarray(values),), (jnp.asarray(tangent),))[1]
+
+
+def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int = 1) -> Effect:
+    """The effect with these coefficients as its sizes and the candidate's shapes: where a joint refit starts."""
+    effect = at_null(candidate.effect, gears=gears)
+    values: dict[str, Any] = {p.name: getattr(effect, p.name) for p in effect.parameters}
+    values.update({name: np.asarray(v, dtype=float) for name, v in candidate.shapes})
+    for p in candidate.effect.parameters:
+        if p.kind == "limit" and p.name not in candidate.sizes:
+            values[p.name] = None  # not part of it: the effect skips what it costs
+    if candidate.kind == "size":
+        for name, group, b in zip(candidate.sizes, candidate.groups, beta, strict=True):
+            if group is None:
+                values[name] = np.asarray(float(b))
+            else:
+                old = values[name]
+                values[name] = Grouped(np.r_[old.values[:group], float(b), old.values[group + 1 :]], old.by)
+    return candidate.effect(**values)

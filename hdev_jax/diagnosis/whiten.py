@@ -1,0 +1,157 @@
+"""The noise of a log: its colour, the level of each trip, the scale of each trip; and what makes it white."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hdev_jax.inference import Clusters
+from hdev_jax.segments import trip_slices
+
+__all__ = ["Noise", "estimate_noise", "whiten"]
+
+MAX_ORDER = 24
+LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Gaussian working model of the residual: AR(p) inside a trip, plus a level and a scale of each trip.
+
+    `coefficients[k]` predicts the row at position k of its trip from the k rows before it (the last line serves all
+    later rows), `scales[k]` is the standard deviation of that prediction's error. `level_sd` is the standard deviation
+    of the trips' levels; `trip_scale` multiplies `scales`, by trip in the order of the rows.
+    """
+
+    coefficients: Float[np.ndarray, "position lag"]
+    scales: Float[np.ndarray, " position"]
+    level_sd: float
+    trip_scale: Float[np.ndarray, " trip"]
+    log_likelihood: float
+
+    @property
+    def order(self) -> int:
+        """Order of the autoregression."""
+        return self.coefficients.shape[1]
+
+
+def _levinson(acov: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Predictors of every order up to `order` and the sd of their errors (Levinson 1946, Durbin 1960)."""
+    phi = np.zeros((order + 1, order))
+    var = np.empty(order + 1)
+    var[0] = acov[0]
+    for k in range(1, order + 1):
+        prev = phi[k - 1, : k - 1]
+        reflection = (acov[k] - prev @ acov[k - 1 : 0 : -1]) / var[k - 1] if k > 1 else acov[1] / acov[0]
+        reflection = np.clip(reflection, -0.9999, 0.9999)
+        phi[k, : k - 1] = prev - reflection * prev[::-1]
+        phi[k, k - 1] = reflection
+        var[k] = var[k - 1] * (1 - reflection**2)
+    return phi, np.sqrt(np.maximum(var, 1e-300))
+
+
+def _positions(trip: np.ndarray) -> np.ndarray:
+    position = np.arange(len(trip))
+    for _, s in trip_slices(trip):
+        position[s] -= s.start
+    return position
+
+
+def estimate_noise(residual: Float[np.ndarray, " row"], trip: Int[np.ndarray, " row"], *, levels: bool) -> Noise:
+    """The colour of a residual, by trip: order by AIC up to 24, level of the trips by maximum likelihood.
+
+    `levels=False` where trips are too few to have levels of their own. Trips of a scale of their own (`trip_scale`)
+    are shrunk towards one common scale, as far as their number of rows allows.
+    """
+    slices = [s for _, s in trip_slices(trip)]
+    common = np.sqrt(np.mean(residual**2)) + 1e-300
+    longest = max(s.stop - s.start for s in slices)
+    order = int(max(1, min(MAX_ORDER, longest // 4)))
+    # Autocovariance about zero: each lag with the number of pairs it has, so that short trips are not biased to white
+    acov = np.zeros(order + 1)
+    pairs = np.zeros(order + 1)
+    size = 1 << int(np.ceil(np.log2(2 * longest)))
+    for s in slices:
+        x = residual[s] / common
+        spectrum = np.abs(np.fft.rfft(x, size)) ** 2
+        lags = min(order + 1, len(x))
+        acov[:lags] += np.fft.irfft(spectrum, size)[:lags]
+        pairs[:lags] += len(x) - np.arange(lags)
+    pairs = np.maximum(pairs, 1.0)
+    # divided by n, not by pairs, where there is plenty of either: that keeps the sequence positive definite
+    acov = acov / (pairs if longest < 50 * order else pairs[0])
+
+    best: tuple[float, Noise] | None = None
+    for share in LEVEL_SHARES if levels and len(slices) >= 4 else (0.0,):
+        rest = acov - share * acov[0]
+        if rest[0] <= 0:
+            continue
+        phi, sd = _levinson(rest, order)
+        aic = len(residual) * 2 * np.log(sd) + 2 * np.arange(order + 1)
+        keep = max(1, int(np.argmin(aic)))
+        noise = Noise(phi[: keep + 1, :keep], sd[: keep + 1] * common, float(np.sqrt(share)) * common, np.ones(1), 0.0)
+        loglik = _log_likelihood(noise, residual, trip, slices) - keep
+        if best is None or loglik > best[0] + (2.0 if share > 0 and best[1].level_sd == 0 else 0.0):
+            best = (loglik, noise)
+    assert best is not None
+    noise = best[1]
+    # scale by trip from what is white, shrunk by the number of rows: 50 rows are worth as much as the common scale
+    white = np.asarray(_filter(residual[:, None], noise.coefficients, noise.scales, _positions(trip)))[:, 0]
+    rows = np.array([s.stop - s.start for s in slices])
+    own = np.array([np.mean(white[s] ** 2) for s in slices])
+    pooled = float(np.mean(white**2))
+    scale = np.sqrt((rows * own + 50.0 * pooled) / (rows + 50.0))
+    return Noise(noise.coefficients, noise.scales, noise.level_sd, np.maximum(scale, 1e-6), best[0])
+
+
+def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices: list[slice]) -> float:
+    """Gaussian log-likelihood with the levels integrated out."""
+    position = np.minimum(_positions(trip), noise.order)
+    both = np.asarray(_filter(np.c_[residual, np.ones_like(residual)], noise.coefficients, noise.scales, position))
+    z, u = both[:, 0], both[:, 1]
+    total = -np.sum(np.log(noise.scales[position])) - 0.5 * np.sum(z**2)
+    for s in slices:
+        uu, uz = float(u[s] @ u[s]), float(u[s] @ z[s])
+        g = noise.level_sd**2
+        total += -0.5 * np.log1p(g * uu) + 0.5 * g * uz**2 / (1 + g * uu)
+    return float(total)
+
+
+@jax.jit
+def _filter(columns: Array, coefficients: Array, scales: Array, position: Array) -> Array:
+    order = coefficients.shape[1]
+    at = jnp.minimum(position, order)
+    phi = coefficients[at]
+    out = columns
+    for k in range(order):
+        back = jnp.concatenate([jnp.zeros_like(columns[: k + 1]), columns[: -(k + 1)]])
+        # rows too early in their trip have a zero coefficient here, so nothing leaks from the trip before
+        out = out - phi[:, k : k + 1] * back
+    return out / scales[at][:, None]
+
+
+def whiten(
+    columns: Float[np.ndarray, "row k"], noise: Noise, trip: Int[np.ndarray, " row"], clusters: Clusters
+) -> Float[np.ndarray, "row k"]:
+    """Columns as the noise's own units see them: independent rows of variance 1.
+
+    The level of each trip is taken out as far as its variance asks (a random intercept: all of it where levels are
+    large against the rest, nothing where there are none).
+    """
+    position = _positions(trip)
+    n, k = columns.shape
+    pad = (-k) % 16  # a few widths only, so that the filter is compiled a few times
+    wide = np.concatenate([columns, np.ones((n, 1)), np.zeros((n, (pad - 1) % 16))], axis=1)
+    white = np.asarray(_filter(wide, noise.coefficients, noise.scales, position))
+    out, u = white[:, :k].copy(), white[:, k]
+    for t, (_, s) in enumerate(trip_slices(trip)):
+        scale = noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
+        out[s] /= scale
+        if noise.level_sd > 0:
+            v = u[s] / scale
+            vv = float(v @ v)
+            shrink = 1.0 - 1.0 / np.sqrt(1.0 + noise.level_sd**2 * vv)
+            out[s] -= (shrink / vv) * np.outer(v, v @ out[s])
+    return out

@@ -1,0 +1,10 @@
+"""The one exception for whatever the user can put right: `hdev` prints it as one line and exits with status 2."""
+
+__all__ = ["InputError"]
+
+
+class InputError(Exception):
+    """The input is at fault. The message is one line: which file, row, column; what was expected; what to do."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(str(message).split()))

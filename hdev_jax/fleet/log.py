@@ -1,0 +1,322 @@
+"""Synthetic logs with known truth: a seeded fleet of one heavy truck, what it measured, and what it hides.
+
+Every log is labelled synthetic: in its sheet's name, its vehicle's name and `frame.attrs`. Randomness is split by
+purpose (route, weather, vehicle, cycles, noise), so that the same seed drives the same roads whatever is planted.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hdev_jax.fleet.driving import FINAL_DRIVE, GEAR_RATIOS, WHEEL_RADIUS_M, Drive, drive_trips, smooth_noise
+from hdev_jax.fleet.truth import PLANTABLE, Truth, power_w, shaft_channels
+
+__all__ = ["ENTRIES", "NOISES", "SyntheticLog", "demo_log", "size_effect", "synthetic_log"]
+
+ENTRIES = ("road", "shaft", "wheel")
+NOISES = ("white", "ar1", "ar1_white", "trip_levels", "student_t", "trip_variance")
+_SD = {"c_rr": 0.0008, "cda_m2": 0.5, "motoring_efficiency": 0.05, "regenerating_efficiency": 0.05}  # contract, 2
+_NUISANCE = ("humidity_pct", "cloud_cover", "gps_hdop", "tyre_pressure_kpa_display")
+_VEHICLE = "synthetic-truck-34t"
+
+
+@dataclass(frozen=True)
+class SyntheticLog:
+    """A log as a customer would send it, and what only the generator knows.
+
+    `frame` has contract column names. `truth` has a row for each of its rows, in the target's unit: `noise_free`,
+    `baseline` (nothing planted), `noise`, and `effect:<id>`, each effect's own difference to the baseline. `ratio` is
+    the RMS of what is planted, after projecting off the baseline's Jacobian, over `noise_rms`.
+    """
+
+    frame: pd.DataFrame
+    truth: pd.DataFrame
+    sheet: str
+    vehicle: Truth
+    target: str
+    noise_rms: float
+    ratio: float
+    drive: Drive
+    entry: str
+
+    def write(self, folder: str | Path, stem: str = "synthetic_truck", *, truth: bool = True) -> dict[str, Path]:
+        """Write `<stem>.csv`, `<stem>.toml` and, in a folder of its own, the truth. **Returns** paths by name."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = {"log": folder / f"{stem}.csv", "sheet": folder / f"{stem}.toml"}
+        self.frame.to_csv(paths["log"], index=False, float_format="%.7g", lineterminator="\n")
+        paths["sheet"].write_text(self.sheet, encoding="utf-8")
+        if truth:
+            paths["truth"] = folder / "truth" / f"{stem}_truth.csv"
+            paths["truth"].parent.mkdir(exist_ok=True)
+            self.truth.to_csv(paths["truth"], index=False, float_format="%.9g", lineterminator="\n")
+        return paths
+
+
+def _target(drive: Drive, truth: Truth, entry: str, effects: Mapping | None = None) -> np.ndarray:
+    """The noise-free target: energy [Wh] of segments, power [kW] of samples."""
+    power = power_w(drive, truth, entry, effects)
+    return power * drive.columns["duration_s"] / 3600 if drive.mode == "segments" else power / 1e3
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def _jacobian(drive: Drive, truth: Truth, entry: str) -> np.ndarray:
+    """Columns of the coefficients that the sheet leaves open, by central differences of the baseline, scaled to 1."""
+    names = ("c_rr", "cda_m2") if entry == "road" else ("motoring_efficiency", "regenerating_efficiency")
+    columns = []
+    for name in names:
+        value = getattr(truth, name)
+        up, down = (_target(drive, replace(truth, **{name: value * f}), entry, {}) for f in (1.0001, 0.9999))
+        columns.append((up - down) / _rms(up - down))
+    return np.stack(columns, axis=1)
+
+
+def _beyond(jacobian: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """What is left of a column after projecting off the Jacobian."""
+    return column - jacobian @ np.linalg.lstsq(jacobian, column, rcond=None)[0]
+
+
+def _scaled(truth: Truth, effect: str, parameters: Mapping[str, float], factor: float, entry: str) -> dict[str, float]:
+    """The effect's parameters with its size at `factor` times its distance from the null."""
+    plant, scaled = PLANTABLE[effect], dict(parameters)
+    for name in plant.size:
+        if name not in scaled:
+            continue
+        if np.isinf(plant.null):
+            scaled[name] = scaled[name] / factor
+        elif effect == "mode_change":  # a second value; its null is the first one
+            first = getattr(truth, "efficiency" if entry == "road" and name.endswith("efficiency") else name)
+            scaled[name] = first + factor * (scaled[name] - first)
+        else:
+            scaled[name] = scaled[name] * factor
+    return scaled
+
+
+def size_effect(
+    drive: Drive, truth: Truth, effect: str, parameters: Mapping[str, float], *, rms: float, entry: str = "road"
+) -> dict[str, float]:
+    """Parameters at which the effect's column, after projecting off the baseline's Jacobian, has this RMS.
+
+    **Arguments:** `rms` in the target's unit; `parameters` give the direction (signs, time constants) of the search.
+    **Raises:** `ValueError` where no size within a factor of 300 reaches it, or the energy jumps over it
+    (`regen_cutoff`): match the noise to the effect instead.
+    """
+    jacobian, base = _jacobian(drive, truth, entry), _target(drive, truth, entry, {})
+
+    def reached(log_factor: float) -> float:
+        fx = {effect: _scaled(truth, effect, parameters, float(np.exp(log_factor)), entry)}
+        return _rms(_beyond(jacobian, _target(drive, truth, entry, fx) - base))
+
+    low, high = -np.log(300.0), np.log(300.0)
+    grid = np.linspace(low, high, 60)
+    values = np.array([reached(x) for x in grid])
+    above = np.flatnonzero(values >= rms)
+    if not len(above) or above[0] == 0:
+        raise ValueError(
+            f"{effect}: RMS {rms:.4g} beyond the baseline is out of reach ({values.min():.4g} to {values.max():.4g}); "
+            "choose other starting parameters, or match the noise to the effect with adjust='noise'"
+        )
+    low, high = grid[above[0] - 1], grid[above[0]]
+    for _ in range(45):
+        mid = 0.5 * (low + high)
+        low, high = (mid, high) if reached(mid) < rms else (low, mid)
+    if abs(reached(high) / rms - 1) > 1e-6:
+        raise ValueError(f"{effect}: its energy jumps over RMS {rms:.4g}; match the noise with adjust='noise'")
+    return _scaled(truth, effect, parameters, float(np.exp(high)), entry)
+
+
+def _ar1(innovations: np.ndarray, coefficient: float) -> np.ndarray:
+    """Stationary AR(1) along the last axis from unit-variance innovations."""
+    noise = np.empty_like(innovations)
+    noise[:, 0] = innovations[:, 0]
+    for k in range(1, innovations.shape[1]):
+        noise[:, k] = coefficient * noise[:, k - 1] + np.sqrt(1 - coefficient**2) * innovations[:, k]
+    return noise
+
+
+def _noise(rng: np.random.Generator, rows: np.ndarray, kind: str, coefficient: float) -> np.ndarray:
+    """Noise of RMS 1 over the log. `ar1_white`: a fifth of the variance is white; `trip_levels`: half of it is a level
+    by trip; `student_t`: innovations with four degrees of freedom; `trip_variance`: sizes log-normal by trip."""
+    trips, n = len(rows), int(rows.max())
+    white = rng.standard_normal((trips, n))
+    tails = rng.standard_t(4, (trips, n)) / np.sqrt(2.0)
+    other = rng.standard_normal((trips, n))
+    levels, sizes = rng.standard_normal((trips, 1)), np.exp(0.6 * rng.standard_normal((trips, 1)))
+    noise = {
+        "white": lambda: white,
+        "ar1": lambda: _ar1(white, coefficient),
+        "ar1_white": lambda: np.sqrt(0.8) * _ar1(white, coefficient) + np.sqrt(0.2) * other,
+        "trip_levels": lambda: np.sqrt(0.5) * (_ar1(white, coefficient) + levels),
+        "student_t": lambda: _ar1(tails, coefficient),
+        "trip_variance": lambda: sizes * _ar1(white, coefficient),
+    }[kind]()
+    flat = noise[np.arange(n)[None, :] < rows[:, None]]
+    return flat / _rms(flat)
+
+
+def _instruments(drive: Drive, truth: Truth, rng: np.random.Generator) -> None:
+    """Add channels that follow from driving with nothing planted: shaft and wheel, brake, battery."""
+    c = drive.columns
+    c |= shaft_channels(drive, truth)
+    retard = np.maximum(-c["traction_force_n"] / c["mass_kg"] - 0.25, 0.0) * (c["distance_m"] > 0)
+    c["brake_pressure_pa"] = np.where(c["distance_m"] > 0, 2.0e5 * retard, 1.5e5)  # held at standstill
+    power = power_w(drive, truth, "road", {})
+    soc, open_v, warm = np.zeros_like(power), np.zeros_like(power), np.zeros_like(power)
+    for i in range(int(c["trip"][-1]) + 1):
+        rows = c["trip"] == i
+        used = np.cumsum(power[rows] * c["duration_s"][rows]) / 3600
+        soc[rows] = np.clip(rng.uniform(0.55, 0.95) - used / 450e3, 0.02, 1.0)  # 450 kWh
+        slow = 1 - np.exp(-c["time_s"][rows] / 2500)
+        warm[rows] = c["ambient_temp_c"][rows] * 0.5 + 10 + (6 + rng.uniform(0, 4)) * slow
+        warm[rows] += 0.2 * smooth_noise(rng, int(rows.sum()), 20.0)
+    open_v = 600 + 90 * soc
+    c["soc"], c["battery_temp_c"] = soc, warm
+    c["voltage_v"] = open_v - 0.03 * power / open_v  # the pack's own sag, already in what is measured
+
+
+_CHANNELS = (
+    "mass_kg", "grade_rad", "altitude_m", "ambient_temp_c", "air_density_kgpm3", "wind_speed_mps", "wind_from_rad",
+    "heading_rad", "curvature_1pm", "wet_road", "gear", "brake_pressure_pa", "soc", "voltage_v", "battery_temp_c",
+    "door_open", "standstill_flag", *_NUISANCE,
+)  # fmt: skip
+_KINEMATICS = {
+    "segments": ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps"),
+    "samples": ("time_s", "speed_mps"),
+}
+_SHAFT = {"road": (), "shaft": ("motor_torque_nm", "motor_speed_radps"), "wheel": ("traction_force_n",)}
+
+
+def _sheet(entry: str) -> str:
+    """The vehicle sheet that goes with the log: the tabular values, nothing of what is planted."""
+    head = 'name = "articulated truck, 34 t (synthetic)"\nmass_kg = 29000.0\n'
+    if entry != "road":
+        return head + (
+            "[machine]\nmotoring_efficiency     = { value = 0.93, sd = 0.05 }\n"
+            "regenerating_efficiency = { value = 0.93, sd = 0.05 }\n[battery]\nauxiliary_w = 0.0\n"
+        )
+    return head + (
+        "[road]\nc_rr   = { value = 0.0060, sd = 0.0008 }\ncda_m2 = { value = 5.6, sd = 0.5 }\n"
+        f"[driveline]\nefficiency = 0.91\ngear_ratios = {list(GEAR_RATIOS)}\nfinal_drive = {FINAL_DRIVE}\n"
+        f"wheel_radius_m = {WHEEL_RADIUS_M}\n[battery]\nauxiliary_w = 0.0\n"
+    )
+
+
+def _check(entry: str, mode: str, noise: str, adjust: str, trips: int, rows: int, effects: Mapping) -> None:
+    for name, value, allowed in (
+        ("entry", entry, ENTRIES),
+        ("mode", mode, tuple(_KINEMATICS)),
+        ("noise", noise, NOISES),
+        ("adjust", adjust, ("auto", "effect", "noise")),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name}: expected one of {', '.join(allowed)}; got {value!r}")
+    if trips < 1 or rows < 60:
+        raise ValueError(f"expected at least 1 trip of 60 rows; got {trips} of {rows}")
+    for effect, parameters in effects.items():
+        if effect not in PLANTABLE:
+            raise ValueError(f"{effect!r} cannot be planted; known: {', '.join(PLANTABLE)}")
+        plant = PLANTABLE[effect]
+        if entry not in plant.entries or mode not in plant.modes:
+            raise ValueError(f"{effect} needs entry {'|'.join(plant.entries)} and mode {'|'.join(plant.modes)}")
+        known = {*plant.parameters, *plant.size}
+        if unknown := set(parameters) - known:
+            raise ValueError(f"{effect}: unknown {', '.join(sorted(unknown))}; known: {', '.join(sorted(known))}")
+
+
+def synthetic_log(
+    *,
+    seed: int,
+    trips: int = 24,
+    rows_per_trip: int | None = None,
+    effects: Mapping[str, Mapping[str, float | int]] | None = None,
+    ratio: float | int | None = None,
+    adjust: str = "auto",
+    noise: str = "ar1",
+    noise_level: float | int = 0.04,
+    noise_rms: float | int | None = None,
+    ar_coefficient: float | int = 0.9,
+    entry: str = "road",
+    mode: str = "segments",
+    sample_s: float | int = 1.0,
+) -> SyntheticLog:
+    """A synthetic log of one truck.
+
+    **Arguments:**
+
+    - `trips`, `rows_per_trip`: trips vary in length by ±30 %; the log has trips·rows_per_trip rows exactly (250 of
+      segments, 1200 of samples by default).
+    - `effects`: id → parameters. `{}` plants the default size; time constants and the like left out have defaults
+      (a step comes after 42 % of the trips).
+    - `ratio`: RMS of what is planted, after projecting off the baseline's Jacobian, over that of the noise.
+      `adjust="effect"` sizes each effect to it, `"noise"` keeps the effects and sizes the noise, `"auto"` takes what
+      `PLANTABLE[id].match` says.
+    - `noise`, `ar_coefficient`: colour (`NOISES`), and lag-1 correlation from row to row. `noise_level` is relative to
+      the RMS of the baseline's target; `noise_rms` is absolute (Wh a row, or kW) and wins.
+    - `entry`: road (slope and speed), shaft (torque and motor speed measured) or wheel (traction force measured).
+    - `mode`: segments (target `energy_wh`) or samples every `sample_s` (target `battery_power_kw`).
+
+    **Raises:** `ValueError` for what cannot be planted or sized.
+    """
+    wanted = {k: {n: float(x) for n, x in v.items()} for k, v in (effects or {}).items()}
+    rows_per_trip = rows_per_trip or (250 if mode == "segments" else 1200)
+    _check(entry, mode, noise, adjust, trips, rows_per_trip, wanted)
+    for effect, parameters in wanted.items():  # no size given: the default one; time constants and the like always
+        plant = PLANTABLE[effect]
+        sized = any(name in parameters for name in plant.size)
+        defaults = {k: plant.null if sized and k in plant.size else v for k, v in plant.parameters.items()}
+        if effect == "mode_change" and sized:  # a second value has no null of its own
+            defaults = {"share": defaults["share"]}
+        if effect == "step_change":
+            defaults["trip"] = float(int(0.42 * trips))
+        wanted[effect] = {**defaults, **parameters}
+    if adjust == "auto":
+        adjust = "noise" if any(PLANTABLE[k].match == "noise" for k in wanted) else "effect"
+    route, weather, vehicle, cycles, noises = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5))
+
+    lengths = np.floor(rows_per_trip * route.uniform(0.7, 1.3, trips)).astype(int)
+    lengths += np.diff(np.linspace(0, trips * rows_per_trip - lengths.sum(), trips + 1).round()).astype(int)
+    drive = drive_trips(route, weather, rows=lengths, mode=mode, sample_s=float(sample_s))
+    draws = {k: getattr(Truth(), k) + sd * np.clip(vehicle.normal(), -1.5, 1.5) for k, sd in _SD.items()}
+    draws = {k: float(min(v, 0.97) if k.endswith("efficiency") else v) for k, v in draws.items()}
+    truth = replace(Truth(), **draws, phase=tuple(cycles.random(trips).tolist()), lottery=_lottery(cycles, trips))
+    _instruments(drive, truth, vehicle)
+
+    baseline = _target(drive, truth, entry, {})
+    rms = noise_rms if noise_rms is not None else noise_level * _rms(baseline)
+    if wanted and ratio is not None and adjust == "effect":
+        wanted = {k: size_effect(drive, truth, k, p, rms=ratio * rms, entry=entry) for k, p in wanted.items()}
+    truth = replace(truth, effects=wanted)
+    clean = _target(drive, truth, entry)
+    beyond = _rms(_beyond(_jacobian(drive, truth, entry), clean - baseline))
+    if wanted and not beyond > 0:
+        raise ValueError(f"{', '.join(wanted)} changes nothing in this log: other parameters, or more rows")
+    if wanted and ratio is not None and adjust == "noise":
+        rms = beyond / ratio
+    error = rms * _noise(noises, lengths, noise, ar_coefficient)
+
+    target = "energy_wh" if mode == "segments" else "battery_power_kw"
+    c = drive.columns
+    trip = np.array([f"T{i + 1:02d}" for i in range(trips)])[c["trip"]]
+    names = (*_KINEMATICS[mode], *_CHANNELS, *_SHAFT[entry])
+    frame = pd.DataFrame({"vehicle_id": _VEHICLE, "trip_id": trip, **{k: c[k] for k in names}, target: clean + error})
+    frame.attrs = {"synthetic": True, "seed": seed, "target": target}
+    hidden = {"trip_id": trip, "time_s": c["time_s"], "noise_free": clean, "baseline": baseline, "noise": error}
+    hidden |= {f"effect:{k}": _target(drive, truth, entry, {k: p}) - baseline for k, p in wanted.items()}
+    return SyntheticLog(frame, pd.DataFrame(hidden), _sheet(entry), truth, target, rms, beyond / rms if rms else np.inf,
+                        drive, entry)  # fmt: skip
+
+
+def _lottery(rng: np.random.Generator, trips: int) -> tuple[float, ...]:
+    """An even spread of (0, 1) over the trips in random order: a share of trips is that share, not a draw of it."""
+    return tuple(rng.permutation((np.arange(trips) + 0.5) / trips).tolist())
+
+
+def demo_log(seed: int = 7, *, trips: int = 14) -> SyntheticLog:
+    """The demo's log: a 34 t truck in real wind, with measured wind channels and a sheet that does not declare it."""
+    return synthetic_log(seed=seed, trips=trips, effects={"headwind": {"scale": 0.98}}, noise_level=0.02)

@@ -1,0 +1,245 @@
+"""Calibration: Levenberg-Marquardt on the kernel with tabular priors, errors clustered by trip."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from hdev_jax.inference.clusters import Clusters
+from hdev_jax.inference.parameters import ParameterTable, insert
+from hdev_jax.physics import Vehicle
+from hdev_jax.physics.vehicle import Target
+from hdev_jax.segments import Segments
+
+__all__ = ["Calibration", "Fit", "calibrate", "jacobian", "padded"]
+
+STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
+WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
+
+
+class Fit(eqx.Module):
+    """The rows of one problem, padded to a shape that others share. Rows past the log have weight 0."""
+
+    segments: Segments
+    measured: Float[Array, " row"]
+    weight: Float[Array, " row"]
+    rows: int = eqx.field(static=False)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a fit came to. `values`, `sd` and `covariance` follow `table.free`; `message` is the solver's own word."""
+
+    vehicle: Vehicle
+    table: ParameterTable
+    values: Float[np.ndarray, " free"]
+    sd: Float[np.ndarray, " free"]
+    covariance: Float[np.ndarray, "free free"]
+    predicted: Float[np.ndarray, " row"]
+    sigma: float
+    inflation: float
+    converged: bool
+    message: str
+    steps: int
+
+    def prior_z(self) -> Float[np.ndarray, " free"]:
+        """How far each coefficient moved from its table, in its tabular sd; NaN without one."""
+        prior = np.array([c.value for c in self.table.free])
+        sd = np.array([np.nan if c.sd is None else c.sd for c in self.table.free], dtype=float)
+        return (self.values - prior) / sd
+
+
+def padded(segments: Segments, measured: np.ndarray) -> Fit:
+    """Rows padded to the next of eight shapes per octave, so that logs of like length share one compilation."""
+    n = len(segments)
+    quantum = max(64, 2 ** max(int(np.ceil(np.log2(max(n, 1)))) - 3, 0))
+    size = int(np.ceil(n / quantum) * quantum)
+    extra = size - n
+
+    def pad(x: Any, fill: float | None = None) -> np.ndarray:
+        x = np.asarray(x)
+        return np.concatenate([x, np.full(extra, x[-1] if fill is None else fill, dtype=x.dtype)]) if extra else x
+
+    out = jax.tree.map(pad, segments)
+    # a trip of its own, standing still: finite everywhere, and no neighbour of a real row
+    out = eqx.tree_at(
+        lambda s: (s.trip, s.distance_m),
+        out,
+        (pad(segments.trip, fill=int(np.max(np.asarray(segments.trip))) + 1), pad(segments.distance_m, fill=0.0)),
+    )
+    return Fit(out, pad(measured, fill=0.0), np.r_[np.ones(n), np.zeros(extra)], n)
+
+
+def _to_support(z: Array, start: Array, scale: Array, structure: Any) -> Array:
+    """From the solver's space to the coefficient's support; z = 0 is the start, slope `scale` there."""
+    out = []
+    for k, (_, _, lower, upper) in enumerate(structure):
+        x0, s = start[k], scale[k]
+        if np.isinf(lower) and np.isinf(upper):
+            out.append(x0 + s * z[k])
+        elif np.isinf(upper) or upper > 1e9:
+            out.append(lower + (x0 - lower) * jnp.exp(s * z[k] / (x0 - lower)))
+        else:
+            u = (x0 - lower) / (upper - lower)
+            logit = jnp.log(u) - jnp.log1p(-u)
+            out.append(lower + (upper - lower) * jax.nn.sigmoid(logit + s * z[k] / ((upper - lower) * u * (1 - u))))
+    return jnp.stack(out)
+
+
+@eqx.filter_jit
+def _solve(
+    vehicle: Vehicle, structure: Any, target: Target, fit: Fit, start: Array, scale: Array, prior: Array, prior_sd: Array
+) -> Any:
+    def residuals(z: Array, args: Any) -> Array:
+        vehicle, fit = args
+        theta = _to_support(z, start, scale, structure)
+        r = fit.weight * (insert(vehicle, structure, theta).predict(fit.segments, target) - fit.measured)
+        return jnp.concatenate([r, (theta - prior) / prior_sd])
+
+    solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9, linear_solver=lx.Normal(lx.Cholesky()))
+    z0 = jnp.zeros_like(start)
+    sol = optx.least_squares(residuals, solver, z0, args=(vehicle, fit), max_steps=100, throw=False)
+    theta = _to_support(sol.value, start, scale, structure)
+    predicted = insert(vehicle, structure, theta).predict(fit.segments, target)
+    return theta, predicted, sol.result, sol.stats["num_steps"]
+
+
+@eqx.filter_jit
+def _jacobian(vehicle: Vehicle, structure: Any, target: Target, segments: Segments, theta: Array) -> Array:
+    def predict(x: Array) -> Array:
+        return insert(vehicle, structure, x).predict(segments, target)
+
+    return jax.jacfwd(predict)(theta)
+
+
+def jacobian(
+    vehicle: Vehicle, table: ParameterTable, segments: Segments, target: Target
+) -> Float[np.ndarray, "row free"]:
+    """∂ predicted / ∂θ of the free coefficients at their present values."""
+    if not table.free:
+        return np.zeros((len(segments), 0))
+    return np.asarray(_jacobian(vehicle, table.structure, target, segments, jnp.asarray(table.values(vehicle))))
+
+
+def calibrate(
+    vehicle: Vehicle,
+    table: ParameterTable,
+    fit: Fit,
+    target: Target,
+    clusters: Clusters,
+    *,
+    noise: Literal["normal", "student_t"] = "normal",
+    weights: Float[np.ndarray, " row"] | None = None,
+) -> Calibration:
+    """Maximum a posteriori values of the table's free coefficients.
+
+    Errors inside a cluster are correlated, so rows are not independent evidence against a tabular prior: the
+    likelihood counts 1/`inflation` of each row, where `inflation` is the ratio of clustered to naive variance of the
+    estimates. Standard errors are clustered (sandwich, G/(G−1)).
+
+    **Arguments:** `fit` from `padded`; `clusters` of its real rows; `noise`: "student_t" reweights rows by a
+    t-distribution with 4 degrees of freedom, for logs with outliers; `weights` (real rows) multiply residuals.
+
+    **Returns:** a `Calibration`, whose `converged` and `message` its caller reads. Coefficients that are not free are
+    kept.
+    """
+    rows, free = fit.rows, table.free
+    base = np.ones(rows) if weights is None else np.asarray(weights, dtype=float)
+    measured = np.asarray(fit.measured)[:rows]
+    theta = table.values(vehicle)
+    if not free:
+        predicted = np.asarray(_predict(vehicle, fit.segments, target))[:rows]
+        sigma = float(np.sqrt(np.mean((base * (measured - predicted)) ** 2)))
+        none = np.zeros((0, 0))
+        return Calibration(vehicle, table, theta, theta, none, predicted, sigma, 1.0, True, "nothing to estimate", 0)
+
+    scale = np.array([c.scale for c in free])
+    prior = np.array([c.value for c in free])
+    prior_sd = np.array([c.sd if c.sd is not None else WEAK * c.scale for c in free])
+    theta = np.array([_inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
+    structure = table.structure
+
+    sigma, inflation, tail = 1.0, 1.0, np.ones(rows)
+    message, converged, steps = "", False, 0
+    predicted = np.zeros(rows)
+    covariance = np.zeros((len(free), len(free)))
+    for sweep in range(8 if noise == "student_t" else 3):
+        if sweep == 0:  # the first sweep only looks for σ: the prior weighs as against a perfect log
+            p = np.asarray(_predict(insert(vehicle, structure, jnp.asarray(theta)), fit.segments, target))[:rows]
+            sigma = float(np.sqrt(np.mean((base * (measured - p)) ** 2))) + 1e-12
+        row_weight = np.zeros(np.shape(fit.weight)[0])
+        row_weight[:rows] = base * np.sqrt(tail / inflation) / sigma
+        weighted = eqx.tree_at(lambda f: f.weight, fit, row_weight)
+        new, p, result, taken = _solve(
+            vehicle, structure, target, weighted, jnp.asarray(theta), scale, prior, prior_sd
+        )
+        if not (np.all(np.isfinite(new)) and np.all(np.isfinite(p))):
+            message, converged = "left the finite numbers; start nearer or give a prior", False
+            break
+        predicted, steps = np.asarray(p)[:rows], steps + int(taken)
+        converged = bool(result == optx.RESULTS.successful)
+        message = "converged" if converged else str(optx.RESULTS[result]).strip() or "did not converge"
+        change = np.max(np.abs(np.asarray(new) - theta) / scale)
+        theta = np.asarray(new)
+        r = base * (measured - predicted)
+        if noise == "student_t":
+            tail = (STUDENT_DF + 1.0) / (STUDENT_DF + (r / sigma) ** 2)
+            new_sigma = float(np.sqrt(np.mean(tail * r**2))) + 1e-12
+        else:
+            new_sigma = float(np.sqrt(np.mean(r**2))) + 1e-12
+        jac = np.asarray(_jacobian(vehicle, structure, target, fit.segments, jnp.asarray(theta)))[:rows]
+        w = np.sqrt(tail)[:, None] * base[:, None]
+        covariance, new_inflation = _clustered(w * jac, np.sqrt(tail) * r, new_sigma, prior_sd, clusters)
+        settled = abs(np.log(new_sigma / sigma)) < 1e-3 and abs(np.log(new_inflation / inflation)) < 0.1
+        sigma, inflation = new_sigma, new_inflation
+        if settled and change < 1e-4 and sweep > 0:
+            break
+
+    fitted = table.insert(vehicle, jnp.asarray(theta))
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Calibration(
+        fitted, table, theta, sd, covariance, predicted, sigma, inflation, converged, message, steps
+    )
+
+
+def _inside(x: float, lower: float, upper: float) -> float:
+    """A start inside the support, off its edges, where the solver's transform has no slope."""
+    if np.isinf(lower) and np.isinf(upper):
+        return x
+    if np.isinf(upper) or upper > 1e9:
+        return max(x, lower + 1e-6 * max(1.0, abs(lower)))
+    edge = 1e-3 * (upper - lower)
+    return float(np.clip(x, lower + edge, upper - edge))
+
+
+def _clustered(
+    jac: np.ndarray, r: np.ndarray, sigma: float, prior_sd: np.ndarray, clusters: Clusters
+) -> tuple[np.ndarray, float]:
+    """Covariance with errors clustered, and how much wider it is than the naive one (at least 1)."""
+    g = clusters.count
+    scores = clusters.sums(jac * r[:, None])
+    information = jac.T @ jac
+    precision0 = np.diag(1.0 / prior_sd**2)
+    # conditioning: work in units of the naive standard errors
+    d = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    bread = np.linalg.pinv(information / np.outer(d, d), rcond=1e-12)
+    meat = scores.T @ scores / np.outer(d, d) * (g / max(g - 1, 1))
+    robust = bread @ meat @ bread
+    naive = sigma**2 * bread
+    inflation = max(1.0, float(np.mean(np.diag(robust) / np.maximum(np.diag(naive), 1e-300))))
+    a = information / (sigma**2 * inflation) + precision0
+    b = (scores.T @ scores) * (g / max(g - 1, 1)) / (sigma**2 * inflation) ** 2 + precision0
+    s = 1.0 / np.sqrt(np.diag(a))
+    inverse = np.linalg.pinv(a * np.outer(s, s), rcond=1e-13) * np.outer(s, s)
+    return inverse @ b @ inverse, inflation
+
+
+@eqx.filter_jit
+def _predict(vehicle: Vehicle, segments: Segments, target: Target) -> Array:
+    return vehicle.predict(segments, target)

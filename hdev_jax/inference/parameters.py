@@ -1,0 +1,151 @@
+"""One table of parameters (path, unit, prior, support, free): it drives every estimator and the report."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdev_jax.physics import Effect, Grouped, Vehicle
+
+__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert"]
+
+_DECLARED = {  # path in the sheet → (effect that holds it, its field)
+    "road.c_rr": ("rolling", "c_rr"),
+    "road.cda_m2": ("aero", "cda_m2"),
+    "road.rotating_mass_factor": ("inertia", "rotating_mass_factor"),
+    "battery.auxiliary_w": ("auxiliary", "auxiliary_w"),
+}
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One number of a vehicle. `value` and `sd` are its tabular prior; without an `sd` nothing but the log speaks.
+
+    `path` as in the sheet (`road.c_rr`, `effects.headwind.scale`); `group` is the place in a coefficient that has one
+    value per vehicle or gear, `label` its name. `lower` and `upper` are the support; `scale` conditions the solver.
+    """
+
+    path: str
+    unit: str
+    value: float
+    sd: float | None
+    scale: float
+    lower: float = -np.inf
+    upper: float = np.inf
+    free: bool = True
+    group: int | None = None
+    label: str = ""
+
+    @property
+    def name(self) -> str:
+        """The path, with the group's label where there is one."""
+        return f"{self.path}[{self.label}]" if self.group is not None else self.path
+
+
+def _leaf(vehicle: Vehicle, path: str) -> Any:
+    """The leaf at a path. Raises `KeyError` for a path that the vehicle does not have."""
+    if path == "mass_kg":
+        return vehicle.mass_kg
+    if path in _DECLARED:
+        effect_id, field = _DECLARED[path]
+        return getattr(vehicle.effect(effect_id), field)
+    head, _, rest = path.partition(".")
+    if head in ("driveline", "machine"):
+        return getattr(getattr(vehicle, head), rest)
+    if head == "effects":
+        effect_id, _, field = rest.partition(".")
+        return getattr(vehicle.effect(effect_id), field)
+    raise KeyError(path)
+
+
+@dataclass(frozen=True)
+class ParameterTable:
+    """Coefficients of one vehicle, in a fixed order. Functions return new tables."""
+
+    rows: tuple[Coefficient, ...]
+
+    @property
+    def free(self) -> tuple[Coefficient, ...]:
+        """The coefficients that are estimated."""
+        return tuple(c for c in self.rows if c.free)
+
+    @property
+    def structure(self) -> tuple[tuple[str, int | None, float, float], ...]:
+        """What jit must know: where each free coefficient sits and its support. Hashable."""
+        return tuple((c.path, c.group, c.lower, c.upper) for c in self.free)
+
+    def plus(self, *rows: Coefficient) -> "ParameterTable":
+        """The table with more rows."""
+        return ParameterTable((*self.rows, *rows))
+
+    def minus(self, effect_id: str) -> "ParameterTable":
+        """The table without an effect's rows."""
+        return ParameterTable(tuple(c for c in self.rows if not c.path.startswith(f"effects.{effect_id}.")))
+
+    def with_free(self, **free: bool) -> "ParameterTable":
+        """The table with rows held or freed, by name."""
+        return ParameterTable(tuple(replace(c, free=free.get(c.name, c.free)) for c in self.rows))
+
+    def values(self, vehicle: Vehicle) -> Float[np.ndarray, " free"]:
+        """The free coefficients as they are in the vehicle."""
+        return np.array([_pick(_leaf(vehicle, c.path), c.group) for c in self.free], dtype=float)
+
+    def insert(self, vehicle: Vehicle, values: Float[Array, " free"] | Sequence[float]) -> Vehicle:
+        """A vehicle with these values for the free coefficients; traceable in `values`."""
+        return insert(vehicle, self.structure, jnp.asarray(values))
+
+
+def _pick(leaf: Any, group: int | None) -> Any:
+    return leaf if group is None else leaf.values[group]
+
+
+def insert(vehicle: Vehicle, structure: Any, values: Float[Array, " free"]) -> Vehicle:
+    """`ParameterTable.insert` from the table's static structure."""
+    for k, (path, group, _, _) in enumerate(structure):
+        where = lambda v, p=path: _leaf(v, p)  # noqa: E731
+        if group is None:
+            new: Any = values[k]
+        else:
+            old = _leaf(vehicle, path)
+            new = Grouped(jnp.asarray(old.values).at[group].set(values[k]), old.by)
+        vehicle = eqx.tree_at(where, vehicle, new, is_leaf=lambda x: isinstance(x, Grouped))
+    return vehicle
+
+
+def effect_coefficients(
+    effect: Effect, sizes: Sequence[str], *, shapes: bool = True, groups: Sequence[str] = ()
+) -> tuple[Coefficient, ...]:
+    """Rows for an effect's parameters: those in `sizes` and, where `shapes`, its shapes free, the others held.
+
+    A found effect has no tabular prior; shapes keep a wide one around their start (their `scale` times 3), without
+    which a flat direction would run off.
+    """
+    rows = []
+    for p in effect.parameters:
+        leaf = getattr(effect, p.name)
+        if leaf is None:
+            continue
+        free = p.name in sizes or (shapes and p.kind == "shape" and bool(p.grid) and len(p.grid) > 1)
+        values = leaf.values if isinstance(leaf, Grouped) else [leaf]
+        for g, value in enumerate(np.asarray(jax.device_get(values), dtype=float)):
+            grouped = isinstance(leaf, Grouped)
+            rows.append(
+                Coefficient(
+                    path=f"effects.{effect.id}.{p.name}",
+                    unit=p.unit,
+                    value=float(value),
+                    sd=3 * abs(p.scale) if p.kind == "shape" else None,
+                    scale=abs(p.scale),
+                    lower=p.lower if p.kind != "size" else -np.inf,
+                    upper=p.upper if p.kind != "size" else np.inf,
+                    free=free and (not grouped or not groups or str(g) in groups),
+                    group=g if grouped else None,
+                    label=str(g) if grouped else "",
+                )
+            )
+    return tuple(rows)

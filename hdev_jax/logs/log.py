@@ -1,0 +1,122 @@
+"""`Log`: what a reader hands on. Segments for the kernel, measurements for the residual, the ledger for the user."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hdev_jax.errors import InputError
+from hdev_jax.logs.adapter import near
+from hdev_jax.logs.columns import ColumnInfo
+from hdev_jax.logs.ledger import Ledger
+from hdev_jax.segments import Segments
+from hdev_jax.units import J_PER_WH
+
+__all__ = ["MEASURED", "TARGETS", "Log"]
+
+MEASURED = ("battery_power_w", "energy_wh")
+TARGETS = ("energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n")
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log in memory, SI, float64 on the host.
+
+    **Fields:** `segments`; `measured`, what is positive out of the battery and kept out of the channels
+    (`battery_power_w`, `energy_wh`); `trip_names[segments.trip[i]]` and `vehicle_names[segments.vehicle[i]]` name
+    row i; `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from.
+    """
+
+    segments: Segments
+    measured: dict[str, np.ndarray]
+    trip_names: tuple[str, ...]
+    vehicle_names: tuple[str, ...]
+    ledger: Ledger = field(default_factory=Ledger)
+    columns: tuple[ColumnInfo, ...] = ()
+    sampled: bool = False
+    files: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The targets this log can give, nearest the battery first."""
+        channels = tuple(t for t in TARGETS[2:] if t in self.segments.channels)
+        if "energy_wh" in self.measured:
+            return ("energy_wh", "battery_power_kw", *channels)
+        return (*(("battery_power_kw", "energy_wh") if "battery_power_w" in self.measured else ()), *channels)
+
+    @property
+    def default_target(self) -> str:
+        """What the log measures nearest the battery. Raises `InputError` where it measures nothing of the kind."""
+        if not self.targets:
+            none = f"none of {', '.join(self._accepted())} is measured"
+            raise InputError(f"{self._name()}: no target: {none}{self._near()}")
+        return self.targets[0]
+
+    def target(self, name: str) -> np.ndarray:
+        """The measured target `[row]` in the unit of its name. Raises `InputError` if the log lacks it."""
+        if name not in TARGETS:
+            raise InputError(f"unknown target '{name}'{near(name, TARGETS)} accepted: {', '.join(TARGETS)}")
+        if name not in self.targets:
+            has = f"it has {', '.join(self.targets)}" if self.targets else "it measures none"
+            raise InputError(f"{self._name()}: target {name} is not in this log ({has}){self._near()}")
+        hours = self.segments.duration_s / 3600.0
+        if name == "energy_wh":
+            return np.asarray(self.measured["energy_wh"] if name in self.measured else self._watts() * hours)
+        if name == "battery_power_kw":
+            return np.asarray(self._watts() / 1000.0)
+        return np.asarray(self.segments.channels[name])
+
+    def _watts(self) -> np.ndarray:
+        if "battery_power_w" in self.measured:
+            return self.measured["battery_power_w"]
+        return np.asarray(self.measured["energy_wh"] * J_PER_WH / self.segments.duration_s)
+
+    def _name(self) -> str:
+        return self.files[0] if len(self.files) == 1 else f"log of {len(self.files)} files"
+
+    @staticmethod
+    def _accepted() -> tuple[str, ...]:
+        return ("energy_wh", "battery_power_w", "battery_power_kw", "motor_torque_nm", "traction_force_n")
+
+    def _near(self) -> str:
+        for wanted in self._accepted():
+            for column in self.segments.channels:
+                if column not in TARGETS and (hint := near(column, [wanted], 0.8)):
+                    return f"; column '{column}'{hint}"
+        return ""
+
+    def select(self, trips: Sequence[int]) -> "Log":
+        """The rows of these trips (by id); ids and names stay as they are."""
+        return self.take(np.isin(np.asarray(self.segments.trip), np.asarray(list(trips), dtype=np.int64)))
+
+    def take(self, rows: np.ndarray) -> "Log":
+        """Rows by mask or index."""
+        measured = {k: v[rows] for k, v in self.measured.items()}
+        return replace(self, segments=self.segments.take(rows), measured=measured)
+
+    def trip_id(self, name: str) -> int:
+        """The id of a trip by its name. Raises `InputError` with the near name."""
+        if name not in self.trip_names:
+            shown = ", ".join(self.trip_names[:8]) + (", …" if len(self.trip_names) > 8 else "")
+            raise InputError(f"no trip '{name}' in {self._name()}{near(name, self.trip_names)}; it has {shown}")
+        return self.trip_names.index(name)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of names and numbers: two logs with the same one give the same results."""
+        s = self.segments
+        columns: dict[str, object] = {
+            **{k: getattr(s, k) for k in ("trip", "vehicle", "time_s", "duration_s", "distance_m")},
+            **{k: getattr(s, k) for k in ("speed_start_mps", "speed_end_mps")},
+            **{f"channel {k}": v for k, v in sorted(s.channels.items())},
+            **{f"measured {k}": v for k, v in sorted(self.measured.items())},
+        }
+        sha = hashlib.sha256(repr((self.trip_names, self.vehicle_names, self.sampled)).encode())
+        for name, x in columns.items():
+            array = np.ascontiguousarray(x)
+            sha.update(f"{name} {array.dtype.str} {array.shape}".encode())
+            sha.update(array.data)
+        return sha.hexdigest()

@@ -1,0 +1,163 @@
+"""`read_log`: files, adapter and checks put together."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdev_jax.errors import InputError
+from hdev_jax.logs.adapter import Adapter, near
+from hdev_jax.logs.columns import ColumnInfo, Piece, translate
+from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
+from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.log import MEASURED, Log
+from hdev_jax.logs.readers import find_files, read_raw
+from hdev_jax.logs.repair import repair
+from hdev_jax.logs.rows import Rows, check_rows, concatenate, split_trips
+from hdev_jax.segments import Segments
+from hdev_jax.units import accepted
+
+__all__ = ["read_log"]
+
+_ROW = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
+
+
+def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Adapter | None = None) -> Log:
+    """Read one log from files and folders (several files are one log).
+
+    **Arguments:** `paths`, in the order in which trips are to come; `adapter`, the path of a TOML file or an `Adapter`
+    where the files have other column names.
+
+    Raises `InputError`, one line saying which file, row and column and what to do, for whatever contract §1 refuses.
+    """
+    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    if not given:
+        raise InputError("no log given; name one or more files")
+    rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
+    files, companions = find_files([Path(p) for p in given], rules)
+    ledger = Ledger()
+    for name in companions:
+        ledger = ledger.add("noted", "companion, joined to its log and no log itself", file=name)
+    pieces = []
+    for path in files:
+        pieces += [translate(raw, rules) for raw in read_raw(path, rules)]
+    sampled = _require(pieces)
+    rows = concatenate(pieces, ledger)
+    measured = [c for c in MEASURED if c in rows.data]
+    for c in list(measured):
+        if not np.isfinite(rows.data[c]).any():
+            measured.remove(c)
+            left = {k: v for k, v in rows.data.items() if k != c}
+            rows = replace(rows, data=left, ledger=rows.ledger.add("noted", "no value in any row, absent", column=c))
+    rows = split_trips(check_rows(rows, sampled, measured), rules.edge_trim_s, sampled)
+    columns = _columns(pieces)
+    return _log(rows, sampled, measured, columns, tuple(p.name for p in files))
+
+
+def _require(pieces: list[Piece]) -> bool:
+    """Whether the rows are samples; refuses a log that lacks what every row needs, with the near name."""
+    ends = all("speed_start_mps" in p.data and "speed_end_mps" in p.data for p in pieces)
+    for p in pieces:
+        free = [h for h in p.headers if h not in {c.source for c in p.columns} or h in p.data]
+        free = [h for h in free if h not in _ROW]
+        if not ends and "speed_mps" not in p.data:
+            lacking = [c for c in ("speed_start_mps", "speed_end_mps") if c not in p.data]
+            wanted = lacking[0] if len(lacking) == 1 else "speed_mps"
+            also = "" if len(lacking) == 1 else " (or speed_start_mps and speed_end_mps)"
+            raise InputError(f"{p.file}: no column {wanted}{also}{_nearest([*lacking, wanted], free, p)}")
+        if "time_s" not in p.data and "duration_s" not in p.data:
+            raise InputError(f"{p.file}: no column time_s or duration_s{_nearest(['time_s', 'duration_s'], free, p)}")
+    for c in ("time_s", "duration_s"):
+        other = "duration_s" if c == "time_s" else "time_s"
+        lacking = [p for p in pieces if c not in p.data]
+        if lacking and any(other not in p.data for p in pieces):
+            raise InputError(f"{lacking[0].file}: no column {c}, which another file of this log needs")
+    return not ends
+
+
+def _nearest(wanted: list[str], free: list[str], piece: Piece) -> str:
+    stems = [w.rpartition("_")[0] for w in wanted]
+    for name in dict.fromkeys(wanted):
+        for header in free:
+            if near(header, accepted(name.rpartition("_")[0]), 0.7) or header.lower() in stems:
+                return f"; '{header}' is near: rename it {name} (or {', '.join(accepted(stems[0])[1:3])})"
+    shown = ", ".join(piece.headers[:8]) + (", …" if len(piece.headers) > 8 else "")
+    return f"; the file has {shown}; rename one, or write an adapter (hdev check --skeleton)"
+
+
+def _columns(pieces: list[Piece]) -> tuple[ColumnInfo, ...]:
+    return tuple(dict.fromkeys(c for p in pieces for c in p.columns))
+
+
+def _log(
+    rows: Rows, sampled: bool, measured: list[str], columns: tuple[ColumnInfo, ...], files: tuple[str, ...]
+) -> Log:
+    data, trip = rows.data, rows.trip
+    time, duration, v_start, v_end = _intervals(rows, sampled)
+    ledger = rows.ledger
+    mean = 0.5 * (v_start + v_end)
+    speed = data.get("speed_mps", mean)
+    made = np.where(np.isfinite(speed), speed, mean) * duration
+    distance = data.get("distance_m", made)
+    if (gone := ~np.isfinite(distance)).any():
+        distance = np.where(gone, made, distance)
+        ledger = ledger.add("filled", "missing, speed × duration", count=int(gone.sum()), column="distance_m")
+    if "distance_m" not in data:
+        ledger = ledger.add("derived", "speed × duration", column="distance_m")
+    moved = float(made.sum())
+    if moved > 0 and not 0.5 < float(distance.sum()) / moved < 2.0:
+        ratio = float(distance.sum()) / moved
+        ledger = ledger.add(
+            "noted", f"the sum is {ratio:.3g} times speed × duration: check its unit", column="distance_m"
+        )
+    channels: dict[str, Any] = {k: v for k, v in data.items() if k not in _ROW and k not in measured}
+    channels, ledger = repair(channels, trip, time, ledger)
+    soc = channels.get("soc")
+    if soc is not None and soc.max() > 1.5:  # a share cannot be: this is per cent
+        channels["soc"] = soc / 100.0
+        ledger = ledger.add("noted", f"up to {soc.max():.4g}, read as per cent", column="soc")
+    if "grade_rad" not in channels and "altitude_m" in channels:
+        channels["grade_rad"] = grade_from_altitude(trip, distance, channels["altitude_m"])
+        ledger = ledger.add("derived", f"from altitude_m over {SLOPE_WINDOW_M:g} m of the way", column="grade_rad")
+    elif "grade_rad" not in channels:
+        ledger = ledger.add("noted", "neither slope nor altitude in the log: taken as level", column="grade_rad")
+    segments = Segments(
+        trip=trip.astype(np.int32),
+        vehicle=rows.vehicle.astype(np.int32),
+        time_s=time,
+        duration_s=duration,
+        distance_m=distance,
+        speed_start_mps=v_start,
+        speed_end_mps=v_end,
+        channels=channels,
+    )
+    return Log(
+        segments=segments,
+        measured={c: data[c] for c in measured},
+        trip_names=rows.trip_names,
+        vehicle_names=rows.vehicle_names,
+        ledger=ledger,
+        columns=columns,
+        sampled=sampled,
+        files=files,
+    )
+
+
+def _intervals(rows: Rows, sampled: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    data, trip = rows.data, rows.trip
+    given = data.get("duration_s")
+    if "time_s" in data:
+        time = data["time_s"] - rows.origin_s
+    else:
+        assert given is not None
+        end = np.cumsum(given)
+        edges = np.flatnonzero(starts(trip))
+        time = end - given - np.repeat((end - given)[edges], np.diff(np.r_[edges, len(trip)]))
+    if sampled:
+        return sample_intervals(trip, time, data["speed_mps"], given)
+    if given is None:
+        step = np.r_[np.where(np.diff(trip) == 0, np.diff(time), np.nan), np.nan]
+        given = np.where(np.isnan(step), trip_median(step, trip), step)
+    return time, given, data["speed_start_mps"], data["speed_end_mps"]

@@ -1,0 +1,24 @@
+"""The kernel: effects at five stages, and the vehicle as their sum."""
+
+from hdev_jax.physics.driveline import Driveline, EfficiencyMap
+from hdev_jax.physics.effect import Effect, Grouped, Parameter, Point
+from hdev_jax.physics.library import LIBRARY, at_null, library, unavailable
+from hdev_jax.physics.machine import Machine
+from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
+
+__all__ = [
+    "AIR_DENSITY_KGPM3",
+    "GRAVITY_MPS2",
+    "LIBRARY",
+    "Driveline",
+    "Effect",
+    "EfficiencyMap",
+    "Grouped",
+    "Machine",
+    "Parameter",
+    "Point",
+    "Vehicle",
+    "at_null",
+    "library",
+    "unavailable",
+]

@@ -1,0 +1,109 @@
+"""What acts across rows, by trip: positions in a trip, shifts by a fraction of a row, filters, running sums."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from hdev_jax.segments import Segments
+
+__all__ = [
+    "at_times",
+    "distance_since_start",
+    "low_pass",
+    "neighbours",
+    "shifted",
+    "time_since_braking",
+    "trip_bounds",
+]
+
+
+def trip_bounds(trip: Any) -> tuple[Int[Array, " row"], Int[Array, " row"]]:
+    """First and last row of each row's trip (rows of a trip are contiguous)."""
+    trip = jnp.asarray(trip)
+    index = jnp.arange(trip.shape[0])
+    change = trip[1:] != trip[:-1]
+    starts = jnp.concatenate([jnp.array([True]), change])
+    ends = jnp.concatenate([change, jnp.array([True])])
+    first = jax.lax.cummax(jnp.where(starts, index, 0))
+    last = jax.lax.cummin(jnp.where(ends, index, trip.shape[0] - 1), reverse=True)
+    return first, last
+
+
+def shifted(column: Any, segments: Segments, seconds: Any, cubic: Any = 0.0) -> Float[Array, " row"]:
+    """The column `seconds` earlier, by a fraction of a row: x(t − s). The trip's edges hold their value.
+
+    `cubic` blends linear interpolation (0) into the four-point cubic (1), whose slope at s = 0 is the central
+    difference. Rows of unequal duration are shifted by their own.
+    """
+    x = jnp.asarray(column)
+    first, last = trip_bounds(segments.trip)
+    rows = seconds / jnp.asarray(segments.duration_s)
+    whole = jnp.floor(rows)
+    a = rows - whole
+    at = jnp.arange(x.shape[0]) - whole.astype(int)
+
+    def pick(offset: int) -> Array:
+        return x[jnp.clip(at + offset, first, last)]
+
+    # Lagrange's four points at +1, 0, −1, −2 rows for the place −a
+    ahead, here, behind, far = pick(1), pick(0), pick(-1), pick(-2)
+    linear = (1 - a) * here + a * behind
+    four = (
+        -a * (1 - a) * (2 - a) / 6 * ahead
+        + (1 + a) * (1 - a) * (2 - a) / 2 * here
+        + (1 + a) * a * (2 - a) / 2 * behind
+        - (1 + a) * a * (1 - a) / 6 * far
+    )
+    return linear + cubic * (four - linear)
+
+
+def neighbours(column: Any, segments: Segments, rows: int) -> Float[Array, " row"]:
+    """x(k−j) + x(k+j) − 2x(k) with j = `rows`; the trip's edges hold their value."""
+    x = jnp.asarray(column)
+    first, last = trip_bounds(segments.trip)
+    index = jnp.arange(x.shape[0])
+    return x[jnp.clip(index - rows, first, last)] + x[jnp.clip(index + rows, first, last)] - 2 * x
+
+
+def low_pass(column: Any, segments: Segments, tau_s: Any) -> Float[Array, " row"]:
+    """First-order lag with time constant `tau_s` [s], started at each trip's first value; the column itself at 0."""
+    x = jnp.asarray(column)
+    first, _ = trip_bounds(segments.trip)
+    keep = jnp.exp(-jnp.asarray(segments.duration_s) / jnp.maximum(tau_s, 1e-9))
+    keep = jnp.where(first == jnp.arange(x.shape[0]), 0.0, keep)
+
+    def compose(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
+        return one[0] * two[0], one[1] * two[0] + two[1]
+
+    return jax.lax.associative_scan(compose, (keep, (1 - keep) * x))[1]
+
+
+def at_times(column: Any, segments: Segments, ahead_s: Any) -> Float[Array, " row"]:
+    """The column `ahead_s` seconds later inside its trip, linear in time, held at the trip's edges."""
+    clock = jnp.asarray(segments.time_s) + 0.5 * jnp.asarray(segments.duration_s)
+    first, last = trip_bounds(segments.trip)
+    wanted = jnp.clip(clock + ahead_s, clock[first], clock[last])
+    # one increasing clock for all trips, so that a single interpolation serves
+    lap = jnp.asarray(segments.trip) * (jnp.max(clock) + 1.0)
+    return jnp.interp(wanted + lap, clock + lap, jnp.asarray(column))
+
+
+def distance_since_start(segments: Segments) -> Float[Array, " row"]:
+    """Distance from the start of the trip to the middle of the row [m]."""
+    d = jnp.asarray(segments.distance_m)
+    first, _ = trip_bounds(segments.trip)
+    before = jnp.cumsum(d) - d
+    return before - before[first] + 0.5 * d
+
+
+def time_since_braking(segments: Segments, threshold_pa: float = 2e4) -> Float[Array, " row"]:
+    """Seconds from the end of the trip's last braked row to the middle of this one; 0 while braking and before."""
+    first, _ = trip_bounds(segments.trip)
+    start, duration = jnp.asarray(segments.time_s), jnp.asarray(segments.duration_s)
+    braking = jnp.asarray(segments.channels["brake_pressure_pa"]) > threshold_pa
+    last = jax.lax.cummax(jnp.where(braking, jnp.arange(start.shape[0]), -1))
+    held = jnp.maximum(last, 0)
+    since = start + 0.5 * duration - (start + duration)[held]
+    return jnp.where((last >= first) & ~braking, since, 0.0)

@@ -1,0 +1,62 @@
+"""The library: every effect a diagnosis may add, and what of it a given log can show."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from hdev_jax.physics import battery, losses, road, sensors
+from hdev_jax.physics.effect import STAGES, Effect
+from hdev_jax.segments import Segments
+
+__all__ = ["DECLARED", "LIBRARY", "at_null", "library", "unavailable"]
+
+DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, road.Aero, battery.Auxiliary)
+
+
+def _all() -> dict[str, type[Effect]]:
+    found = [
+        c
+        for module in (sensors, road, losses, battery)
+        for c in (getattr(module, name) for name in module.__all__)
+        if isinstance(c, type) and issubclass(c, Effect) and c.parameters
+    ]
+    return {c.id: c for c in sorted(found, key=lambda c: (STAGES.index(c.stage), c.id))}
+
+
+LIBRARY: dict[str, type[Effect]] = _all()
+
+
+def library(extra: Iterable[type[Effect]] = ()) -> dict[str, type[Effect]]:
+    """The library by id, with a user's own effects. Raises `ValueError` for an id that is there already."""
+    found = dict(LIBRARY)
+    for c in extra:
+        if c.id in found:
+            raise ValueError(f"effect id {c.id!r} is in the library already; give yours a name of its own")
+        found[c.id] = c
+    return found
+
+
+def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
+    """An instance with every size at its null value and every shape at its default."""
+    values = {}
+    for p in effect.parameters:
+        if p.by:
+            from hdev_jax.physics.effect import Grouped
+
+            values[p.name] = Grouped(np.full(gears + 1, p.null), p.by)
+        else:
+            values[p.name] = np.asarray(p.null, dtype=float)
+    return effect(**values)
+
+
+def unavailable(effect: type[Effect], segments: Segments, entry: str) -> str | None:
+    """Why this log cannot show the effect, in one phrase; None where it can."""
+    if entry not in effect.entries:
+        where = {"road": "road", "wheel": "measured traction force", "shaft": "measured motor torque"}[entry]
+        return f"acts before the {where} where the chain is entered"
+    for need in effect.needs:
+        if not any(segments.has(n) for n in need.split("|")):
+            return f"needs a channel that the log lacks: {need.replace('|', ' or ')}"
+    if present := [n for n in effect.lacks if segments.has(n)]:
+        return f"the log has {present[0]} itself"
+    return None

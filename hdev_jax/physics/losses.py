@@ -1,0 +1,131 @@
+"""Losses of the driveline and of the machine with its inverter that a declared efficiency does not hold."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from hdev_jax.physics.across import time_since_braking
+from hdev_jax.physics.effect import Effect, Parameter
+
+__all__ = ["BrakeDrag", "CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "IronLoss"]
+
+
+class DrivelineDrag(Effect):
+    """Drag torque at the motor shaft while it turns: τ₀ as a force τ₀·i/r at the wheel."""
+
+    id: ClassVar = "driveline_drag"
+    stage: ClassVar = "driveline"
+    equation: ClassVar = "τ₀·i/r"
+    source: ClassVar = "Naunheimer, Fahrzeuggetriebe (no-load losses)"
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("torque_nm", "Nm", 0.0, 5.0, 0.0, 200.0, least=0.05),)
+    mistaken_for: ClassVar = ("iron_loss", "constant_headwind")
+    separated_by: ClassVar = "coasting in several gears"
+    torque_nm: Any
+
+    def drive(self, row, car, point):
+        return self.torque_nm * car.driveline.ratio_radpm(row)
+
+
+class BrakeDrag(Effect):
+    """Pads that do not let go: F·exp(−t/τ), t since the brake was released."""
+
+    id: ClassVar = "brake_drag"
+    stage: ClassVar = "driveline"
+    equation: ClassVar = "F·exp(−t_release/τ)"
+    source: ClassVar = "Breuer and Bill, Bremsenhandbuch (residual torque)"
+    needs: ClassVar = ("brake_pressure_pa",)
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (
+        Parameter("force_n", "N", 0.0, 300.0, 0.0, 2e4, least=5.0),
+        Parameter("tau_s", "s", 30.0, 20.0, 2.0, 600.0, kind="shape", grid=(10.0, 30.0, 90.0)),
+    )
+    mistaken_for: ClassVar = ("tyre_warmup",)
+    separated_by: ClassVar = "cruising just after braking and long after"
+    force_n: Any
+    tau_s: Any
+
+    def derive(self, segments):
+        return segments.with_channels(time_since_braking_s=time_since_braking(segments))
+
+    def drive(self, row, car, point):
+        moving = row.speed_mps > 0.1
+        since = row.channels["time_since_braking_s"]
+        return self.force_n * jnp.where(moving & (since > 0), jnp.exp(-since / self.tau_s), 0.0)
+
+
+class GearEfficiency(Effect):
+    """Efficiency that differs by gear: P·δ[n] lost while driving, |P|·δ[n] less while braking."""
+
+    id: ClassVar = "gear_efficiency"
+    stage: ClassVar = "driveline"
+    equation: ClassVar = "δ[n]·|F_w|"
+    source: ClassVar = "paper 1, section 3.1 (calibration maps by gear)"
+    needs: ClassVar = ("gear",)
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("delta", "1", 0.0, 0.02, -0.3, 0.3, by="gear", least=0.001),)
+    mistaken_for: ClassVar = ("copper_loss",)
+    separated_by: ClassVar = "the same power in several gears"
+    delta: Any
+
+    def drive(self, row, car, point):
+        return self.delta * jnp.abs(point.force_n)
+
+
+class CopperLoss(Effect):
+    """Resistive loss of the windings: k·τ²."""
+
+    id: ClassVar = "copper_loss"
+    stage: ClassVar = "machine"
+    equation: ClassVar = "k·τ²"
+    source: ClassVar = "Larminie and Lowry, Electric Vehicle Technology Explained, eq. 7.23"
+    parameters: ClassVar = (Parameter("w_per_nm2", "W/Nm²", 0.0, 0.1, 0.0, 50.0, least=1e-6),)
+    mistaken_for: ClassVar = ("battery_resistance",)
+    separated_by: ClassVar = "the same power at different torque"
+    w_per_nm2: Any
+
+    def power(self, row, car, point):
+        return self.w_per_nm2 * point.torque_nm**2
+
+
+class IronLoss(Effect):
+    """Iron and windage of a turning motor: k₁·|ω| + k₂·ω²."""
+
+    id: ClassVar = "iron_loss"
+    stage: ClassVar = "machine"
+    equation: ClassVar = "k₁·|ω| + k₂·ω²"
+    source: ClassVar = "Larminie and Lowry, Electric Vehicle Technology Explained, eq. 7.23"
+    parameters: ClassVar = (
+        Parameter("w_per_radps", "W·s/rad", 0.0, 1.0, 0.0, 500.0, least=1e-4),
+        Parameter("w_per_radps2", "W·s²/rad²", 0.0, 1e-3, 0.0, 5.0, least=1e-7),
+    )
+    variants: ClassVar = (("w_per_radps",), ("w_per_radps2",), ("w_per_radps", "w_per_radps2"))
+    mistaken_for: ClassVar = ("driveline_drag", "constant_headwind")
+    separated_by: ClassVar = "the motor turning without torque"
+    w_per_radps: Any
+    w_per_radps2: Any
+
+    def power(self, row, car, point):
+        w = jnp.abs(point.speed_radps)
+        return self.w_per_radps * w + self.w_per_radps2 * w**2
+
+
+class InverterLoss(Effect):
+    """Inverter: standby while the vehicle is on, and switching loss by current, b·|τ|."""
+
+    id: ClassVar = "inverter_loss"
+    stage: ClassVar = "machine"
+    equation: ClassVar = "P₀ + b·|τ|"
+    source: ClassVar = "Graovac and Pürschel, IGBT Power Losses Calculation (linear part)"
+    parameters: ClassVar = (
+        Parameter("standby_w", "W", 0.0, 200.0, 0.0, 1e4, least=1.0),
+        Parameter("per_nm_w", "W/Nm", 0.0, 2.0, 0.0, 500.0, least=1e-4),
+    )
+    variants: ClassVar = (("per_nm_w",), ("standby_w", "per_nm_w"))  # standby alone is auxiliary_power by another name
+    mistaken_for: ClassVar = ("auxiliary_power", "copper_loss")
+    separated_by: ClassVar = "steps of the key, then torque at standstill"
+    standby_w: Any
+    per_nm_w: Any
+
+    def power(self, row, car, point):
+        return self.standby_w + self.per_nm_w * jnp.abs(point.torque_nm)

@@ -1,0 +1,389 @@
+"""Forces between the road and the wheel: the four of the papers, and those a declared model may lack."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+
+from hdev_jax.physics.across import distance_since_start
+from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
+from hdev_jax.segments import Segments
+
+__all__ = [
+    "Aero",
+    "AirDensity",
+    "ConstantHeadwind",
+    "Cornering",
+    "Crosswind",
+    "Drafting",
+    "FrictionBrake",
+    "Grade",
+    "Headwind",
+    "Inertia",
+    "RoadGrade",
+    "Rolling",
+    "RollingSpeed",
+    "RollingTemperature",
+    "RotatingMass",
+    "TyreWarmup",
+    "WetRoad",
+    "air_density",
+    "mean_square_speed",
+]
+
+ROAD = ("road",)
+REFERENCE_TEMP_C = 20.0  # where a tabular c_rr is measured (ISO 28580: 25 °C in the laboratory; 20 °C on the road)
+
+
+def mean_square_speed(row: Segments) -> Any:
+    """(v_i² + v_f²)/2 of paper 1, equation 4 [m²/s²]."""
+    return 0.5 * (row.speed_start_mps**2 + row.speed_end_mps**2)
+
+
+def _slope(row: Segments) -> Any:
+    return row.get("grade_rad", 0.0)
+
+
+def _weight_on_road(row: Segments, car: Vehicle) -> Any:
+    """m·g·cosθ [N]."""
+    return car.mass(row) * GRAVITY_MPS2 * jnp.cos(_slope(row))
+
+
+# --- declared: equations 3 and 4 of paper 1, equation 2 of paper 2 ---------------------------------------------------
+
+
+class Inertia(Effect):
+    """F_a = λ·m·a (paper 1, equation 3; λ of paper 2, equation 2)."""
+
+    id: ClassVar = "inertia"
+    stage: ClassVar = "road"
+    equation: ClassVar = "λ·m·a"
+    source: ClassVar = "paper 1, eq. 3; paper 2, eq. 2"
+    entries: ClassVar = ROAD
+    rotating_mass_factor: Any
+
+    def force(self, row, car):
+        return self.rotating_mass_factor * car.mass(row) * row.accel_mps2
+
+
+class Grade(Effect):
+    """F_g = m·g·sinθ (paper 1, equation 3)."""
+
+    id: ClassVar = "grade"
+    stage: ClassVar = "road"
+    equation: ClassVar = "m·g·sinθ"
+    source: ClassVar = "paper 1, eq. 3"
+    entries: ClassVar = ROAD
+
+    def force(self, row, car):
+        return car.mass(row) * GRAVITY_MPS2 * jnp.sin(_slope(row))
+
+
+class Rolling(Effect):
+    """F_r = m·g·C_rr·cosθ (paper 1, equation 3)."""
+
+    id: ClassVar = "rolling"
+    stage: ClassVar = "road"
+    equation: ClassVar = "m·g·C_rr·cosθ"
+    source: ClassVar = "paper 1, eq. 3"
+    entries: ClassVar = ROAD
+    c_rr: Any
+
+    def force(self, row, car):
+        return self.c_rr * _weight_on_road(row, car)
+
+
+class Aero(Effect):
+    """F_d = ½·ρ₀·C_d·A·(v_i² + v_f²)/2 (paper 1, equation 4), ρ₀ the standard density."""
+
+    id: ClassVar = "aero"
+    stage: ClassVar = "road"
+    equation: ClassVar = "½·ρ₀·C_d·A·(v_i² + v_f²)/2"
+    source: ClassVar = "paper 1, eq. 4"
+    entries: ClassVar = ROAD
+    cda_m2: Any
+
+    def force(self, row, car):
+        return 0.5 * AIR_DENSITY_KGPM3 * self.cda_m2 * mean_square_speed(row)
+
+
+# --- air -------------------------------------------------------------------------------------------------------------
+
+
+def air_density(row: Segments) -> Any:
+    """Density of the air [kg/m³]: measured, else p/(R·T) with the pressure of ISO 2533 at the row's altitude."""
+    if row.has("air_density_kgpm3"):
+        return row.channels["air_density_kgpm3"]
+    pressure_pa = 101325.0 * (1.0 - 2.25577e-5 * row.get("altitude_m", 0.0)) ** 5.25588
+    return pressure_pa / (287.05 * (row.get("ambient_temp_c", 15.0) + 273.15))
+
+
+def _wind_along(row: Segments) -> Any:
+    """Wind against the vehicle [m/s]: it blows *from* `wind_from_rad`."""
+    return row.channels["wind_speed_mps"] * jnp.cos(row.channels["wind_from_rad"] - row.channels["heading_rad"])
+
+
+def _extra_drag(row: Segments, car: Vehicle, wind_mps: Any) -> Any:
+    """Drag at air speed v + w less drag at v, with the sign of the air speed."""
+    v = row.speed_mps
+    air = v + wind_mps
+    return car.drag() * (air * jnp.abs(air) - v * v)
+
+
+class ConstantHeadwind(Effect):
+    """The same wind against every row: ½ρ₀C_dA((v+w)² − v²)."""
+
+    id: ClassVar = "constant_headwind"
+    stage: ClassVar = "road"
+    equation: ClassVar = "½ρ₀·C_dA·((v+w)² − v²)"
+    source: ClassVar = "paper 2, eq. 2"
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("speed_mps", "m/s", 0.0, 2.0, -15.0, 15.0, least=0.1),)
+    mistaken_for: ClassVar = ("iron_loss", "driveline_drag")
+    separated_by: ClassVar = "drive the same road out and back"
+    speed_mps: Any
+
+    def force(self, row, car):
+        return _extra_drag(row, car, self.speed_mps)
+
+
+class Headwind(Effect):
+    """Measured wind along the heading: ½ρ₀C_dA((v + s·w·cos(from − heading))² − v²)."""
+
+    id: ClassVar = "headwind"
+    stage: ClassVar = "road"
+    equation: ClassVar = "½ρ₀·C_dA·((v + s·w·cos δ)² − v²)"
+    source: ClassVar = "paper 2, eq. 2"
+    needs: ClassVar = ("wind_speed_mps", "wind_from_rad", "heading_rad")
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("scale", "1", 0.0, 1.0, 0.0, 2.5, least=0.02),)
+    mistaken_for: ClassVar = ("constant_headwind", "crosswind")
+    separated_by: ClassVar = "headings all around on one windy day"
+    scale: Any
+
+    def force(self, row, car):
+        return _extra_drag(row, car, self.scale * _wind_along(row))
+
+
+class AirDensity(Effect):
+    """Drag with the density of the day: s·(ρ/ρ₀ − 1)·½ρ₀C_dA·v²."""
+
+    id: ClassVar = "air_density"
+    stage: ClassVar = "road"
+    equation: ClassVar = "s·(ρ/ρ₀ − 1)·½ρ₀·C_dA·v²"
+    source: ClassVar = "ISO 2533"
+    needs: ClassVar = ("air_density_kgpm3|ambient_temp_c|altitude_m",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("scale", "1", 0.0, 1.0, 0.0, 3.0, least=0.05),)
+    mistaken_for: ClassVar = ("rolling_temperature",)
+    separated_by: ClassVar = "hot and cold days at motorway speed"
+    scale: Any
+
+    def force(self, row, car):
+        return self.scale * (air_density(row) / AIR_DENSITY_KGPM3 - 1.0) * car.drag() * mean_square_speed(row)
+
+
+class Crosswind(Effect):
+    """Drag area that grows with the yaw angle ψ of the air: k·ψ²·½ρ₀C_dA·v²."""
+
+    id: ClassVar = "crosswind"
+    stage: ClassVar = "road"
+    equation: ClassVar = "k·ψ²·½ρ₀·C_dA·v²"
+    source: ClassVar = "SAE J1252 (drag against yaw)"
+    needs: ClassVar = ("wind_speed_mps", "wind_from_rad", "heading_rad")
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("drag_per_rad2", "1/rad²", 0.0, 2.0, 0.0, 20.0, least=0.05),)
+    mistaken_for: ClassVar = ("headwind",)
+    separated_by: ClassVar = "headings across and along the wind"
+    drag_per_rad2: Any
+
+    def force(self, row, car):
+        delta = row.channels["wind_from_rad"] - row.channels["heading_rad"]
+        side = row.channels["wind_speed_mps"] * jnp.sin(delta)
+        along = row.speed_mps + row.channels["wind_speed_mps"] * jnp.cos(delta)
+        # a floor on the air speed along: at walking pace ψ means nothing and the drag is nil
+        yaw = jnp.arctan2(jnp.abs(side), jnp.maximum(along, 1.0))
+        return self.drag_per_rad2 * yaw**2 * car.drag() * mean_square_speed(row)
+
+
+class Drafting(Effect):
+    """Drag saved behind another vehicle: −r·½ρ₀C_dA·v²·exp(−gap/30 m)."""
+
+    id: ClassVar = "drafting"
+    stage: ClassVar = "road"
+    equation: ClassVar = "−r·exp(−gap/30 m)·½ρ₀·C_dA·v²"
+    source: ClassVar = "Hucho, Aerodynamik des Automobils (platoons)"
+    needs: ClassVar = ("gap_m",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("reduction", "1", 0.0, 0.3, 0.0, 0.8, least=0.02),)
+    mistaken_for: ClassVar = ("constant_headwind",)
+    separated_by: ClassVar = "stretches with and without a leader"
+    reduction: Any
+
+    def force(self, row, car):
+        near = jnp.exp(-jnp.maximum(row.channels["gap_m"], 0.0) / 30.0)
+        return -self.reduction * near * car.drag() * mean_square_speed(row)
+
+
+# --- tyres and surface -------------------------------------------------------------------------------------------------
+
+
+class RollingSpeed(Effect):
+    """Rolling resistance that grows with speed: m·g·cosθ·k·v²."""
+
+    id: ClassVar = "rolling_speed"
+    stage: ClassVar = "road"
+    equation: ClassVar = "m·g·cosθ·k·v²"
+    source: ClassVar = "ISO 28580; Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge"
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("per_mps2", "s²/m²", 0.0, 3e-6, 0.0, 3e-5, least=1e-7),)
+    mistaken_for: ClassVar = ("constant_headwind",)
+    separated_by: ClassVar = "a sweep of speed, loaded and empty"
+    per_mps2: Any
+
+    def force(self, row, car):
+        return self.per_mps2 * _weight_on_road(row, car) * mean_square_speed(row)
+
+
+class RollingTemperature(Effect):
+    """Rolling resistance by temperature: m·g·cosθ·k·(T − 20 °C); k is negative, cold tyres roll worse."""
+
+    id: ClassVar = "rolling_temperature"
+    stage: ClassVar = "road"
+    equation: ClassVar = "m·g·cosθ·k·(T − 20 °C)"
+    source: ClassVar = "ISO 28580, temperature correction"
+    needs: ClassVar = ("ambient_temp_c",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("per_k", "1/K", 0.0, -5e-5, -6e-4, 6e-4, least=1e-6),)
+    mistaken_for: ClassVar = ("air_density", "hvac_power")
+    separated_by: ClassVar = "hot and cold days at several speeds"
+    per_k: Any
+
+    def force(self, row, car):
+        return self.per_k * (row.channels["ambient_temp_c"] - REFERENCE_TEMP_C) * _weight_on_road(row, car)
+
+
+class TyreWarmup(Effect):
+    """Cold tyres at the start: m·g·cosθ·C_rr·e·exp(−d/d₀), d the distance since the start of the trip."""
+
+    id: ClassVar = "tyre_warmup"
+    stage: ClassVar = "road"
+    equation: ClassVar = "m·g·cosθ·C_rr·e·exp(−d/d₀)"
+    source: ClassVar = "SAE J2452 (warm-up)"
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (
+        Parameter("excess", "1", 0.0, 0.3, 0.0, 3.0, least=0.01),
+        Parameter("distance_m", "m", 1e4, 5e3, 500.0, 6e4, kind="shape", grid=(2e3, 5e3, 1e4, 2e4)),
+    )
+    mistaken_for: ClassVar = ("cabin_warmup",)
+    separated_by: ClassVar = "a restart after a short stop"
+    excess: Any
+    distance_m: Any
+
+    def derive(self, segments):
+        return segments.with_channels(distance_since_start_m=distance_since_start(segments))
+
+    def force(self, row, car):
+        cold = jnp.exp(-row.channels["distance_since_start_m"] / self.distance_m)
+        return self.excess * cold * car.rolling() * _weight_on_road(row, car)
+
+
+class WetRoad(Effect):
+    """Water on the road: m·g·cosθ·C_rr·e·wet, and spray, ½ρ₀C_dA·s·wet·v²."""
+
+    id: ClassVar = "wet_road"
+    stage: ClassVar = "road"
+    equation: ClassVar = "wet·(m·g·cosθ·C_rr·e + s·½ρ₀·C_dA·v²)"
+    source: ClassVar = "Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge"
+    needs: ClassVar = ("wet_road",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (
+        Parameter("excess", "1", 0.0, 0.2, 0.0, 4.0, least=0.01),
+        Parameter("spray", "1", 0.0, 0.2, 0.0, 2.0, least=0.01),
+    )
+    variants: ClassVar = (("excess",), ("spray",), ("excess", "spray"))
+    mistaken_for: ClassVar = ("rolling_temperature",)
+    separated_by: ClassVar = "the same road dry and wet, slow and fast"
+    excess: Any
+    spray: Any
+
+    def force(self, row, car):
+        water = row.channels["wet_road"]
+        rolling = self.excess * car.rolling() * _weight_on_road(row, car)
+        return water * (rolling + self.spray * car.drag() * mean_square_speed(row))
+
+
+class Cornering(Effect):
+    """Cornering resistance: c·m·v⁴·κ² (slip angles that turn lateral force into drag)."""
+
+    id: ClassVar = "cornering"
+    stage: ClassVar = "road"
+    equation: ClassVar = "c·m·v⁴·κ²"
+    source: ClassVar = "Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge (curve resistance)"
+    needs: ClassVar = ("curvature_1pm",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("coefficient", "s²/m", 0.0, 0.02, 0.0, 1.0, least=1e-4),)
+    mistaken_for: ClassVar = ("rolling_speed",)
+    separated_by: ClassVar = "heading rate: straight and winding roads at one speed"
+    coefficient: Any
+
+    def force(self, row, car):
+        lateral = row.speed_mps**2 * row.channels["curvature_1pm"]
+        return self.coefficient * car.mass(row) * lateral**2
+
+
+# --- mass and slope ------------------------------------------------------------------------------------------------------
+
+
+class RotatingMass(Effect):
+    """Inertia of what turns: f·m·a besides the declared one."""
+
+    id: ClassVar = "rotating_mass"
+    stage: ClassVar = "road"
+    equation: ClassVar = "f·m·a"
+    source: ClassVar = "paper 2, eq. 2 (λ)"
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("factor", "1", 0.0, 0.05, 0.0, 0.6, least=0.002),)
+    mistaken_for: ClassVar = ("mass_scale",)
+    separated_by: ClassVar = "accelerating on the flat, and climbing at a steady speed"
+    factor: Any
+
+    def force(self, row, car):
+        return self.factor * car.mass(row) * row.accel_mps2
+
+
+class RoadGrade(Effect):
+    """Slope that the log lacks, from an accelerometer that feels gravity: s·m·(accelerometer − dv/dt)."""
+
+    id: ClassVar = "road_grade"
+    stage: ClassVar = "road"
+    equation: ClassVar = "s·m·(a_sensor − dv/dt)"
+    source: ClassVar = "paper 2, eq. 2, slope from the specific force"
+    needs: ClassVar = ("accel_mps2",)
+    lacks: ClassVar = ("grade_rad",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("scale", "1", 0.0, 1.0, 0.0, 2.0, least=0.02),)
+    mistaken_for: ClassVar = ("mass_scale",)
+    separated_by: ClassVar = "hills"
+    scale: Any
+
+    def force(self, row, car):
+        return self.scale * car.mass(row) * (row.channels["accel_mps2"] - row.accel_mps2)
+
+
+class FrictionBrake(Effect):
+    """What the friction brakes take off the drive: −k·pressure, while the vehicle moves."""
+
+    id: ClassVar = "friction_brake"
+    stage: ClassVar = "road"
+    equation: ClassVar = "−k·p_brake"
+    source: ClassVar = "paper 2, eq. 7-9 (share of braking that is not regenerated)"
+    needs: ClassVar = ("brake_pressure_pa",)
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("n_per_pa", "N/Pa", 0.0, 2e-3, 0.0, 1.0, least=1e-6),)
+    mistaken_for: ClassVar = ("mass_scale", "friction_blending")
+    separated_by: ClassVar = "braking hard and lightly"
+    n_per_pa: Any
+
+    def force(self, row, car):
+        return -self.n_per_pa * jnp.where(row.speed_mps > 0.1, row.channels["brake_pressure_pa"], 0.0)

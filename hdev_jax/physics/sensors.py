@@ -1,0 +1,211 @@
+"""What the measurements themselves may have wrong: scales, offsets, delays and filters."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+
+from hdev_jax.physics.across import at_times, low_pass, neighbours, shifted
+from hdev_jax.physics.effect import Effect, Parameter
+
+__all__ = [
+    "AccelerometerBias",
+    "GradeBias",
+    "GradeLag",
+    "MassScale",
+    "PowerGain",
+    "SamplingFilter",
+    "SpeedScale",
+    "TimeSkew",
+    "TorqueOffset",
+]
+
+
+class MassScale(Effect):
+    """The mass is another than logged: m·(1 + s)."""
+
+    id: ClassVar = "mass_scale"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "m → m·(1 + s)"
+    source: ClassVar = "paper 1, section 5 (mass as future work)"
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.002),)
+    mistaken_for: ClassVar = ("rotating_mass",)
+    separated_by: ClassVar = "the same road empty and loaded"
+    scale: Any
+
+    def sense(self, row, car):
+        return row.with_channels(mass_kg=car.mass(row) * (1.0 + self.scale))
+
+
+class GradeBias(Effect):
+    """The slope has an offset: θ + b. The same as rolling resistance on every log that is not out and back."""
+
+    id: ClassVar = "grade_bias"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "θ → θ + b"
+    source: ClassVar = "mounting of an inclinometer"
+    needs: ClassVar = ("grade_rad",)
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("bias_rad", "rad", 0.0, 2e-3, -0.05, 0.05, least=5e-5),)
+    mistaken_for: ClassVar = ("rolling",)
+    separated_by: ClassVar = "the same road out and back"
+    bias_rad: Any
+
+    def sense(self, row, car):
+        return row.with_channels(grade_rad=row.channels["grade_rad"] + self.bias_rad)
+
+
+class GradeLag(Effect):
+    """The slope comes late: what is logged at t was the road at t − L."""
+
+    id: ClassVar = "grade_lag"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "θ(t) → θ(t + L)"
+    source: ClassVar = "lag of a barometric altimeter"
+    needs: ClassVar = ("grade_rad",)
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (
+        Parameter("lag_s", "s", 0.0, 1.0, -60.0, 60.0, kind="limit", in_rows=True, least=0.05,
+                  grid=(-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0)),
+    )  # fmt: skip
+    mistaken_for: ClassVar = ("grade_bias",)
+    separated_by: ClassVar = "short hills, up and down"
+    lag_s: Any
+
+    def across(self, segments):
+        return segments.with_channels(grade_rad=at_times(segments.channels["grade_rad"], segments, self.lag_s))
+
+
+class SpeedScale(Effect):
+    """Speed and distance are off by a factor, as by a wrong wheel radius: v·(1 + s)."""
+
+    id: ClassVar = "speed_scale"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "v → v·(1 + s), d → d·(1 + s)"
+    source: ClassVar = "wear and pressure of tyres"
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    mistaken_for: ClassVar = ("mass_scale", "rotating_mass")
+    separated_by: ClassVar = "a position by satellite"
+    scale: Any
+
+    def sense(self, row, car):
+        factor = 1.0 + self.scale
+        return eqx.tree_at(
+            lambda r: (r.distance_m, r.speed_start_mps, r.speed_end_mps),
+            row,
+            (row.distance_m * factor, row.speed_start_mps * factor, row.speed_end_mps * factor),
+        )
+
+
+class AccelerometerBias(Effect):
+    """The accelerometer is tilted: a_sensor − b. Matters where the slope comes from it."""
+
+    id: ClassVar = "accelerometer_bias"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "a_sensor → a_sensor − b"
+    source: ClassVar = "mounting tilt"
+    needs: ClassVar = ("accel_mps2",)
+    lacks: ClassVar = ("grade_rad",)
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("bias_mps2", "m/s²", 0.0, 0.05, -1.0, 1.0, least=0.002),)
+    mistaken_for: ClassVar = ("rolling",)
+    separated_by: ClassVar = "standing still on the flat"
+    bias_mps2: Any
+
+    def sense(self, row, car):
+        return row.with_channels(accel_mps2=row.channels["accel_mps2"] - self.bias_mps2)
+
+
+class TorqueOffset(Effect):
+    """The torque signal has an offset and a gain: τ·(1 + g) + τ₀."""
+
+    id: ClassVar = "torque_offset"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "τ → τ·(1 + g) + τ₀"
+    source: ClassVar = "torque estimated from currents"
+    needs: ClassVar = ("motor_torque_nm",)
+    entries: ClassVar = ("shaft",)
+    parameters: ClassVar = (
+        Parameter("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.02),
+        Parameter("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
+    )
+    variants: ClassVar = (("offset_nm",), ("gain",), ("offset_nm", "gain"))
+    mistaken_for: ClassVar = ("iron_loss", "driveline_drag")
+    separated_by: ClassVar = "coasting at zero torque"
+    offset_nm: Any
+    gain: Any
+
+    def sense(self, row, car):
+        return row.with_channels(motor_torque_nm=row.channels["motor_torque_nm"] * (1.0 + self.gain) + self.offset_nm)
+
+
+class PowerGain(Effect):
+    """The power sensor has a gain and an offset: P·(1 + g) + P₀."""
+
+    id: ClassVar = "power_gain"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "P → P·(1 + g) + P₀"
+    source: ClassVar = "current sensor"
+    parameters: ClassVar = (
+        Parameter("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
+        Parameter("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=5.0),
+    )
+    variants: ClassVar = (("gain",), ("offset_w",), ("gain", "offset_w"))
+    mistaken_for: ClassVar = ("auxiliary_power",)
+    separated_by: ClassVar = "the balance of charge over a trip"
+    order: ClassVar = 10
+    gain: Any
+    offset_w: Any
+
+    def observe(self, column, segments):
+        return column * (1.0 + self.gain) + self.offset_w
+
+
+class TimeSkew(Effect):
+    """The target's clock is late: P(t − s); positive where the target lags the other channels."""
+
+    id: ClassVar = "time_skew"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "P(t) → P(t − s)"
+    source: ClassVar = "messages of several control units on one bus"
+    parameters: ClassVar = (
+        Parameter("skew_s", "s", 0.0, 0.5, -30.0, 30.0, kind="limit", in_rows=True, least=0.005,
+                  grid=(-4.0, -2.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0)),
+        Parameter("cubic", "1", 0.0, 1.0, 0.0, 1.0, kind="choice", grid=(0.0, 1.0)),
+    )  # fmt: skip
+    mistaken_for: ClassVar = ("sampling_filter", "rotating_mass")
+    separated_by: ClassVar = "steps of the pedal"
+    skew_s: Any
+    cubic: Any
+
+    def observe(self, column, segments):
+        return shifted(column, segments, self.skew_s, self.cubic)
+
+
+class SamplingFilter(Effect):
+    """The target is filtered: P + c₁·Δ₁²P + c₂·Δ₂²P with Δⱼ² = x(k−j) − 2x(k) + x(k+j), or a lag of first order τ.
+
+    Negative taps sharpen: then it is the inputs that were smoothed.
+    """
+
+    id: ClassVar = "sampling_filter"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "P → P + Σ cⱼ·(P₋ⱼ − 2P + P₊ⱼ), or τ·dP/dt + P"
+    source: ClassVar = "Proakis and Manolakis, Digital Signal Processing (symmetric FIR; first-order lag)"
+    parameters: ClassVar = (
+        Parameter("tap_1", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
+        Parameter("tap_2", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
+        Parameter("tau_s", "s", 0.0, 1.0, 0.0, 120.0, kind="limit", in_rows=True, grid=(0.5, 1.0, 2.0, 5.0)),
+    )
+    variants: ClassVar = (("tap_1",), ("tap_1", "tap_2"), ("tau_s",))
+    mistaken_for: ClassVar = ("time_skew",)
+    separated_by: ClassVar = "steps of the pedal"
+    order: ClassVar = 5
+    tap_1: Any
+    tap_2: Any
+    tau_s: Any  # None where only the taps are in use: the recursion is not run
+
+    def observe(self, column, segments):
+        sharp = column + self.tap_1 * neighbours(column, segments, 1) + self.tap_2 * neighbours(column, segments, 2)
+        return sharp if self.tau_s is None else low_pass(sharp, segments, self.tau_s)

@@ -1,0 +1,230 @@
+"""The vehicle: a sum of effects along one chain, road → driveline → machine → battery, entered where it is measured."""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hdev_jax.physics.driveline import Driveline
+from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
+from hdev_jax.physics.machine import Machine, switch
+from hdev_jax.segments import Segments
+
+__all__ = ["AIR_DENSITY_KGPM3", "GRAVITY_MPS2", "Entry", "Target", "Vehicle"]
+
+GRAVITY_MPS2 = 9.80665  # standard gravity, 3rd CGPM (1901)
+AIR_DENSITY_KGPM3 = 1.225  # ISO 2533 standard atmosphere at sea level, 15 °C
+Entry = Literal["road", "wheel", "shaft"]
+Target = Literal["energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n"]
+JOULES_PER_WH = 3600.0
+
+
+class _Chain(NamedTuple):
+    """What one row came to: what each effect added [W], in order, and where it ended."""
+
+    added_w: dict[str, Real]
+    wheel_n: Real  # force at the wheels [N]
+    drive_n: Real  # the same behind the driveline, at the wheel [N]
+    point: Point
+
+
+class Vehicle(eqx.Module):
+    """A sum of effects. Nothing is changed in place: `plus` and `minus` return new vehicles.
+
+    **Arguments:** `effects` in any order (they are kept by stage); `mass_kg` where the log has no `mass_kg`;
+    `driveline` and `machine`, the efficiencies of the chain; `entry`, the measured quantity where the chain begins:
+    `road` (nothing measured), `wheel` (`traction_force_n`), `shaft` (`motor_torque_nm`, `motor_speed_radps`).
+    """
+
+    effects: tuple[Effect, ...]
+    mass_kg: Real
+    driveline: Driveline
+    machine: Machine
+    entry: Entry = eqx.field(static=True)
+
+    def __init__(
+        self,
+        effects: tuple[Effect, ...],
+        *,
+        mass_kg: Any,
+        driveline: Driveline,
+        machine: Machine,
+        entry: Entry = "road",
+    ):
+        ids = [e.id for e in effects]
+        if len(set(ids)) < len(ids):
+            raise ValueError(f"each effect once in a vehicle, found {ids}; use minus() before plus() to replace one")
+        self.effects = tuple(sorted(effects, key=lambda e: (STAGES.index(e.stage), e.order)))
+        self.mass_kg = mass_kg
+        self.driveline = driveline
+        self.machine = machine
+        self.entry = entry
+
+    # --- the sum -----------------------------------------------------------------------------------------------
+
+    def plus(self, *effects: Effect) -> "Vehicle":
+        """This vehicle with more effects. Raises `ValueError` if one is there already."""
+        return self._with((*self.effects, *effects))
+
+    def minus(self, *ids: str) -> "Vehicle":
+        """This vehicle without these effects. Raises `ValueError` for one it does not have."""
+        if missing := set(ids) - {e.id for e in self.effects}:
+            raise ValueError(f"no such effect in this vehicle: {sorted(missing)}; it has {[e.id for e in self.effects]}")
+        return self._with(tuple(e for e in self.effects if e.id not in ids))
+
+    def has(self, effect_id: str) -> bool:
+        """Whether the vehicle has this effect."""
+        return any(e.id == effect_id for e in self.effects)
+
+    def effect(self, effect_id: str) -> Any:
+        """The effect of that id. Raises `KeyError`."""
+        for e in self.effects:
+            if e.id == effect_id:
+                return e
+        raise KeyError(effect_id)
+
+    def _with(self, effects: tuple[Effect, ...]) -> "Vehicle":
+        return Vehicle(
+            effects, mass_kg=self.mass_kg, driveline=self.driveline, machine=self.machine, entry=self.entry
+        )
+
+    # --- what effects read of the vehicle ------------------------------------------------------------------------
+
+    def mass(self, row: Segments) -> Any:
+        """Total mass [kg]: the log's, else the sheet's."""
+        return row.get("mass_kg", self.mass_kg)
+
+    def rolling(self) -> Any:
+        """c_rr of the declared rolling resistance, 0 where there is none."""
+        return self.effect("rolling").c_rr if self.has("rolling") else 0.0
+
+    def drag(self) -> Any:
+        """½ρ₀·C_d·A of the declared drag [N/(m/s)²], 0 where there is none."""
+        return 0.5 * AIR_DENSITY_KGPM3 * self.effect("aero").cda_m2 if self.has("aero") else 0.0
+
+    # --- one row ---------------------------------------------------------------------------------------------------
+
+    def _chain(self, row: Segments) -> _Chain:
+        """One row from the entry to the battery. Sensors have been applied."""
+        car = resolve(self, row)
+        v = row.speed_mps
+        added: dict[str, Any] = {}
+        zero = jnp.zeros(())
+        if self.entry == "road":
+            force = zero
+            for e in car.effects:
+                if e.overrides("force"):
+                    with jax.named_scope(e.id):
+                        f = e.force(row, car)
+                    added[e.id] = f * v
+                    force = force + f
+        else:
+            force = row.get("traction_force_n", zero) if self.entry == "wheel" else zero
+            added["traction"] = force * v
+        wheel = force
+        ratio = car.driveline.ratio_radpm(row)
+        if self.entry == "road":
+            speed = row.get("motor_speed_radps", v * ratio)
+            eta = car.driveline.efficiency_at(row, speed, force / ratio)
+            force = switch(force, eta, eta)
+            added["driveline"] = (force - wheel) * v
+            for e in car.effects:
+                if e.overrides("drive"):
+                    with jax.named_scope(e.id):
+                        f = e.drive(row, car, Point(force, force * v, force / ratio, speed))
+                    added[e.id] = f * v
+                    force = force + f
+        drive = force
+        if self.entry == "shaft":
+            torque, speed = row.channels["motor_torque_nm"], row.channels["motor_speed_radps"]
+            power = torque * speed
+            added["traction"] = power
+        else:
+            torque, speed = force / ratio, row.get("motor_speed_radps", v * ratio)
+            power = force * v
+        if self.entry != "road" or not car.driveline.covers_machine:
+            mechanical = power
+            power = switch(mechanical, car.machine.motoring_efficiency, car.machine.regenerating_efficiency)
+            added["machine"] = power - mechanical
+        for e in car.effects:
+            if e.overrides("power"):
+                with jax.named_scope(e.id):
+                    p = e.power(row, car, Point(force, power, torque, speed))
+                added[e.id] = p
+                power = power + p
+        return _Chain(added, wheel, drive, Point(force, power, torque, speed))
+
+    def _sensed(self, row: Segments) -> Segments:
+        for e in self.effects:
+            if e.overrides("sense"):
+                row = resolve(e, row).sense(row, self)
+        return row
+
+    def _rows(self, segments: Segments, of: Callable[[_Chain, Segments], Any]) -> Any:
+        """`of` the chain of every row; the one `vmap` of the kernel."""
+        for e in self.effects:
+            segments = e.across(e.derive(segments))
+        segments = jax.tree.map(jnp.asarray, segments)
+        return jax.vmap(lambda row: of(self._chain(self._sensed(row)), row))(segments)
+
+    def _observed(self, column: Array, segments: Segments) -> Array:
+        for e in self.effects:
+            if e.overrides("observe"):
+                column = e.observe(column, jax.tree.map(jnp.asarray, segments))
+        return column
+
+    # --- what users ask for ------------------------------------------------------------------------------------------
+
+    def power(self, segments: Segments) -> Float[Array, " row"]:
+        """Mean battery power of each row [W], positive out of the battery."""
+        return self._observed(self._rows(segments, lambda c, _: c.point.power_w), segments)
+
+    def energy(self, segments: Segments) -> Float[Array, " row"]:
+        """Battery energy of each row [Wh]: e of paper 1, equation 5, with the vehicle's other effects."""
+        return self.power(segments) * (jnp.asarray(segments.duration_s) / JOULES_PER_WH)
+
+    def force(self, segments: Segments) -> Float[Array, " row"]:
+        """Traction force at the wheels [N]: F_w of paper 1, equation 3. Entry must be `road`."""
+        return self._observed(self._rows(segments, lambda c, _: c.wheel_n), segments)
+
+    def torque(self, segments: Segments) -> Float[Array, " row"]:
+        """Torque at the motor shaft [Nm] (paper 2, equations 4 and 9). Entry must be `road` or `wheel`."""
+        return self._observed(self._rows(segments, lambda c, _: c.point.torque_nm), segments)
+
+    def predict(self, segments: Segments, target: Target) -> Float[Array, " row"]:
+        """The target's column in the target's unit."""
+        match target:
+            case "energy_wh":
+                return self.energy(segments)
+            case "battery_power_kw":
+                return self.power(segments) / 1000.0
+            case "motor_torque_nm":
+                return self.torque(segments)
+            case "traction_force_n":
+                return self.force(segments)
+        raise ValueError(f"unknown target {target!r}; one of {Target}")
+
+    def breakdown(self, segments: Segments) -> dict[str, Float[Array, " row"]]:
+        """Energy of each effect by row [Wh]. The entries add up to `energy` to rounding.
+
+        Forces count at the wheel; `driveline` and `machine` are what the efficiencies cost; a sensor effect counts as
+        the difference it makes.
+        """
+        hours = jnp.asarray(segments.duration_s) / JOULES_PER_WH
+        chain_only = self._with(tuple(e for e in self.effects if not _is_sensor(e)))
+        parts = {k: w * hours for k, w in chain_only._rows(segments, lambda c, _: c.added_w).items()}
+        car, before = chain_only, chain_only.energy(segments)
+        for e in self.effects:
+            if _is_sensor(e):
+                car = car.plus(e)
+                after = car.energy(segments)
+                parts[e.id] = after - before
+                before = after
+        return parts
+
+
+def _is_sensor(e: Effect) -> bool:
+    return e.overrides("across") or e.overrides("sense") or e.overrides("observe")

@@ -1,0 +1,249 @@
+"""The HTML page: what the tables hold, put into the templates with the figures inside the file."""
+
+import base64
+from pathlib import Path
+from typing import Any
+
+from hdev_jax.report import names, words
+from hdev_jax.report.canvas import png, style
+from hdev_jax.report.data import ReportData, same_model, test_rows, total_name, trip_lines
+from hdev_jax.report.figures import (
+    before_after,
+    coefficients,
+    energy_by_effect,
+    measured_predicted,
+    residual_by_trip,
+    trip_errors,
+)
+from hdev_jax.report.residuals import panels, residual_by_channel, residual_in_time
+from hdev_jax.report.statistics import TRIPS_ENOUGH, row_seconds
+
+__all__ = ["write_calibration_report", "write_report"]
+
+_TEMPLATES = Path(__file__).parent / "templates"
+CANDIDATES_SHOWN = 8
+Z_FLAG = 2.0  # a coefficient further from its table than 19 of 20 would be by chance
+
+
+def write_report(data: ReportData, directory: Path) -> None:
+    """Write `report.html` and `figures/*.png` of a diagnosis into a directory; it is made where it is not there.
+
+    The page is one file: figures are inside it, nothing is loaded from anywhere. The same data give the same bytes.
+    """
+    with style():
+        shown, channels = panels(data)
+        figures = {
+            "before_after": before_after(data),
+            "coefficients": coefficients(data),
+            "residual_channels": residual_by_channel(data, shown),
+            "residual_time": residual_in_time(data),
+            "energy_by_effect": energy_by_effect(data),
+            "trips": trip_errors(data),
+        }
+        images = {name: png(fig) for name, fig in figures.items() if fig is not None}
+    rows = test_rows(data)
+    summary = data.summary
+    context = {
+        **_common(data),
+        "answer": words.answer_parts(data),
+        "tiles": _tiles(data),
+        "found": [_found(data, e) for e in summary.get("effects", [])],
+        "candidates": _candidates(summary),
+        "excluded": [{**e, "name": names.effect(e["id"])} for e in summary.get("excluded", [])],
+        "unexplained": summary.get("unexplained", {}),
+        "remaining": words.remaining(data),
+        "nothing_added": same_model(data),
+        "dependence": [p for p in shown if p.name[0] != "\x00"],
+        "channels_shown": len(shown),
+        "channels": channels,
+        "clustered_by": "trip" if len(set(data.row("trip")[rows].tolist())) >= TRIPS_ENOUGH else "5-minute block",
+        "row_seconds": row_seconds(data, rows),
+        "n_test": int(rows.sum()),
+        "stages": _blocks(summary.get("stages", {})),
+        "subsets": _blocks(summary.get("subsets", {})),
+    }
+    _write("diagnosis.html.j2", context, images, directory)
+
+
+def write_calibration_report(data: ReportData, directory: Path) -> None:
+    """Write `report.html` and `figures/*.png` of a calibration: coefficients, measured against predicted, trips.
+
+    `data.rows["before"]` is the calibrated prediction; `data.summary` needs `target` and `baseline`, and may hold
+    `method`, `notes`, `clusters` and `split`. Channels and breakdown may be empty.
+    """
+    with style():
+        figures = {
+            "coefficients": coefficients(data),
+            "measured_predicted": measured_predicted(data),
+            "residual_by_trip": residual_by_trip(data),
+            "energy_by_effect": energy_by_effect(data),
+        }
+        images = {name: png(fig) for name, fig in figures.items() if fig is not None}
+    context = {**_common(data), "method": data.summary.get("method", ""), "n_shown": int(test_rows(data).sum())}
+    context["moved"] = [c["name"] for c in context["coefficients"] if c["flag"]]
+    _write("calibration.html.j2", context, images, directory)
+
+
+def _common(data: ReportData) -> dict[str, Any]:
+    """What both pages show."""
+    lines = trip_lines(data)
+    return {
+        "vehicle": data.vehicle,
+        "synthetic": data.synthetic,
+        "unit": data.unit,
+        "target": names.target(data.summary["target"])[0],
+        "summary": data.summary,
+        "notes": data.summary.get("notes", []),
+        "clusters": data.summary.get("clusters", {}),
+        "total": total_name(data),
+        "trips": lines,
+        "trip_count": {r: sum(t.role == r for t in lines) for r in ("train", "test", "unused")},
+        "n": {r: sum(t.n for t in lines if t.role == r) for r in ("train", "test", "unused")},
+        "coefficients": [_coefficient(k, p) for k, p in data.summary.get("baseline", {}).get("parameters", {}).items()],
+        "ledger": [_ledger(e) for e in data.ledger],
+        "command": data.command,
+        "seconds": data.seconds,
+    }
+
+
+def _write(template: str, context: dict[str, Any], images: dict[str, bytes], directory: Path) -> None:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    env = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    env.globals.update(
+        number=words.number,
+        percent=words.percent,
+        pair=words.pair,
+        plus_minus=words.plus_minus,
+        q_value=words.q_value,
+        count=words.count,
+        join=names.verbose_join,
+    )
+    sources = {k: f"data:image/png;base64,{base64.b64encode(v).decode('ascii')}" for k, v in images.items()}
+    page = env.get_template(template).render(**context, figures=sources)
+    folder = directory / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in images.items():
+        (folder / f"{name}.png").write_bytes(image)
+    (directory / "report.html").write_text(page, encoding="utf-8")
+
+
+def _tiles(data: ReportData) -> list[dict[str, str]]:
+    """The numbers that go with the answer: `label`, `value`, `note`."""
+    s = data.summary
+    before, after, u = s["before"]["test"], s["after"]["test"], s.get("unexplained", {})
+    b, a = words.pair(before.get("rmse"), after.get("rmse"))
+    same = same_model(data)
+    name = total_name(data)[0]
+    fit = after.get("fit_percent")
+    share = u.get("share_of_test_variance")
+    tiles = [
+        {
+            "label": "Error per row (RMSE)",
+            "value": f"{a} {data.unit}" if same else f"{b} → {a} {data.unit}",
+            "note": f"test rows, n = {after.get('n', 0):,}",
+        },
+        {
+            "label": f"{name.capitalize()} error",
+            "value": words.percent(after.get("pe_percent"))
+            if same
+            else f"{words.percent(before.get('pe_percent'))} → {words.percent(after.get('pe_percent'))}",
+            "note": "all test trips together",
+        },
+        {
+            "label": "Noise floor",
+            "value": words.number(u.get("noise_floor_rmse"), 2, data.unit),
+            "note": "estimated: what no model can predict from this log",
+        },
+        {
+            "label": "Still predictable",
+            "value": words.percent(None if share is None else 100 * share, signed=False, decimals=0),
+            "note": "of the variance of the remaining error",
+        },
+    ]
+    if fit is not None:
+        start = before.get("fit_percent")
+        value = words.percent(fit, signed=False)
+        if not same and start is not None:
+            value = f"{words.percent(start, signed=False)} → {value}"
+        tiles.insert(2, {"label": "Fit (NRMSE)", "value": value, "note": "100 % is perfect, 0 % no better than the mean"})
+    return tiles
+
+
+def _found(data: ReportData, e: dict[str, Any]) -> dict[str, Any]:
+    """A row of "what was found"."""
+    said = names.explained(e["id"])
+    stability = e.get("stability")
+    return {
+        **e,
+        "name": names.effect(e["id"]),
+        "words": e.get("words") or said.get("words", ""),
+        "equation": e.get("equation") or said.get("equation", ""),
+        "separated_by": e.get("separated_by") or said.get("separated_by", ""),
+        "sizes": [
+            (names.parameter(k), words.plus_minus(p.get("value"), p.get("sd"), p.get("unit")))
+            for k, p in e.get("parameters", {}).items()
+        ],
+        "stability": words.percent(None if stability is None else 100 * stability, signed=False, decimals=0),
+        "twins": [names.effect(t) for t in e.get("indistinguishable_from") or []],
+        "rmse": words.pair(e.get("test_rmse_before"), e.get("test_rmse_after")),
+    }
+
+
+def _candidates(summary: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """Candidates by gain, the leaders apart; those that this log cannot show last."""
+    rows = [{**c, "name": names.effect(c["id"])} for c in summary.get("candidates", [])]
+    tried = sorted((c for c in rows if c.get("score") is not None), key=lambda c: -c["score"])
+    tried += [c for c in rows if c.get("score") is None]
+    most = CANDIDATES_SHOWN if len(tried) > CANDIDATES_SHOWN + 2 else len(tried)
+    return {"first": tried[:most], "rest": tried[most:]}
+
+
+def _coefficient(path: str, p: dict[str, Any]) -> dict[str, Any]:
+    """A row of the table of coefficients, flagged where it moved far from its own table."""
+    name, unit = names.coefficient(path)
+    unit = p.get("unit") or unit
+    z, prior = p.get("prior_z"), p.get("prior_value")
+    if z is None and prior is not None and p.get("prior_sd"):
+        z = (p["value"] - prior) / p["prior_sd"]
+    return {
+        "path": path,
+        "name": name,
+        "value": words.plus_minus(p.get("value"), p.get("sd"), unit),
+        "prior": words.plus_minus(prior, p.get("prior_sd"), unit) if p.get("prior_sd") else "none",
+        "z": "–" if z is None else f"{z:+.1f}".replace("-", "−"),
+        "flag": z is not None and abs(z) > Z_FLAG,
+        "absorbs": [names.effect(a) for a in p.get("absorbs") or []],
+    }
+
+
+def _ledger(e: dict[str, Any]) -> dict[str, Any]:
+    """A row of the ledger; where it happened from `where`, or from the file and the trip."""
+    where = e.get("where")
+    if where is None:
+        where = ", ".join(str(e[k]) for k in ("trip", "file") if e.get(k))
+    return {"kind": e.get("kind", ""), "where": where, "column": e.get("column") or "", "count": e.get("count") or 0,
+            "reason": e.get("reason", "")}
+
+
+def _blocks(blocks: dict[str, Any]) -> list[dict[str, Any]]:
+    """Named before/after metrics (stages, subsets) as rows."""
+    rows = []
+    for name, block in blocks.items():
+        before, after = block.get("before") or {}, block.get("after") or {}
+        rows.append(
+            {
+                "name": name,
+                "n": after.get("n") or before.get("n") or 0,
+                "rmse": words.pair(before.get("rmse"), after.get("rmse")),
+                "pe": (words.percent(before.get("pe_percent")), words.percent(after.get("pe_percent"))),
+                "unit": block.get("unit", ""),
+            }
+        )
+    return rows

@@ -1,0 +1,197 @@
+"""Summaries that the figures draw: binned means with their error, autocorrelation, spectrum, a stretch to look at."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdev_jax.report.data import ReportData, test_rows
+
+__all__ = [
+    "Binned",
+    "autocorrelation",
+    "binned",
+    "blocks",
+    "dependence",
+    "distance_since_start",
+    "edges_of",
+    "row_seconds",
+    "runs",
+    "stretch",
+    "thin",
+    "variance_by_period",
+]
+
+BINS = 14
+BLOCK_S = 300.0  # design.md: with few trips, errors are clustered by blocks of at least 5 minutes
+TRIPS_ENOUGH = 8  # design.md: from so many trips on, a cluster is a trip
+
+
+@dataclass(frozen=True)
+class Binned:
+    """Mean of a residual in bins of a channel: centre, mean, standard error (errors clustered), rows in it."""
+
+    x: np.ndarray
+    mean: np.ndarray
+    error: np.ndarray
+    n: np.ndarray
+
+
+def runs(trip: np.ndarray) -> list[slice]:
+    """Runs of equal trip ids."""
+    cut = np.flatnonzero(np.diff(trip)) + 1
+    return [slice(int(a), int(b)) for a, b in zip(np.r_[0, cut], np.r_[cut, len(trip)], strict=True) if b > a]
+
+
+def blocks(data: ReportData, rows: np.ndarray) -> np.ndarray:
+    """Cluster id of each chosen row: its trip, or with fewer than 8 trips a block of 5 minutes of it."""
+    trip = data.row("trip")[rows]
+    if len(np.unique(trip)) >= TRIPS_ENOUGH:
+        return np.unique(trip, return_inverse=True)[1]
+    part = np.floor(np.nan_to_num(data.row("time_s")[rows]) / BLOCK_S).astype(np.int64)
+    return np.unique(trip * (part.max(initial=0) - part.min(initial=0) + 1) + part, return_inverse=True)[1]
+
+
+def distance_since_start(data: ReportData) -> np.ndarray:
+    """Distance from the start of each trip to the row's middle [m]."""
+    trip, step = data.row("trip"), np.nan_to_num(data.row("distance_m"))
+    out = np.empty(len(step))
+    for s in runs(trip):
+        out[s] = np.cumsum(step[s]) - 0.5 * step[s]
+    return out
+
+
+def edges_of(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
+    """Inner edges of bins with like numbers of rows; one bin a value where there are few. None: constant."""
+    x = x[np.isfinite(x)]
+    if not len(x):
+        return None
+    sample = x if len(x) <= 50_000 else x[:: len(x) // 50_000]
+    values = np.unique(sample)
+    if len(values) < 2 or values[-1] - values[0] <= 1e-9 * max(abs(values[-1]), abs(values[0])):
+        return None
+    if len(values) <= bins:
+        return 0.5 * (values[1:] + values[:-1])
+    edges = np.unique(np.quantile(sample, np.linspace(0, 1, bins + 1)[1:-1]))
+    if len(edges) < bins // 2:  # half of the rows at one value: like widths tell more
+        edges = np.linspace(values[0], values[-1], bins + 1)[1:-1]
+    return edges
+
+
+def binned(x: np.ndarray, residual: np.ndarray, cluster: np.ndarray, edges: np.ndarray, least: int = 5) -> Binned:
+    """Means by bin; the error of a mean sums residuals by cluster first, for they are not independent."""
+    good = np.isfinite(x) & np.isfinite(residual)
+    x, residual, cluster = x[good], residual[good], cluster[good]
+    place = np.searchsorted(edges, x)
+    bins = len(edges) + 1
+    n = np.bincount(place, minlength=bins)
+    safe = np.maximum(n, 1)
+    centre = np.bincount(place, x, minlength=bins) / safe
+    mean = np.bincount(place, residual, minlength=bins) / safe
+    clusters = int(cluster.max(initial=0)) + 1
+    sums = np.bincount(place * clusters + cluster, residual - mean[place], minlength=bins * clusters)
+    groups = sums.reshape(bins, clusters)
+    there = np.maximum((np.bincount(place * clusters + cluster, minlength=bins * clusters) > 0).reshape(bins, clusters).sum(1), 2)
+    error = np.sqrt(np.sum(groups**2, axis=1) * there / (there - 1)) / safe
+    few = n < least
+    return Binned(centre[~few], mean[~few], error[~few], n[~few])
+
+
+def dependence(x: np.ndarray, residual: np.ndarray, edges: np.ndarray) -> float:
+    """Share of the residual's variance that its mean by bin of the channel makes, less what chance makes (≥ 0)."""
+    good = np.isfinite(x) & np.isfinite(residual)
+    x, residual = x[good], residual[good]
+    if len(x) < 20:
+        return 0.0
+    place = np.searchsorted(edges, x)
+    n = np.bincount(place, minlength=len(edges) + 1)
+    mean = np.bincount(place, residual, minlength=len(n)) / np.maximum(n, 1)
+    variance = float(np.mean(residual**2))
+    share = float(np.sum(n * mean**2)) / len(x) / variance if variance > 0 else 0.0
+    return max(share - len(n) / len(x), 0.0)
+
+
+def row_seconds(data: ReportData, rows: np.ndarray) -> tuple[float, bool]:
+    """Typical duration of a row [s], and whether all are (nearly) alike."""
+    d = data.row("duration_s")[rows]
+    d = d[np.isfinite(d) & (d > 0)]
+    typical = float(np.median(d)) if len(d) else 1.0
+    return typical, bool(len(d) and np.mean(np.abs(d - typical) < 0.05 * typical) > 0.9)
+
+
+def autocorrelation(residual: np.ndarray, trip: np.ndarray, lags: int) -> np.ndarray:
+    """Correlation of the residual with itself `0 … lags` rows later, within trips, about the overall mean."""
+    r = residual - residual.mean()
+    products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
+    for s in runs(trip):
+        x = r[s]
+        size = 1 << int(np.ceil(np.log2(max(2 * len(x), 2))))
+        spectrum = np.fft.rfft(x, size)
+        acf = np.fft.irfft(spectrum * np.conj(spectrum), size)[: min(lags + 1, len(x))]
+        products[: len(acf)] += acf
+        pairs[: len(acf)] += len(x) - np.arange(len(acf))
+    covariance = products / np.maximum(pairs, 1)
+    return covariance / covariance[0] if covariance[0] > 0 else np.zeros(lags + 1)
+
+
+def variance_by_period(
+    residual: np.ndarray, trip: np.ndarray, seconds: float, longest: int = 4096
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residual variance by length of its cycles: `(period [s], variance per octave)`, by Welch's averages (1967)."""
+    lengths = [s.stop - s.start for s in runs(trip)]
+    length = int(min(longest, max(lengths, default=0)))
+    if length < 32:
+        return np.empty(0), np.empty(0)
+    length = 1 << int(np.floor(np.log2(length)))
+    window = np.hanning(length)
+    power, pieces = np.zeros(length // 2 + 1), 0
+    for s in runs(trip):
+        x = residual[s]
+        for start in range(0, len(x) - length + 1, length // 2):
+            power += np.abs(np.fft.rfft(x[start : start + length] * window)) ** 2
+            pieces += 1
+    if not pieces:
+        return np.empty(0), np.empty(0)
+    density = 2 * seconds * power / (pieces * np.sum(window**2))  # one-sided, per Hz
+    frequency = np.fft.rfftfreq(length, seconds)
+    octave = np.floor(3 * np.log2(frequency[1:] / frequency[1])).astype(int)  # thirds of an octave, as acousticians use
+    n = np.maximum(np.bincount(octave), 1)
+    centre = np.bincount(octave, frequency[1:]) / n
+    mean = np.bincount(octave, density[1:] * frequency[1:]) / n
+    there = np.bincount(octave) > 0
+    return 1.0 / centre[there], np.log(2) * mean[there]
+
+
+def stretch(data: ReportData, rows: int = 240) -> slice | None:
+    """The stretch of one test trip whose errors, before and after, are nearest to those of all test rows.
+
+    Typical on purpose, not the best. Stretches that mostly stand still are passed over where others are there.
+    """
+    good = test_rows(data)
+    if not good.any():
+        return None
+    trip = data.row("trip")
+    whole = [float(np.sqrt(np.mean(data.residual(w)[good] ** 2))) + 1e-12 for w in ("before", "after")]
+    spread = float(np.std(data.row("measured")[good])) + 1e-12
+    best, least = None, np.inf
+    part = np.cumsum(np.r_[True, (np.diff(trip) != 0) | (np.diff(good.astype(int)) != 0)])
+    for s in runs(part):
+        if not good[s.start]:
+            continue
+        n = s.stop - s.start
+        length = min(rows, n)
+        for start in range(s.start, s.stop - length + 1, max(length, (n - length) // 200 or 1)):
+            here = slice(start, start + length)
+            cost = sum(
+                abs(np.log((np.sqrt(np.mean(data.residual(w)[here] ** 2)) + 1e-12) / t))
+                for w, t in zip(("before", "after"), whole, strict=True)
+            )
+            cost += 4 * max(0.0, 0.8 - float(np.std(data.row("measured")[here])) / spread)
+            cost += 2 * np.log(rows / length)
+            if cost < least:
+                best, least = here, cost
+    return best
+
+
+def thin(n: int, most: int = 4000) -> np.ndarray:
+    """At most so many of n rows, in order and the same every time."""
+    return np.arange(n) if n <= most else np.sort(np.random.default_rng(0).choice(n, most, replace=False))

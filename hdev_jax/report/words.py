@@ -1,0 +1,189 @@
+"""Numbers and sentences as a reader wants them: the answer first."""
+
+import math
+from typing import Any
+
+from hdev_jax.report import names
+from hdev_jax.report.data import ReportData, total_name
+
+__all__ = ["NBSP", "answer", "answer_parts", "count", "number", "pair", "percent", "plus_minus", "q_value", "remaining"]
+
+NBSP = "\u00a0"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_MINUS = str.maketrans("-", "−")
+_DASH = "–"
+
+
+def _finite(*values: Any) -> bool:
+    return all(isinstance(v, (int, float)) and math.isfinite(v) for v in values)
+
+
+def _fixed(x: float, decimals: int) -> str:
+    text = f"{x:,.{max(decimals, 0)}f}"
+    if float(text.replace(",", "")) == 0:
+        text = text.lstrip("-")
+    return text.translate(_MINUS)
+
+
+def _decimals(x: float, digits: int) -> int:
+    """Decimals that show `digits` significant digits of x, none above the point."""
+    return max(digits - 1 - math.floor(math.log10(abs(x))), 0) if x else 0
+
+
+def _unit(text: str, unit: str | None) -> str:
+    return text if unit in (None, "", "1") else f"{text}{NBSP}{unit}"
+
+
+def number(x: Any, digits: int = 3, unit: str | None = "") -> str:
+    """`digits` significant digits: 0.0123, 18.9, 24,000, 3.02×10⁻⁶; a dash for what is no number."""
+    if not _finite(x):
+        return _DASH
+    if x and not 1e-4 <= abs(x) < 1e7:
+        exponent = math.floor(math.log10(abs(x)))
+        return _unit(f"{_fixed(x / 10.0**exponent, digits - 1)}×10{str(exponent).translate(_SUPERSCRIPT)}", unit)
+    return _unit(_fixed(x, _decimals(x, digits)), unit)
+
+
+def plus_minus(value: Any, sd: Any, unit: str | None = "") -> str:
+    """`0.98 ± 0.03 m`: the standard deviation to one digit (two where it begins with 1 or 2), the value to match."""
+    if not _finite(value):
+        return _DASH
+    if not _finite(sd) or sd <= 0:
+        return number(value, 4, unit)
+    size = max(abs(value), sd)
+    exponent = math.floor(math.log10(size))
+    exponent = 0 if -3 <= exponent < 7 else exponent
+    value, sd = value / 10.0**exponent, sd / 10.0**exponent
+    lead = sd / 10.0 ** math.floor(math.log10(sd))
+    decimals = _decimals(sd, 2 if lead < 2.95 else 1)
+    if decimals > 7:  # an sd far below the digits worth reading
+        return number(value * 10.0**exponent, 6, unit)
+    text = f"{_fixed(value, decimals)} ± {_fixed(sd, decimals)}"
+    if exponent:
+        text = f"({text})×10{str(exponent).translate(_SUPERSCRIPT)}"
+    return _unit(text, unit)
+
+
+def pair(before: Any, after: Any) -> tuple[str, str]:
+    """Two numbers with the same decimals: two digits of the smaller one, more where they would look the same."""
+    if not _finite(before, after):
+        return number(before), number(after)
+    sizes = [abs(x) for x in (before, after) if x]
+    if not sizes:
+        return "0", "0"
+    if min(sizes) < 1e-4:
+        return number(before), number(after)
+    start = max(_decimals(min(sizes), 2), 0 if max(sizes) >= 100 else 1 if max(sizes) >= 10 else 0)
+    for decimals in range(start, start + 3):
+        texts = _fixed(before, decimals), _fixed(after, decimals)
+        if texts[0] != texts[1]:
+            return texts
+    return _fixed(before, start), _fixed(after, start)
+
+
+def percent(x: Any, *, signed: bool = True, decimals: int = 1) -> str:
+    """`−4.1 %`; a second decimal for what would read 0.0, none from 100 % on, a dash for null."""
+    if not _finite(x):
+        return _DASH
+    if abs(x) < 0.5 * 10**-decimals and x:
+        decimals += 1
+    decimals = 0 if abs(x) >= 100 else decimals
+    text = _fixed(x, decimals)
+    plus = "+" if signed and x > 0 and float(f"{x:.{decimals}f}") else ""
+    return f"{plus}{text}{NBSP}%"
+
+
+def q_value(q: Any) -> str:
+    """A corrected chance of a false find: `0.03`, `< 0.0001`."""
+    if not _finite(q):
+        return _DASH
+    return f"<{NBSP}0.0001" if q < 1e-4 else f"{q:.4f}" if q < 0.001 else f"{q:.3f}" if q < 0.1 else f"{q:.2f}"
+
+
+def count(n: int, word: str) -> str:
+    """`1 trip`, `4 trips`, `143,000 rows`."""
+    return f"{n:,} {word}{'' if n == 1 else 's'}"
+
+
+def _sizes(effect: dict[str, Any]) -> str:
+    """` (scale 0.98 ± 0.03)`."""
+    found = [
+        f"{names.parameter(name)} {plus_minus(p.get('value'), p.get('sd'), p.get('unit'))}"
+        for name, p in effect.get("parameters", {}).items()
+    ]
+    if len(found) > 3:
+        return f" ({', '.join(found[:2])} and {len(found) - 2} more values)"
+    return f" ({', '.join(found)})" if found else ""
+
+
+def _missing(effects: list[dict[str, Any]]) -> str:
+    items = []
+    for e in effects[:4]:
+        twins = [names.effect(t) for t in e.get("indistinguishable_from") or []]
+        alike = f" or {names.verbose_join(twins, 'or')}, which this log cannot tell apart," if twins else ""
+        items.append(f"\x02{names.effect(e['id'])}\x03{_sizes(e)}{alike}")
+    if len(effects) > 4:
+        items.append(f"{len(effects) - 4} more")
+    return names.verbose_join(items).rstrip(",")
+
+
+def _errors(data: ReportData) -> str:
+    """`the error falls from 18.9 to 7.6 Wh RMSE per row, energy error from −4.1 % to −0.2 %`."""
+    before, after = data.summary["before"]["test"], data.summary["after"]["test"]
+    b, a = pair(before.get("rmse"), after.get("rmse"))
+    way = "falls" if after["rmse"] < before["rmse"] else "rises"
+    text = f"the error {way} from {b} to {a}{NBSP}{data.unit} RMSE per row"
+    if b == a:
+        text = f"the error stays at {b}{NBSP}{data.unit} RMSE per row"
+    if _finite(before.get("pe_percent"), after.get("pe_percent")):
+        name = total_name(data)[0]
+        text += f", {name} error from {percent(before['pe_percent'])} to {percent(after['pe_percent'])}"
+    return text
+
+
+def _where(data: ReportData) -> str:
+    n = len(data.summary.get("split", {}).get("test_trips", []))
+    return f"on {count(n, 'trip')} that no choice has seen"
+
+
+def remaining(data: ReportData) -> str:
+    """What is left, in a sentence or two: on what it depends, what it looks like, how much of it there is."""
+    u = data.summary.get("unexplained", {})
+    on = [names.channel(c).label for c in u.get("depends_on") or []]
+    text = f"it depends on {names.verbose_join(on)}" if on else "no channel of the log names it"
+    if signature := str(u.get("signature") or "").strip():
+        text += f" – {signature.rstrip('.')}"
+    return text
+
+
+def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
+    """The answer as (text, bold) pieces, so that a page can mark names without trusting them."""
+    s = data.summary
+    verdict, effects = s.get("verdict", ""), s.get("effects", [])
+    if effects:
+        text = f"The declared model misses {_missing(effects)}: {_where(data)} {_errors(data)}."
+        if "unexplained" in verdict:
+            text += f" \x02Something more\x03 is missing that the library does not hold: {remaining(data)}."
+    elif "unexplained" in verdict:
+        share = s.get("unexplained", {}).get("share_of_test_variance")
+        text = f"\x02Something is missing that the library does not hold\x03: {remaining(data)}."
+        if _finite(share):
+            text += f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of the error."
+    else:
+        tried = sum(c.get("score") is not None for c in s.get("candidates", []))
+        test = s["after"]["test"]
+        text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
+        text += f"{_where(data)} the error is {number(test.get('rmse'))}{NBSP}{data.unit} RMSE per row"
+        if _finite(test.get("pe_percent")):
+            text += f", {total_name(data)[0]} error {percent(test['pe_percent'])}"
+        text += "."
+    pieces = []
+    for i, piece in enumerate(text.replace("\x03", "\x02").split("\x02")):
+        if piece:
+            pieces.append((piece, i % 2 == 1))
+    return pieces
+
+
+def answer(data: ReportData) -> str:
+    """The answer in one sentence, as plain text."""
+    return "".join(text for text, _ in answer_parts(data))

@@ -1,0 +1,78 @@
+"""`Segments`: the only record. One row is one interval of driving, 100 m of road or 0.22 s of CAN samples."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+__all__ = ["Column", "Ids", "Segments", "trip_slices"]
+
+Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
+Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
+
+
+class Segments(eqx.Module):
+    """Columns with one leading axis; ragged trips are concatenated and told apart by `trip`.
+
+    The row kernel sees the same class with scalar leaves, so an effect is written for one row. Columns a log may lack
+    (`grade_rad`, `mass_kg`, `motor_torque_nm`, `ambient_temp_c`, …, named as in a log's header, in SI) are in
+    `channels`; whether one is there is structure and known before tracing.
+
+    **Arguments:** `trip` and `vehicle` are 0-based ids (rows of a trip are contiguous and in time order), `time_s` is
+    the start of the interval from the start of the trip, `duration_s` > 0, `distance_m` ≥ 0, speeds in m/s.
+    """
+
+    trip: Ids
+    vehicle: Ids
+    time_s: Column
+    duration_s: Column
+    distance_m: Column
+    speed_start_mps: Column
+    speed_end_mps: Column
+    channels: dict[str, Column]
+
+    @property
+    def speed_mps(self) -> Column:
+        """Mean speed of the interval, distance over duration [m/s]; zero at standstill."""
+        return self.distance_m / self.duration_s
+
+    @property
+    def accel_mps2(self) -> Column:
+        """(v_end − v_start) / duration [m/s²]; an accelerometer's reading is `channels["accel_mps2"]`."""
+        return (self.speed_end_mps - self.speed_start_mps) / self.duration_s
+
+    def __len__(self) -> int:
+        return self.trip.shape[0]
+
+    def has(self, *names: str) -> bool:
+        """Whether every one of these channels is there."""
+        return all(n in self.channels for n in names)
+
+    def get(self, name: str, default: float | Column) -> float | Column:
+        """The channel, or `default` where the log lacks it."""
+        return self.channels.get(name, default)
+
+    def with_channels(self, **columns: Column) -> "Segments":
+        """The same rows with channels added or replaced."""
+        return eqx.tree_at(lambda s: s.channels, self, {**self.channels, **columns})
+
+    def without(self, *names: str) -> "Segments":
+        """The same rows with these channels taken away."""
+        kept = {k: v for k, v in self.channels.items() if k not in names}
+        return eqx.tree_at(lambda s: s.channels, self, kept)
+
+    def take(self, rows: np.ndarray) -> "Segments":
+        """Rows by boolean mask or index; ids are kept as they are. Host arrays only."""
+        return jax.tree.map(lambda x: np.asarray(x)[rows], self)
+
+
+def trip_slices(trip: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """`(id, slice of its rows)` for each run of equal ids, in the order of the rows."""
+    trip = np.asarray(trip)
+    if not len(trip):
+        return
+    edges = np.flatnonzero(np.diff(trip)) + 1
+    for start, stop in zip(np.r_[0, edges], np.r_[edges, len(trip)], strict=True):
+        yield int(trip[start]), slice(int(start), int(stop))

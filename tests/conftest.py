@@ -1,0 +1,46 @@
+"""Every test runs with float64, without silent rank promotion, and with the shapes in annotations checked."""
+
+import os
+from pathlib import Path
+
+import hypothesis
+import jax
+import jaxtyping
+import matplotlib as mpl
+import pytest
+
+# Before any module of the package is imported.
+jaxtyping.install_import_hook("hdev_jax", "beartype.beartype")
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+mpl.use("Agg")
+hypothesis.settings.register_profile("hdev", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("hdev")
+
+DATA = Path(os.environ.get("HDEV_DATA") or Path(__file__).parents[2] / "shared" / "data")
+NO_DATA = f"no measured data in {DATA} (HDEV_DATA)"
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of measured data; the test is skipped where there is none."""
+    if not DATA.is_dir():
+        pytest.skip(NO_DATA)
+    return DATA
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "data_dir" in getattr(item, "fixturenames", ()):
+            item.add_marker("data")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item):
+    """In CI, with the measured data there, a test that reads it must run: its skip is a failure."""
+    report = yield
+    skipped = report.skipped and not hasattr(report, "wasxfail")
+    if skipped and "data" in item.keywords and os.environ.get("CI", "").lower() == "true" and DATA.is_dir():
+        report.outcome = "failed"
+        report.longrepr = f"skipped although the measured data is in {DATA}: {report.longrepr}"
+    return report
