@@ -7,4 +7,6 @@ class InputError(Exception):
     """The input is at fault. The message is one line: which file, row, column; what was expected; what to do."""
 
     def __init__(self, message: str):
-        super().__init__(" ".join(str(message).split()))
+        line = " ".join(str(message).split())
+        # what a damaged file holds must not reach the terminal as control characters
+        super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line))

@@ -271,7 +271,7 @@ def _choose(problem: _Problem, state: Search, view: _View, tell: Callable[[str],
     ]
     able.sort(key=lambda s: -_bic(s, n))
     while able:
-        close = [s for s in able[:LEADERS] if _bic(s, n) > 0.5 * _bic(able[0], n)]
+        close = [s for s in able[:LEADERS] if _bic(s, n) > 0.7 * _bic(able[0], n)]
         fits = []
         for s in close:
             tell(f"refitting with {s.candidate.id}")

@@ -188,6 +188,8 @@ def _declared_efficiency(sheet: Sheet, why: str) -> Any:
 
 def most_gear(segments: Segments) -> int:
     """The highest gear in the log, 0 without gears."""
-    gear = np.asarray(segments.get("gear", np.zeros(1)), dtype=float)
+    if not segments.has("gear"):
+        return 0
+    gear = np.asarray(segments.channels["gear"], dtype=float)
     gear = gear[np.isfinite(gear)]
     return int(gear.max()) if len(gear) else 0

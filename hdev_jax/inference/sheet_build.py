@@ -30,7 +30,8 @@ class Builder:
     """One `Sheet.build`: what is used becomes a leaf and rows of the table, the rest a note."""
 
     def __init__(self, sheet: Sheet, segments: Segments, entry: Entry, target: Target, names: tuple[str, ...]):
-        self.sheet, self.segments, self.entry, self.target = sheet, segments, entry, target
+        self.sheet, self.segments, self.target = sheet, segments, target
+        self.entry: Entry = entry
         count = max(len(names), int(np.max(np.asarray(segments.vehicle), initial=0)) + 1)
         self.names = (*names, *(str(k) for k in range(len(names), count)))
         self.rows: list[Coefficient] = []
@@ -161,8 +162,7 @@ class Builder:
         for p in cls.parameters:
             d, key = sheet.declared.get(paths[p.name]), effect_key(cls, p)
             if d is None:
-                leaf = getattr(null, p.name)
-                values[p.name] = Grouped(jnp.asarray(leaf.values), leaf.by) if isinstance(leaf, Grouped) else leaf
+                values[p.name] = getattr(null, p.name)
             elif p.by and d.groups:
                 by_gear = np.full(gears + 1, p.null)
                 for gear, (value, sd) in d.groups.items():
@@ -181,6 +181,8 @@ class Builder:
         idle = {p.split(".")[0] for p in sheet.declared if "." in p and p not in used} - {"effects"}
         if self.entry == "wheel" and sheet.efficiency_map is not None:
             idle.add("driveline")
+        if self.target == "traction_force_n" and not self.segments.has("traction_force_n"):
+            idle.discard("driveline")  # the target itself is derived with it (`traction_force_from_torque`)
         before = f"the target {self.target} lies before it"
         reasons = {
             "road": _MEASURED[self.entry],

@@ -35,8 +35,7 @@ def augmented_sheet(
     found = {f"effects.{e}.{p}": v for e, parameters in effects.items() for p, v in parameters.items()}
     for name, (value, sd, *_) in {**calibration_values, **found}.items():
         path, group = _split(name)
-        new_effect = path.startswith("effects.") and path not in sheet.declared
-        if path not in declared and not new_effect and path not in KEYS:
+        if not path.startswith("effects.") and (path not in KEYS or KEYS[path].kind != "coefficient"):
             raise ValueError(f"{name!r} is no coefficient of a sheet")
         declared[path] = _updated(sheet, declared.get(path), path, group, (float(value), _sd(sd)))
     for path in declared:

@@ -84,7 +84,7 @@ def _numbers(raw: Raw, header: str, known: bool) -> np.ndarray | None:
         hint = "; a thousands separator or a decimal comma?" if "," in str(text.iloc[i]) else ""
         raise InputError(
             f"{raw.file}: {_where(i, raw.first_line)}, column '{header}': "
-            f"a number is expected, found '{text.iloc[i]}'{hint}"
+            f"a number is expected, found '{text.iloc[i][:40]}'{hint}"
         )
     return number.to_numpy(dtype=np.float64, na_value=np.nan)
 
@@ -122,7 +122,7 @@ def _seconds(raw: Raw, header: str) -> np.ndarray:
 
 def _labels(raw: Raw, header: str | None, default: str) -> tuple[np.ndarray, tuple[str, ...]]:
     """Codes and names of an id column (−1 where it is missing), or one name for all rows."""
-    if header is None:
+    if header is None or not bool(np.asarray(raw.table[header].notna()).any()):
         return np.zeros(len(raw.table), np.int64), (default,)
     series = raw.table[header]
     codes, names = pd.factorize(series)

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
+from hdev_jax.logs.matlab import read_mat
+from hdev_jax.logs.names import ENDINGS, stem, trip_of
 
-__all__ = ["ENDINGS", "Raw", "find_files", "read_bytes", "read_raw", "stem"]
+__all__ = ["Raw", "find_files", "read_bytes", "read_raw"]
 
-ENDINGS = {".csv": "csv", ".csv.gz": "csv", ".parquet": "parquet", ".pq": "parquet", ".mat": "mat"}
 _MAGIC = {b"\x1f\x8b": "gzip", b"PAR1": "Parquet", b"MATLAB": "MATLAB", b"\x89HDF": "HDF5", b"PK": "zip (or xlsx)"}
 _TEXT_IDS = ("trip_id", "vehicle_id")
 
@@ -35,14 +35,6 @@ class Raw:
     trip: str
     vehicle: str | None = None
     first_line: int = 0
-
-
-def stem(name: str) -> str:
-    """A file's name without its ending (`a.csv.gz` → `a`)."""
-    for ending in sorted(ENDINGS, key=len, reverse=True):
-        if name.lower().endswith(ending):
-            return name[: -len(ending)]
-    return Path(name).stem
 
 
 def _format(path: Path, adapter: Adapter) -> str:
@@ -86,10 +78,10 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
     kind = _format(path, adapter)
     data = read_bytes(path, kind)
     if kind == "mat":
-        raws = _read_mat(path, data, adapter)
+        raws = [Raw(path.name, table, trip) for trip, table in read_mat(path, data, adapter).items()]
     else:
         table, first_line = _read_table(path, data, kind)
-        raws = [Raw(path.name, table, _trip_of(path, adapter), first_line=first_line)]
+        raws = [Raw(path.name, table, trip_of(path, adapter), first_line=first_line)]
     if any(r.table.empty for r in raws):
         raise InputError(f"{path}: no rows")
     vehicle = None
@@ -99,15 +91,6 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
             raise InputError(f"{path}: vehicle_id = {adapter.vehicle_id!r} of {adapter.where} does not match its name")
     raws = [Raw(r.file, r.table, r.trip, vehicle, r.first_line) for r in raws]
     return [_with_companion(r, path, adapter) for r in raws] if adapter.companion else raws
-
-
-def _trip_of(path: Path, adapter: Adapter) -> str:
-    if adapter.trip_id is None:
-        return stem(path.name)
-    trip = adapter.match(adapter.trip_id, path.name)
-    if trip is None:
-        raise InputError(f"{path}: trip_id = {adapter.trip_id!r} of {adapter.where} does not match the file's name")
-    return trip
 
 
 def read_bytes(path: Path, kind: str = "csv") -> bytes:
@@ -226,75 +209,6 @@ def _read_csv(path: Path, data: bytes) -> tuple[pd.DataFrame, int]:
         raise InputError(f"{path}: not a regular table: {why}") from None
     table.columns = pd.Index([n or f"unnamed column {i + 1}" for i, n in enumerate(names)])
     return table, first + 2
-
-
-def _read_mat(path: Path, data: bytes, adapter: Adapter) -> list[Raw]:
-    import scipy.io
-
-    try:
-        content = scipy.io.loadmat(io.BytesIO(data))
-    except Exception as e:  # scipy lets any error of its parser through
-        raise InputError(f"{path}: truncated or damaged MATLAB file ({str(e)[:120]})") from None
-    arrays: dict[str, np.ndarray] = {}
-    for name, value in content.items():
-        if not name.startswith("__") and isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-            arrays[name] = value
-    if not arrays:
-        raise InputError(f"{path}: no numeric variable; save one vector a column (structs and tables are not read)")
-    if adapter.layout == "time_value":
-        return _time_value(path, arrays, adapter)
-    vectors = {n: a.ravel() for n, a in arrays.items() if a.ndim == 2 and min(a.shape) == 1}
-    if not vectors:
-        n, a = next(iter(arrays.items()))
-        raise InputError(
-            f"{path}: variable '{n}' is {a.shape[0]}×{a.shape[-1]}; layout 'table' has one vector a column; "
-            "for variables that are [time, value] the adapter says layout = 'time_value'"
-        )
-    sizes = {n: len(v) for n, v in vectors.items() if len(v) > 1}
-    if len(set(sizes.values())) > 1:
-        (n0, s0), (n1, s1) = next((a, b) for a in sizes.items() for b in sizes.items() if a[1] != b[1])
-        raise InputError(f"{path}: variables of different length: '{n0}' has {s0} values, '{n1}' {s1}")
-    size = next(iter(sizes.values()), 1)
-    return [Raw(path.name, pd.DataFrame({n: v for n, v in vectors.items() if len(v) == size}), _trip_of(path, adapter))]
-
-
-def _time_value(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> list[Raw]:
-    """Each variable is [time, value]; variables of a trip are put on the clock of the longest one."""
-    trips: dict[str, dict[str, np.ndarray]] = {}
-    for name, array in arrays.items():
-        if array.ndim != 2 or array.shape[1] != 2:
-            continue
-        trip, channel = stem(path.name), name
-        if adapter.trip_id is not None:
-            found = re.search(adapter.trip_id, name)
-            if found is None:
-                trip = adapter.match(adapter.trip_id, path.name) or ""
-                if not trip:
-                    raise InputError(f"{path}: trip_id = {adapter.trip_id!r} does not match the variable '{name}'")
-            else:
-                trip = next((g for g in found.groups() if g is not None), found.group(0))
-                channel = (name[: found.start()] + name[found.end() :]).strip("_")
-        if adapter.variable is not None:
-            channel = adapter.match(adapter.variable, name) or ""
-            if not channel:
-                continue
-        if channel in trips.setdefault(trip, {}):
-            raise InputError(f"{path}: two variables of trip {trip} are the channel '{channel}', one of them '{name}'")
-        trips[trip][channel] = array.astype(np.float64)
-    if not trips:
-        raise InputError(f"{path}: no variable of two columns [time, value] that the adapter {adapter.where} names")
-    raws = []
-    for trip, channels in trips.items():
-        longest = max(channels, key=lambda c: len(channels[c]))
-        clock = channels[longest][:, 0]
-        table: dict[str, np.ndarray] = {"time_s": clock}
-        for channel, a in channels.items():
-            same = len(a) == len(clock) and np.array_equal(a[:, 0], clock, equal_nan=True)
-            if not same and (len(a) < 2 or not np.all(np.diff(a[:, 0]) > 0)):
-                raise InputError(f"{path}: the time of '{channel}' in trip {trip} does not run forward")
-            table[channel] = a[:, 1] if same else np.interp(clock, a[:, 0], a[:, 1], left=np.nan, right=np.nan)
-        raws.append(Raw(path.name, pd.DataFrame(table), trip))
-    return raws
 
 
 def _with_companion(raw: Raw, path: Path, adapter: Adapter) -> Raw:

@@ -1,14 +1,13 @@
 """The start of an adapter for a log whose columns have other names."""
 
-import io
 import re
 from pathlib import Path
 
-import numpy as np
-
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter
-from hdev_jax.logs.readers import read_raw, stem
+from hdev_jax.logs.matlab import numeric_variables
+from hdev_jax.logs.names import stem
+from hdev_jax.logs.readers import read_bytes, read_raw
 from hdev_jax.units import COLUMNS, NEEDED_STEMS, accepted, parse_column
 
 __all__ = ["write_adapter_skeleton"]
@@ -101,21 +100,8 @@ def _line(header: str, used: set[str]) -> str:
 
 def _mat(path: Path) -> tuple[str, str, str, list[str]] | None:
     """Layout `time_value` where the variables look like it, with expressions for trip and channel."""
-    import scipy.io
-
-    from hdev_jax.logs.readers import read_bytes
-
-    try:
-        content = scipy.io.loadmat(io.BytesIO(read_bytes(path)))
-    except InputError:
-        raise
-    except Exception as e:  # scipy lets any error of its parser through
-        raise InputError(f"{path}: truncated or damaged MATLAB file ({str(e)[:120]})") from None
-    pairs = [
-        n
-        for n, a in content.items()
-        if isinstance(a, np.ndarray) and a.ndim == 2 and a.shape[1] == 2 and len(a) > 2 and a.dtype.kind == "f"
-    ]
+    content = numeric_variables(path, read_bytes(path, "mat"))
+    pairs = [n for n, a in content.items() if a.ndim == 2 and a.shape[1] == 2 and len(a) > 2 and a.dtype.kind == "f"]
     if not pairs:
         return None
     found = re.match(r"(.*?)(\d+)(_?)", pairs[0])

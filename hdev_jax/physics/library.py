@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.physics import battery, losses, road, sensors
@@ -43,7 +44,7 @@ def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
         if p.by:
             from hdev_jax.physics.effect import Grouped
 
-            values[p.name] = Grouped(np.full(gears + 1, p.null), p.by)
+            values[p.name] = Grouped(jnp.full(gears + 1, p.null), p.by)
         else:
             values[p.name] = np.asarray(p.null, dtype=float)
     return effect(**values)

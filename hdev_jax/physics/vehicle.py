@@ -158,9 +158,10 @@ class Vehicle(eqx.Module):
         return _Chain(added, wheel, drive, Point(force, power, torque, speed))
 
     def _sensed(self, row: Segments) -> Segments:
-        for e in self.effects:
+        car = resolve(self, row)
+        for e in car.effects:
             if e.overrides("sense"):
-                row = resolve(e, row).sense(row, self)
+                row = e.sense(row, car)
         return row
 
     def _rows(self, segments: Segments, of: Callable[[_Chain, Segments], Any]) -> Any:

@@ -1,4 +1,4 @@
-"""Figures without pyplot: one style, no global state left changed, PNG bytes out. Matplotlib is imported on first use."""
+"""Figures without pyplot: one style, no global state left changed, PNG out. Matplotlib is imported on first use."""
 
 import io
 import warnings
@@ -13,7 +13,7 @@ MEASURED, BEFORE, AFTER = "#1a1a1a", "#D55E00", "#0072B2"
 INK, GREY, LINE = "#1b1f24", "#6b7680", "#d9dee3"
 DPI = 150
 
-_RC = {
+_RC: Any = {
     "font.family": ["DejaVu Sans"],
     "font.size": 8.5,
     "axes.titlesize": 9,
@@ -58,9 +58,9 @@ def figure(width: float, height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    fig = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    fig = Figure(figsize=(width, height), dpi=DPI)
     FigureCanvasAgg(fig)
-    fig.get_layout_engine().set(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.06)
+    fig.set_layout_engine("constrained", w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.06)
     return fig
 
 

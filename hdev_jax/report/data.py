@@ -81,11 +81,11 @@ def test_rows(data: ReportData) -> np.ndarray:
     return chosen & np.isfinite(data.residual("before")) & np.isfinite(data.residual("after"))
 
 
-def _weight(data: ReportData) -> np.ndarray:
+def _weight(data: ReportData, rows: np.ndarray) -> np.ndarray:
     """What a sum weighs by (contract §4): power by duration, force by distance; torque by duration, energy by 1."""
     if data.unit == "Wh":
-        return np.ones(len(data.row("measured")))
-    return data.row("distance_m" if data.unit == "N" else "duration_s")
+        return np.ones(len(rows))
+    return data.row("distance_m" if data.unit == "N" else "duration_s")[rows]
 
 
 def total_name(data: ReportData) -> tuple[str, str]:
@@ -94,9 +94,9 @@ def total_name(data: ReportData) -> tuple[str, str]:
 
 
 def total(data: ReportData, rows: np.ndarray) -> float:
-    """The measured total of some rows in the unit of `total_name`: kWh, or the mean torque in Nm."""
-    rows = rows & np.isfinite(data.row("measured"))
-    weight = _weight(data)[rows]
+    """The measured total of some rows (by index) in the unit of `total_name`: kWh, or the mean torque in Nm."""
+    rows = rows[np.isfinite(data.row("measured")[rows])]
+    weight = _weight(data, rows)
     s = float(np.sum(data.row("measured")[rows] * weight))
     if data.unit == "Nm":
         return s / max(float(np.sum(weight)), 1e-12)
@@ -104,27 +104,28 @@ def total(data: ReportData, rows: np.ndarray) -> float:
 
 
 def metrics(data: ReportData, rows: np.ndarray, when: str) -> dict[str, Any]:
-    """METRICS of contract §4 over some rows (without `fit_percent`), for trips that diagnosis.json does not list."""
-    rows = rows & np.isfinite(data.residual(when)) & np.isfinite(data.row("measured"))
-    n = int(rows.sum())
-    if not n:
+    """METRICS of contract §4 (less `fit_percent`) over rows by index, for trips that diagnosis.json does not list."""
+    error = data.row(when)[rows] - data.row("measured")[rows]
+    good = np.isfinite(error)
+    rows, error = rows[good], error[good]
+    if not len(rows):
         return {"rmse": None, "mse": None, "bias": None, "pe_percent": None, "n": 0}
-    error = -data.residual(when)[rows]
-    weight, measured = _weight(data)[rows], data.row("measured")[rows]
+    weight, measured = _weight(data, rows), data.row("measured")[rows]
     net, gross = float(np.sum(weight * measured)), float(np.sum(weight * np.abs(measured)))
     mse = float(np.mean(error**2))
     pe = None if gross == 0 or abs(net) < 0.05 * gross else 100.0 * float(np.sum(weight * error)) / net
-    return {"rmse": mse**0.5, "mse": mse, "bias": float(np.mean(error)), "pe_percent": pe, "n": n}
+    return {"rmse": mse**0.5, "mse": mse, "bias": float(np.mean(error)), "pe_percent": pe, "n": len(rows)}
 
 
 def _parts(data: ReportData) -> Iterator[tuple[int, str, np.ndarray, bool]]:
     trip = data.row("trip")
     role = np.where(~data.row("used"), "unused", np.where(data.row("test"), "test", "train"))
-    for i in dict.fromkeys(trip.tolist()):
-        here = trip == i
-        roles = [r for r in ("train", "test", "unused") if np.any(here & (role == r))]
+    order = np.argsort(trip, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(trip[order])) + 1) if len(trip) else []
+    for rows in sorted(groups, key=lambda g: int(g[0])):
+        roles = [r for r in ("train", "test", "unused") if np.any(role[rows] == r)]
         for r in roles:
-            yield i, r, here & (role == r), len(roles) > 1
+            yield int(trip[rows[0]]), r, rows[role[rows] == r], len(roles) > 1
 
 
 def trip_lines(data: ReportData) -> list[TripLine]:
@@ -138,7 +139,7 @@ def trip_lines(data: ReportData) -> list[TripLine]:
             TripLine(
                 name=f"{name} ({role} part)" if split else name,
                 role=role,
-                n=int(rows.sum()),
+                n=len(rows),
                 hours=float(np.nansum(data.row("duration_s")[rows])) / 3600.0,
                 km=float(np.nansum(data.row("distance_m")[rows])) / 1000.0,
                 total=total(data, rows),

@@ -1,4 +1,4 @@
-"""The figures about errors and energy: before and after, trips, energy by effect, coefficients, measured against predicted."""
+"""The figures about errors and energy: before and after, trips, effects, coefficients, measured and predicted."""
 
 from typing import Any
 
@@ -8,7 +8,6 @@ from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, MEASURED, axis_label, figure, tidy
 from hdev_jax.report.data import ReportData, TripLine, same_model, test_rows, total_name, trip_lines
 from hdev_jax.report.statistics import stretch, thin
-from hdev_jax.report.words import number
 
 __all__ = [
     "WIDTH",
@@ -35,7 +34,7 @@ def short(name: str, most: int = 24) -> str:
 def models(data: ReportData) -> list[tuple[str, str, str]]:
     """(`before` or `after`, what to call it, colour): one model where nothing was added."""
     if same_model(data):
-        return [("after", "declared model", AFTER)]
+        return [("after", "calibrated model", AFTER)]
     return [("before", "before: declared model", BEFORE), ("after", "after: with what was found", AFTER)]
 
 
@@ -65,12 +64,19 @@ def _number(x: Any) -> float:
     return float("nan") if x is None else float(x)
 
 
+def _title(data: ReportData, words: str) -> str:
+    """A title that says so where the data are synthetic, for figures without a legend."""
+    return f"{words} – synthetic data" if data.synthetic else words
+
+
 def legend(fig: Any, data: ReportData, *, measured: bool = False, dots: bool = False) -> None:
     """One legend above the panels, where it covers nothing."""
     from matplotlib.lines import Line2D
 
-    line = {"linestyle": "none", "marker": "o", "markersize": 5} if dots else {"linewidth": 1.8}
+    line: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 5} if dots else {"linewidth": 1.8}
     handles = [Line2D([], [], color=MEASURED, label="measured", **line)] if measured else []
+    if data.synthetic:
+        handles.insert(0, Line2D([], [], linestyle="none", label="synthetic data:"))
     handles += [Line2D([], [], color=colour, label=words, **line) for _, words, colour in models(data)]
     fig.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.6, columnspacing=1.6)
 
@@ -82,7 +88,8 @@ def before_after(data: ReportData) -> Any:
     grid = fig.add_gridspec(2, 2, width_ratios=[1, 1.9], height_ratios=[1.5, 1])
     left = fig.add_subplot(grid[:, 0])
     _dumbbells(left, lines, "rmse", data)
-    left.set_xlim(left=0)
+    worst = [_number(t.before.get("rmse")) for t in lines] + [_number(t.after.get("rmse")) for t in lines]
+    left.set_xlim(0, 1.07 * max((w for w in worst if np.isfinite(w)), default=1.0) or 1.0)
     left.set_xlabel(f"RMSE per row [{data.unit}]")
     left.set_title("Error of each test trip")
     top = fig.add_subplot(grid[0, 1])
@@ -104,7 +111,7 @@ def before_after(data: ReportData) -> Any:
     top.set_ylabel(axis_label(names.target(data.summary["target"])[1], data.unit))
     top.tick_params(labelbottom=False)
     bottom.set_ylabel(f"measured −\npredicted [{data.unit}]")
-    tidy(top, zero=True)
+    tidy(top)
     tidy(bottom, zero=True)
     fig.align_ylabels([top, bottom])
     legend(fig, data, measured=True)
@@ -140,6 +147,7 @@ def energy_by_effect(data: ReportData) -> Any | None:
     y = np.arange(len(ids))[::-1].astype(float)
     height = 0.8 / len(parts)
     widest = max(abs(v.get(i, 0.0)) for _, v, _ in parts for i in ids) or 1.0
+    decimals = 0 if widest >= 1000 else 1 if widest >= 10 else 2 if widest >= 1 else 3
     for k, (_, values, colour) in enumerate(parts):
         x = np.array([values.get(i, np.nan) for i in ids])
         place = y + height * (0.5 * (len(parts) - 1) - k)
@@ -148,11 +156,11 @@ def energy_by_effect(data: ReportData) -> Any | None:
             if np.isfinite(v):
                 gap = 0.006 * widest * (1 if v >= 0 else -1)
                 ha = "left" if v >= 0 else "right"
-                ax.text(v + gap, p, number(v, 3), va="center", ha=ha, fontsize=7.5, color=INK)
+                ax.text(v + gap, p, f"{v:.{decimals}f}".replace("-", "−"), va="center", ha=ha, fontsize=7.5, color=INK)
     ax.axvline(0, color=GREY, linewidth=0.8)
     ax.set_yticks(y, [short(names.effect(i), 44) for i in ids])
     ax.margins(x=0.09)
-    ax.set_xlabel("energy over the test trips [kWh]")
+    ax.set_xlabel(f"energy over the {'test trips' if data.row('test').any() else 'log'} [kWh]")
     ax.set_title("Where the energy goes")
     tidy(ax, grid="x")
     legend(fig, data)
@@ -181,7 +189,7 @@ def coefficients(data: ReportData) -> Any | None:
     ax.set_xlim(-reach, reach)
     ax.set_ylim(-0.6, len(found) - 0.4)
     ax.set_xlabel("distance from the table [standard deviations of the table]")
-    ax.set_title("How far each coefficient moved (dot), its table (thick line ±1, band ±2)")
+    ax.set_title(_title(data, "How far each coefficient moved (dot), its table (thick line ±1, band ±2)"))
     tidy(ax, grid="x")
     return fig
 
@@ -201,7 +209,7 @@ def measured_predicted(data: ReportData) -> Any:
         left.plot(ends, ends, color=GREY, linewidth=0.9, zorder=3)
     left.set_xlabel(axis_label(f"measured {words}", data.unit))
     left.set_ylabel(axis_label("predicted", data.unit))
-    left.set_title("Predicted against measured (line: equal)")
+    left.set_title(_title(data, "Predicted against measured (line: equal)"))
     right.scatter(p, x - p, s=7, color=AFTER, alpha=alpha, linewidth=0, rasterized=True)
     right.set_xlabel(axis_label(f"predicted {words}", data.unit))
     right.set_ylabel(axis_label("measured − predicted", data.unit))
@@ -213,12 +221,13 @@ def measured_predicted(data: ReportData) -> Any:
 
 def residual_by_trip(data: ReportData) -> Any:
     """Mean, middle half and 90 % range of each trip's residual."""
-    trip, good = data.row("trip"), test_rows(data)
-    ids = [i for i in dict.fromkeys(trip[good].tolist())][:60]
+    good = test_rows(data)
+    trip, residual = data.row("trip")[good], data.residual("after")[good]
+    ids = list(dict.fromkeys(trip.tolist()))[:60]
     fig = figure(WIDTH, 3.0)
     ax = fig.add_subplot()
-    q = np.array([np.quantile(data.residual("after")[good & (trip == i)], [0.05, 0.25, 0.75, 0.95]) for i in ids])
-    mean = np.array([data.residual("after")[good & (trip == i)].mean() for i in ids])
+    q = np.array([np.quantile(residual[trip == i], [0.05, 0.25, 0.75, 0.95]) for i in ids])
+    mean = np.array([residual[trip == i].mean() for i in ids])
     x = np.arange(len(ids)).astype(float)
     if len(ids):
         ax.vlines(x, q[:, 0], q[:, 3], color=AFTER, linewidth=1)
@@ -233,6 +242,6 @@ def residual_by_trip(data: ReportData) -> Any:
         ax.set_xlabel(f"{len(ids)} trips in the order of the log")
     ax.set_xlim(-0.7, max(len(ids), 1) - 0.3)
     ax.set_ylabel(f"measured −\npredicted [{data.unit}]")
-    ax.set_title("Error by trip (dot: mean, bar: middle half, line: 90 % of the rows)")
+    ax.set_title(_title(data, "Error by trip (dot: mean, bar: middle half, line: 90 % of the rows)"))
     tidy(ax, zero=True)
     return fig

@@ -19,7 +19,7 @@ _EFFECTS = {
     "auxiliary_power": "constant auxiliary load",
     "hvac_power": "cabin heating and cooling",
     "cabin_warmup": "cabin warm-up",
-    "periodic_load": "periodic load (cycling heater, refrigeration unit)",
+    "periodic_load": "periodic load",
     "standstill_load": "load at standstill",
     "cooling_power": "cooling power",
     "constant_headwind": "constant headwind",
@@ -182,7 +182,7 @@ def coefficient(path: str) -> tuple[str, str]:
     if stem in _COEFFICIENTS:
         words, unit = _COEFFICIENTS[stem]
     elif stem.startswith("effects."):
-        _, effect_id, name = (stem.split(".", 2) + ["", ""])[:3]
+        _, effect_id, name = [*stem.split(".", 2), "", ""][:3]
         words, unit = f"{effect(effect_id)}: {parameter(name)}", ""
     else:
         words, unit = stem.rpartition(".")[2].replace("_", " "), ""
@@ -196,7 +196,8 @@ def channel(name: str) -> Shown:
 
 def target(name: str) -> tuple[str, str]:
     """A target as a thing (`battery energy`) and as an axis (`energy per row`)."""
-    return _TARGETS.get(name, (name.replace("_", " "),) * 2)
+    words = name.replace("_", " ")
+    return _TARGETS.get(name, (words, words))
 
 
 def verbose_join(items: list[str], word: str = "and") -> str:

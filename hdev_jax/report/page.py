@@ -1,12 +1,15 @@
 """The HTML page: what the tables hold, put into the templates with the figures inside the file."""
 
 import base64
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hdev_jax.report import names, words
 from hdev_jax.report.canvas import png, style
-from hdev_jax.report.data import ReportData, same_model, test_rows, total_name, trip_lines
+from hdev_jax.report.data import ReportData, metrics, same_model, test_rows, total_name, trip_lines
 from hdev_jax.report.figures import (
     before_after,
     coefficients,
@@ -23,6 +26,13 @@ __all__ = ["write_calibration_report", "write_report"]
 _TEMPLATES = Path(__file__).parent / "templates"
 CANDIDATES_SHOWN = 8
 Z_FLAG = 2.0  # a coefficient further from its table than 19 of 20 would be by chance
+_NO_UNEXPLAINED = {
+    "significant": False,
+    "share_of_test_variance": None,
+    "noise_floor_rmse": None,
+    "depends_on": [],
+    "signature": "",
+}
 
 
 def write_report(data: ReportData, directory: Path) -> None:
@@ -45,13 +55,14 @@ def write_report(data: ReportData, directory: Path) -> None:
     summary = data.summary
     context = {
         **_common(data),
+        "what": f"what the model of its {names.target(summary['target'])[0]} lacks",
         "answer": words.answer_parts(data),
         "tiles": _tiles(data),
         "found": [_found(data, e) for e in summary.get("effects", [])],
         "candidates": _candidates(summary),
         "excluded": [{**e, "name": names.effect(e["id"])} for e in summary.get("excluded", [])],
-        "unexplained": summary.get("unexplained", {}),
-        "remaining": words.remaining(data),
+        "unexplained": {**_NO_UNEXPLAINED, **summary.get("unexplained", {})},
+        "depends_on": [(c, names.channel(c).label) for c in summary.get("unexplained", {}).get("depends_on") or []],
         "nothing_added": same_model(data),
         "dependence": [p for p in shown if p.name[0] != "\x00"],
         "channels_shown": len(shown),
@@ -71,6 +82,9 @@ def write_calibration_report(data: ReportData, directory: Path) -> None:
     `data.rows["before"]` is the calibrated prediction; `data.summary` needs `target` and `baseline`, and may hold
     `method`, `notes`, `clusters` and `split`. Channels and breakdown may be empty.
     """
+    # one model: what a diagnosis would add, and its split, are no part of this page
+    rows = {k: v for k, v in data.rows.items() if k not in ("after", "test")}
+    data = replace(data, rows=rows, breakdown={"after": data.breakdown.get("before", {})})
     with style():
         figures = {
             "coefficients": coefficients(data),
@@ -80,8 +94,24 @@ def write_calibration_report(data: ReportData, directory: Path) -> None:
         }
         images = {name: png(fig) for name, fig in figures.items() if fig is not None}
     context = {**_common(data), "method": data.summary.get("method", ""), "n_shown": int(test_rows(data).sum())}
-    context["moved"] = [c["name"] for c in context["coefficients"] if c["flag"]]
+    context["what"] = f"calibrated on its {context['target']}"
+    context["answer"] = _calibrated(data, context["coefficients"])
     _write("calibration.html.j2", context, images, directory)
+
+
+def _calibrated(data: ReportData, rows: list[dict[str, Any]]) -> list[tuple[str, bool]]:
+    """The calibration's answer, as (text, bold) pieces."""
+    everything = np.flatnonzero(data.row("used"))
+    m = metrics(data, everything, "before")
+    text = f" at {words.number(m['rmse'])}{words.NBSP}{data.unit} RMSE per row"
+    if m["pe_percent"] is not None:
+        text += f", {total_name(data)[0]} error {words.percent(m['pe_percent'])}"
+    pieces = [("The log fits", True), (f"{text}, over {words.count(m['n'], 'row')}.", False)]
+    if moved := [c["name"] for c in rows if c["flag"]]:
+        verb = "lies" if len(moved) == 1 else "lie"
+        pieces += [(f" {names.verbose_join(moved).capitalize()}", True), (f" {verb} far from the table: ", False)]
+        pieces += [("hdev diagnose looks for what may be missing.", False)]
+    return pieces
 
 
 def _common(data: ReportData) -> dict[str, Any]:
@@ -172,7 +202,9 @@ def _tiles(data: ReportData) -> list[dict[str, str]]:
         value = words.percent(fit, signed=False)
         if not same and start is not None:
             value = f"{words.percent(start, signed=False)} → {value}"
-        tiles.insert(2, {"label": "Fit (NRMSE)", "value": value, "note": "100 % is perfect, 0 % no better than the mean"})
+        tiles.insert(
+            2, {"label": "Fit (NRMSE)", "value": value, "note": "100 % is perfect, 0 % no better than the mean"}
+        )
     return tiles
 
 
@@ -228,8 +260,13 @@ def _ledger(e: dict[str, Any]) -> dict[str, Any]:
     where = e.get("where")
     if where is None:
         where = ", ".join(str(e[k]) for k in ("trip", "file") if e.get(k))
-    return {"kind": e.get("kind", ""), "where": where, "column": e.get("column") or "", "count": e.get("count") or 0,
-            "reason": e.get("reason", "")}
+    return {
+        "kind": e.get("kind", ""),
+        "where": where,
+        "column": e.get("column") or "",
+        "count": e.get("count") or 0,
+        "reason": e.get("reason", ""),
+    }
 
 
 def _blocks(blocks: dict[str, Any]) -> list[dict[str, Any]]:

@@ -40,11 +40,16 @@ def _columns(data: ReportData) -> dict[str, tuple[names.Shown, np.ndarray]]:
     standing = {
         "time_s": (names.channel("time_s"), data.row("time_s")),
         "distance_since_start_m": (names.channel("distance_since_start_m"), distance_since_start(data)),
-        "\x00predicted": (names.Shown(f"predicted {names.target(data.summary['target'])[1]}", data.unit), data.row("after")),
+        "\x00predicted": (
+            names.Shown(f"predicted {names.target(data.summary['target'])[1]}", data.unit),
+            data.row("after"),
+        ),
     }
     hidden = _HIDDEN | {data.summary["target"]} | set(standing)
     logged = {k: (names.channel(k), np.asarray(v)) for k, v in data.channels.items() if k not in hidden}
-    numeric = {k: v for k, v in logged.items() if v[1].dtype.kind in "fiub" and v[1].shape == data.row("measured").shape}
+    numeric = {
+        k: v for k, v in logged.items() if v[1].dtype.kind in "fiub" and v[1].shape == data.row("measured").shape
+    }
     return {**standing, **numeric}
 
 
@@ -71,7 +76,9 @@ def panels(data: ReportData) -> tuple[list[Panel], int]:
     rest = sorted(rest, key=lambda f: -f[0])[: PANELS - standing]
     chosen = sorted([*first, *rest], key=lambda f: -f[0])
     out = [
-        Panel(name, shown, {w: binned(shown.factor * x, r, cluster, shown.factor * e) for w, r in residual.items()}, share)
+        Panel(
+            name, shown, {w: binned(shown.factor * x, r, cluster, shown.factor * e) for w, r in residual.items()}, share
+        )
         for _, name, shown, x, e, share in chosen
     ]
     return [p for p in out if any(len(m.x) for m in p.means.values())], len(found)
@@ -95,7 +102,9 @@ def residual_by_channel(data: ReportData, shown: list[Panel]) -> Any | None:
         tidy(ax, zero=True)
     for ax in axes[len(shown) :]:
         ax.remove()
-    tops = [np.abs(m.mean) + np.minimum(m.error, np.abs(m.mean) + 1e-12) for p in shown for m in p.means.values()]
+    tops = [
+        np.abs(m.mean) + np.minimum(np.nan_to_num(m.error), np.abs(m.mean)) for p in shown for m in p.means.values()
+    ]
     reach = 1.12 * float(np.max(np.concatenate(tops))) or 1.0
     axes[0].set_ylim(-reach, reach)
     for ax in axes[: len(shown) : across]:

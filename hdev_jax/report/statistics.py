@@ -78,7 +78,10 @@ def edges_of(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
 
 
 def binned(x: np.ndarray, residual: np.ndarray, cluster: np.ndarray, edges: np.ndarray, least: int = 5) -> Binned:
-    """Means by bin; the error of a mean sums residuals by cluster first, for they are not independent."""
+    """Means by bin; the error of a mean sums residuals by cluster first, for they are not independent.
+
+    The error is NaN in a bin that only one cluster fills: one says nothing of how clusters differ.
+    """
     good = np.isfinite(x) & np.isfinite(residual)
     x, residual, cluster = x[good], residual[good], cluster[good]
     place = np.searchsorted(edges, x)
@@ -90,8 +93,9 @@ def binned(x: np.ndarray, residual: np.ndarray, cluster: np.ndarray, edges: np.n
     clusters = int(cluster.max(initial=0)) + 1
     sums = np.bincount(place * clusters + cluster, residual - mean[place], minlength=bins * clusters)
     groups = sums.reshape(bins, clusters)
-    there = np.maximum((np.bincount(place * clusters + cluster, minlength=bins * clusters) > 0).reshape(bins, clusters).sum(1), 2)
-    error = np.sqrt(np.sum(groups**2, axis=1) * there / (there - 1)) / safe
+    there = (np.bincount(place * clusters + cluster, minlength=bins * clusters) > 0).reshape(bins, clusters).sum(axis=1)
+    spread = np.sqrt(np.sum(groups**2, axis=1) * there / np.maximum(there - 1, 1)) / safe
+    error = np.where(there > 1, spread, np.nan)
     few = n < least
     return Binned(centre[~few], mean[~few], error[~few], n[~few])
 
@@ -147,16 +151,18 @@ def variance_by_period(
     for s in runs(trip):
         x = residual[s]
         for start in range(0, len(x) - length + 1, length // 2):
-            power += np.abs(np.fft.rfft(x[start : start + length] * window)) ** 2
+            piece = x[start : start + length]
+            power += np.abs(np.fft.rfft((piece - piece.mean()) * window)) ** 2
             pieces += 1
     if not pieces:
         return np.empty(0), np.empty(0)
-    density = 2 * seconds * power / (pieces * np.sum(window**2))  # one-sided, per Hz
-    frequency = np.fft.rfftfreq(length, seconds)
-    octave = np.floor(3 * np.log2(frequency[1:] / frequency[1])).astype(int)  # thirds of an octave, as acousticians use
+    # one-sided, per Hz; the ends, which have no mirror image, left out
+    density = 2 * seconds * power[1:-1] / (pieces * np.sum(window**2))
+    frequency = np.fft.rfftfreq(length, seconds)[1:-1]
+    octave = np.floor(3 * np.log2(frequency / frequency[0])).astype(int)  # thirds of an octave, as acousticians use
     n = np.maximum(np.bincount(octave), 1)
-    centre = np.bincount(octave, frequency[1:]) / n
-    mean = np.bincount(octave, density[1:] * frequency[1:]) / n
+    centre = np.bincount(octave, frequency) / n
+    mean = np.bincount(octave, density * frequency) / n
     there = np.bincount(octave) > 0
     return 1.0 / centre[there], np.log(2) * mean[there]
 
@@ -170,22 +176,21 @@ def stretch(data: ReportData, rows: int = 240) -> slice | None:
     if not good.any():
         return None
     trip = data.row("trip")
-    whole = [float(np.sqrt(np.mean(data.residual(w)[good] ** 2))) + 1e-12 for w in ("before", "after")]
-    spread = float(np.std(data.row("measured")[good])) + 1e-12
+    square = [data.residual(w) ** 2 for w in ("before", "after")]
+    whole = [float(np.sqrt(np.mean(s[good]))) + 1e-12 for s in square]
+    measured = data.row("measured")
+    spread = float(np.std(measured[good])) + 1e-12
     best, least = None, np.inf
     part = np.cumsum(np.r_[True, (np.diff(trip) != 0) | (np.diff(good.astype(int)) != 0)])
-    for s in runs(part):
-        if not good[s.start]:
-            continue
-        n = s.stop - s.start
+    pieces = [p for p in runs(part) if good[p.start]]
+    long = [p for p in pieces if p.stop - p.start >= rows]  # of short ones, as where gaps are many, the longest
+    for p in long or sorted(pieces, key=lambda p: p.start - p.stop)[:50]:
+        n = p.stop - p.start
         length = min(rows, n)
-        for start in range(s.start, s.stop - length + 1, max(length, (n - length) // 200 or 1)):
+        for start in range(p.start, p.stop - length + 1, max(length, (n - length) // 200)):
             here = slice(start, start + length)
-            cost = sum(
-                abs(np.log((np.sqrt(np.mean(data.residual(w)[here] ** 2)) + 1e-12) / t))
-                for w, t in zip(("before", "after"), whole, strict=True)
-            )
-            cost += 4 * max(0.0, 0.8 - float(np.std(data.row("measured")[here])) / spread)
+            cost = sum(abs(np.log((np.sqrt(np.mean(s[here])) + 1e-12) / t)) for s, t in zip(square, whole, strict=True))
+            cost += 4 * max(0.0, 0.8 - float(np.std(measured[here])) / spread)
             cost += 2 * np.log(rows / length)
             if cost < least:
                 best, least = here, cost

@@ -1,6 +1,7 @@
 """Numbers and sentences as a reader wants them: the answer first."""
 
 import math
+from numbers import Real
 from typing import Any
 
 from hdev_jax.report import names
@@ -15,11 +16,11 @@ _DASH = "–"
 
 
 def _finite(*values: Any) -> bool:
-    return all(isinstance(v, (int, float)) and math.isfinite(v) for v in values)
+    return all(isinstance(v, Real) and math.isfinite(v) for v in values)
 
 
 def _fixed(x: float, decimals: int) -> str:
-    text = f"{x:,.{max(decimals, 0)}f}"
+    text = f"{round(x, decimals):,.{max(decimals, 0)}f}"
     if float(text.replace(",", "")) == 0:
         text = text.lstrip("-")
     return text.translate(_MINUS)
@@ -55,7 +56,8 @@ def plus_minus(value: Any, sd: Any, unit: str | None = "") -> str:
     exponent = 0 if -3 <= exponent < 7 else exponent
     value, sd = value / 10.0**exponent, sd / 10.0**exponent
     lead = sd / 10.0 ** math.floor(math.log10(sd))
-    decimals = _decimals(sd, 2 if lead < 2.95 else 1)
+    digits = 2 if lead < 2.95 else 1
+    decimals = digits - 1 - math.floor(math.log10(sd))  # negative: 4,980 ± 210
     if decimals > 7:  # an sd far below the digits worth reading
         return number(value * 10.0**exponent, 6, unit)
     text = f"{_fixed(value, decimals)} ± {_fixed(sd, decimals)}"
@@ -82,11 +84,9 @@ def pair(before: Any, after: Any) -> tuple[str, str]:
 
 
 def percent(x: Any, *, signed: bool = True, decimals: int = 1) -> str:
-    """`−4.1 %`; a second decimal for what would read 0.0, none from 100 % on, a dash for null."""
+    """`−4.1 %`, `0.0 %`; no decimals from 100 % on, a dash for null."""
     if not _finite(x):
         return _DASH
-    if abs(x) < 0.5 * 10**-decimals and x:
-        decimals += 1
     decimals = 0 if abs(x) >= 100 else decimals
     text = _fixed(x, decimals)
     plus = "+" if signed and x > 0 and float(f"{x:.{decimals}f}") else ""
@@ -131,10 +131,11 @@ def _errors(data: ReportData) -> str:
     """`the error falls from 18.9 to 7.6 Wh RMSE per row, energy error from −4.1 % to −0.2 %`."""
     before, after = data.summary["before"]["test"], data.summary["after"]["test"]
     b, a = pair(before.get("rmse"), after.get("rmse"))
-    way = "falls" if after["rmse"] < before["rmse"] else "rises"
-    text = f"the error {way} from {b} to {a}{NBSP}{data.unit} RMSE per row"
     if b == a:
         text = f"the error stays at {b}{NBSP}{data.unit} RMSE per row"
+    else:
+        way = "falls" if after["rmse"] < before["rmse"] else "rises"
+        text = f"the error {way} from {b} to {a}{NBSP}{data.unit} RMSE per row"
     if _finite(before.get("pe_percent"), after.get("pe_percent")):
         name = total_name(data)[0]
         text += f", {name} error from {percent(before['pe_percent'])} to {percent(after['pe_percent'])}"
@@ -173,7 +174,9 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
         tried = sum(c.get("score") is not None for c in s.get("candidates", []))
         test = s["after"]["test"]
         text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
-        text += f"{_where(data)} the error is {number(test.get('rmse'))}{NBSP}{data.unit} RMSE per row"
+        text += (
+            f"{_where(data)} the error is {pair(test.get('rmse'), test.get('rmse'))[1]}{NBSP}{data.unit} RMSE per row"
+        )
         if _finite(test.get("pe_percent")):
             text += f", {total_name(data)[0]} error {percent(test['pe_percent'])}"
         text += "."

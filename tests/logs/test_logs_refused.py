@@ -1,11 +1,15 @@
 """What contract §1 refuses: one line that names file, row, column and the remedy."""
 
+import contextlib
 import gzip
+import io
 
+import hypothesis.strategies as st
 import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+from hypothesis import given
 from logs_helpers import intervals, read, samples, write
 
 from hdev_jax.errors import InputError
@@ -60,6 +64,12 @@ def test_text_in_a_column_that_is_otherwise_numeric(tmp_path):
     frame = samples().assign(wiper=1.0).astype({"wiper": object})
     frame.loc[3, "wiper"] = "2,5"
     refused(lambda: read(tmp_path, frame), "wiper", "'2,5'", "comma")
+
+
+def test_a_message_holds_no_control_characters(tmp_path):
+    frame = samples().astype({"speed_mps": object})
+    frame.loc[1, "speed_mps"] = "1\x1b[31m2" + 100 * "x"
+    assert len(refused(lambda: read(tmp_path, frame), "row 2")) < 150
 
 
 def test_more_than_one_per_cent_bad_rows(tmp_path):
@@ -202,6 +212,22 @@ def test_file_is_not_what_it_should_be(tmp_path, kind, name, parts):
     path = tmp_path / name
     path.write_bytes(_content(kind, tmp_path))
     refused(lambda: read_log(path), name, *parts)
+
+
+def _matlab() -> bytes:
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, {c: x.to_numpy() for c, x in samples(20).items() if c != "trip_id"})
+    return buffer.getvalue()
+
+
+@given(st.integers(0, len(_matlab()) - 1), st.integers(0, 255), st.booleans())
+def test_a_damaged_matlab_file_never_gets_further_than_one_line(tmp_path_factory, place, byte, cut):
+    path = tmp_path_factory.getbasetemp() / "damaged.mat"
+    data = bytearray(_matlab())
+    data[place] = byte
+    path.write_bytes(bytes(data[:place] if cut else data))
+    with contextlib.suppress(InputError):  # anything else, a warning included, fails the test
+        read_log(path)
 
 
 def test_files_that_are_not_there(tmp_path):

@@ -1,0 +1,158 @@
+"""MATLAB 5 files: checked element by element, then read by scipy, then laid out as tables."""
+
+import io
+import math
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hdev_jax.errors import InputError
+from hdev_jax.logs.adapter import Adapter
+from hdev_jax.logs.names import stem, trip_of
+
+__all__ = ["numeric_variables", "read_mat"]
+
+# MAT-File Format, The MathWorks, tables 1-1 and 1-3: element types with their size in bytes; classes of arrays
+_SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8}
+_MATRIX, _COMPRESSED = 14, 15
+_NUMERIC = range(6, 16)
+_HEADER_BYTES = 128
+
+
+class _DamagedError(Exception):
+    """The bytes are not what the format says."""
+
+
+def _elements(data: bytes, start: int, order: str) -> Iterator[tuple[int, bytes]]:
+    """`(type, content)` of the elements that follow each other from `start`."""
+    while start < len(data):
+        if len(data) - start < 8:
+            raise _DamagedError(f"ends inside an element at byte {start}")
+        kind, size = struct.unpack_from(order + "II", data, start)
+        if kind >> 16:  # small element: both halves in the first word, up to four bytes in the second
+            kind, size, body, step = kind & 0xFFFF, kind >> 16, start + 4, 8
+        else:
+            body, step = start + 8, 8 + size + (-size % 8 if kind != _COMPRESSED else 0)
+        if body + size > len(data):
+            raise _DamagedError(f"element at byte {start} has {size} bytes, {len(data) - body} are there")
+        yield kind, data[body : body + size]
+        start += step
+
+
+def _numeric_name(matrix: bytes, order: str) -> str | None:
+    """Name of a numeric array whose dimensions and bytes agree; None for other classes."""
+    parts = _elements(matrix, 0, order)
+    try:
+        (kind, flags), (kind_d, dims), (kind_n, name) = next(parts), next(parts), next(parts)
+        if kind != 6 or len(flags) != 8:
+            raise _DamagedError("an array without flags")
+        word = struct.unpack_from(order + "I", flags)[0]
+        if word & 0xFF not in _NUMERIC:
+            return None
+        if kind_d != 5 or len(dims) < 8 or len(dims) % 4 or kind_n not in (1, 16):
+            raise _DamagedError("an array without dimensions or name")
+        sides = struct.unpack(order + f"{len(dims) // 4}i", dims)
+        if min(sides) < 0:
+            raise _DamagedError(f"an array of {sides}")
+        for _ in range(2 if word & 0x800 else 1):  # real, and imaginary
+            kind, values = next(parts)
+            if kind not in _SIZES or len(values) != math.prod(sides) * _SIZES[kind]:
+                raise _DamagedError(f"an array of {sides} in {len(values)} bytes")
+    except StopIteration:
+        raise _DamagedError("an array that ends early") from None
+    return name.decode("latin-1")
+
+
+def numeric_variables(path: Path, data: bytes) -> dict[str, np.ndarray]:
+    """Real numeric arrays of a file by name. Raises `InputError` where it is truncated, damaged or has none.
+
+    scipy's reader trusts sizes and types in the file and takes the process down where they are wrong, so they are
+    checked first, and only what has been checked is given to it.
+    """
+    import scipy.io
+
+    try:
+        if len(data) <= _HEADER_BYTES or data[126:128] not in (b"IM", b"MI"):
+            raise _DamagedError("no MATLAB 5 header with data after it")
+        order = "<" if data[126:128] == b"IM" else ">"
+        names = []
+        for kind, body in _elements(data, _HEADER_BYTES, order):
+            inner = list(_elements(zlib.decompress(body), 0, order)) if kind == _COMPRESSED else [(kind, body)]
+            for inner_kind, matrix in inner:
+                if inner_kind != _MATRIX:
+                    raise _DamagedError(f"an element of type {inner_kind} where an array is expected")
+                name = _numeric_name(matrix, order)
+                names += [name] if name else []
+        content = scipy.io.loadmat(io.BytesIO(data), variable_names=names) if names else {}
+    except _DamagedError as e:
+        raise InputError(f"{path}: truncated or damaged MATLAB file ({e})") from None
+    except Exception as e:  # zlib's and scipy's, which lets any error of its parser through
+        raise InputError(f"{path}: truncated or damaged MATLAB file ({str(e)[:120]})") from None
+    arrays = {n: content[n] for n in names if n in content}
+    return {n: a for n, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind in "fiub"}
+
+
+def read_mat(path: Path, data: bytes, adapter: Adapter) -> dict[str, pd.DataFrame]:
+    """Tables by trip. Raises `InputError` for a damaged file, and for one without vectors or [time, value] pairs."""
+    arrays = numeric_variables(path, data)
+    if not arrays:
+        raise InputError(f"{path}: no numeric variable; save one vector a column (structs and tables are not read)")
+    if adapter.layout == "time_value":
+        return _time_value(path, arrays, adapter)
+    vectors = {n: a.ravel() for n, a in arrays.items() if a.ndim == 2 and min(a.shape) == 1}
+    if not vectors:
+        n, a = next(iter(arrays.items()))
+        raise InputError(
+            f"{path}: variable '{n}' is {a.shape[0]}×{a.shape[-1]}; layout 'table' has one vector a column; "
+            "for variables that are [time, value] the adapter says layout = 'time_value'"
+        )
+    sizes = {n: len(v) for n, v in vectors.items() if len(v) > 1}
+    if len(set(sizes.values())) > 1:
+        (n0, s0), (n1, s1) = next((a, b) for a in sizes.items() for b in sizes.items() if a[1] != b[1])
+        raise InputError(f"{path}: variables of different length: '{n0}' has {s0} values, '{n1}' {s1}")
+    size = next(iter(sizes.values()), 1)
+    return {trip_of(path, adapter): pd.DataFrame({n: v for n, v in vectors.items() if len(v) == size})}
+
+
+def _time_value(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> dict[str, pd.DataFrame]:
+    """Each variable is [time, value]; variables of a trip are put on the clock of the longest one."""
+    trips: dict[str, dict[str, np.ndarray]] = {}
+    for name, array in arrays.items():
+        if array.ndim != 2 or array.shape[1] != 2:
+            continue
+        trip, channel = stem(path.name), name
+        if adapter.trip_id is not None:
+            found = re.search(adapter.trip_id, name)
+            if found is None:
+                trip = adapter.match(adapter.trip_id, path.name) or ""
+                if not trip:
+                    raise InputError(f"{path}: trip_id = {adapter.trip_id!r} does not match the variable '{name}'")
+            else:
+                trip = next((g for g in found.groups() if g is not None), found.group(0))
+                channel = (name[: found.start()] + name[found.end() :]).strip("_")
+        if adapter.variable is not None:
+            channel = adapter.match(adapter.variable, name) or ""
+            if not channel:
+                continue
+        if channel in trips.setdefault(trip, {}):
+            raise InputError(f"{path}: two variables of trip {trip} are the channel '{channel}', one of them '{name}'")
+        trips[trip][channel] = array.astype(np.float64)
+    if not trips:
+        raise InputError(f"{path}: no variable of two columns [time, value] that the adapter {adapter.where} names")
+    tables = {}
+    for trip, channels in trips.items():
+        longest = max(channels, key=lambda c: len(channels[c]))
+        clock = channels[longest][:, 0]
+        table: dict[str, np.ndarray] = {"time_s": clock}
+        for channel, a in channels.items():
+            same = len(a) == len(clock) and np.array_equal(a[:, 0], clock, equal_nan=True)
+            if not same and (len(a) < 2 or not np.all(np.diff(a[:, 0]) > 0)):
+                raise InputError(f"{path}: the time of '{channel}' in trip {trip} does not run forward")
+            table[channel] = a[:, 1] if same else np.interp(clock, a[:, 0], a[:, 1], left=np.nan, right=np.nan)
+        tables[trip] = pd.DataFrame(table)
+    return tables
