@@ -269,6 +269,7 @@ def test_few_and_many_trips(trips, rows, tmp_path):
         data = replace(data, rows=cut, channels={k: v[keep] for k, v in data.channels.items()})
     text = written(data, tmp_path)
     assert ("T01 (test part)" in text) == (trips == 1)
+    assert ("on the part of T01 that no choice has seen" in plain(text)) == (trips == 1)
 
 
 def test_bare_summary_and_no_channels(tmp_path):

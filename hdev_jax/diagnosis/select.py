@@ -64,8 +64,8 @@ class Search:
     found: list[Found] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     absorbs: dict[str, list[str]] = field(default_factory=dict)
-    noise: Noise | None = None
-    clusters: Clusters | None = None
+    taken_out: tuple[str, ...] = ()  # added once, superfluous later: not tried again
+    finished: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,36 +97,46 @@ def search(
     effects: Sequence[type[Effect]],
     *,
     fdr: float,
-    rng: np.random.Generator,
+    seed: int,
     tell: Callable[[str], None] = lambda _: None,
+    remember: Callable[[int, Callable[[], Search]], Search] = lambda _, compute: compute(),
 ) -> Search:
     """Steps 1 to 5 of the loop on training rows alone.
 
     **Arguments:** the declared vehicle with its table, `rows` from `padded`, the candidates' classes, `fdr` the level
-    of false discoveries over the whole library, `rng` for placebos and resampling, `tell` for progress.
+    of false discoveries over the whole library, `seed` for placebos and resampling, `tell` for progress, `remember`
+    what keeps the state of each step for a run that is killed.
 
     **Returns:** the vehicle with every effect that cleared the bar, its fit, and a verdict on every other candidate.
     """
-    segments = rows.segments
-    real = segments.take(np.arange(rows.rows))
+    real = rows.segments.take(np.arange(rows.rows))
     gears = int(np.max(np.asarray(real.channels["gear"]))) if real.has("gear") else 1
-    problem = _Problem(rows, target, cluster_rows(real), effects, fdr, rng, gears)
-    tell("calibrating the declared model")
-    state = Search(vehicle, table, calibrate(vehicle, table, rows, target, problem.clusters))
-    state.clusters = problem.clusters
-    for step in range(MOST_EFFECTS + 1):
-        tell(f"scoring candidates, step {step + 1}")
-        view = _look(problem, state)
-        if step == 0:
-            state.absorbs = view.absorbs
-        state.noise = view.noise
-        choice = None if step == MOST_EFFECTS else _choose(problem, state, view, tell)
-        state.verdicts = view.verdicts(state)
-        if choice is None:
+    clusters = cluster_rows(real)
+
+    def declared() -> Search:
+        tell("calibrating the declared model")
+        return Search(vehicle, table, calibrate(vehicle, table, rows, target, clusters))
+
+    state = remember(0, declared)
+    for step in range(1, MOST_EFFECTS + 2):
+        problem = _Problem(rows, target, clusters, effects, fdr, np.random.default_rng([seed, step]), gears)
+        state = remember(step, lambda p=problem, s=state, k=step: _step(p, s, k, tell))
+        if state.finished:
             break
-        state = _prune(problem, choice, tell)
-        tell(f"added {state.found[-1].id}" if state.found else "nothing added")
     return state
+
+
+def _step(problem: _Problem, state: Search, step: int, tell: Callable[[str], None]) -> Search:
+    """One look at all candidates, and the vehicle with the one that is taken; `finished` where none is."""
+    tell(f"scoring candidates, step {step}")
+    view = _look(problem, state)
+    if step == 1:
+        state = replace(state, absorbs=view.absorbs)
+    choice = _choose(problem, state, view, tell) if step <= MOST_EFFECTS else None
+    if choice is None:
+        return replace(state, verdicts=view.verdicts(state), finished=True)
+    tell(f"added {choice.found[-1].id}")
+    return replace(_prune(problem, choice, tell), verdicts=view.verdicts(choice))
 
 
 @dataclass
@@ -267,7 +277,7 @@ def _choose(problem: _Problem, state: Search, view: _View, tell: Callable[[str],
     able = [
         s
         for id_, s in view.best.items()
-        if view.q[id_] <= problem.fdr and s.left_out_gain > 0 and _plausible(s) and _bic(s, n) > 0
+        if id_ not in state.taken_out and view.q[id_] <= problem.fdr and s.left_out_gain > 0 and _plausible(s) and _bic(s, n) > 0
     ]
     able.sort(key=lambda s: -_bic(s, n))
     while able:
@@ -292,7 +302,7 @@ def _choose(problem: _Problem, state: Search, view: _View, tell: Callable[[str],
             twins = _twins(view, s, problem)
             stability = _stability(problem, view, {c.id, *twins})
             found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain))
-            return replace(new, found=[*state.found, found], absorbs=state.absorbs)
+            return replace(new, found=[*state.found, found])
     return None
 
 
@@ -311,7 +321,7 @@ def _refit(problem: _Problem, state: Search, s: Score, view: _View) -> tuple[Sea
     if not _in_range(fit, s.candidate):
         return None
     gain = _whitened_gain(problem, state, fit, view)
-    return Search(fit.vehicle, table, fit, clusters=problem.clusters, noise=view.noise), gain
+    return replace(state, vehicle=fit.vehicle, table=table, fit=fit), gain
 
 
 def _idle(candidate: Candidate, path: str) -> bool:
@@ -440,7 +450,9 @@ def _prune(problem: _Problem, state: Search, tell: Callable[[str], None]) -> Sea
         vehicle = state.fit.vehicle.minus(drop)
         fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
         kept = [f for f in state.found if f.id != drop]
-        state = replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=kept)
+        state = replace(
+            state, vehicle=fit.vehicle, table=table, fit=fit, found=kept, taken_out=(*state.taken_out, drop)
+        )
     return state
 
 

@@ -372,18 +372,23 @@ class RoadGrade(Effect):
 
 
 class FrictionBrake(Effect):
-    """What the friction brakes take off the drive: −k·pressure, while the vehicle moves."""
+    """What the drive is spared or must overcome by the friction brakes: + k·brake signal, while the vehicle moves.
+
+    The wheels need m·a + resistances; what the friction brakes take away the drive need not take: F_drive = that sum
+    + F_brake (less negative while braking).
+    """
 
     id: ClassVar = "friction_brake"
     stage: ClassVar = "road"
-    equation: ClassVar = "−k·p_brake"
+    equation: ClassVar = "+k·brake"
     source: ClassVar = "paper 2, eq. 7-9 (share of braking that is not regenerated)"
-    needs: ClassVar = ("brake_pressure_pa",)
+    needs: ClassVar = ("brake_pressure_pa|brake_pedal_pct",)
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("n_per_pa", "N/Pa", 0.0, 2e-3, 0.0, 1.0, least=1e-6),)
+    parameters: ClassVar = (Parameter("n_per_unit", "N per unit of the brake signal", 0.0, 1.0, 0.0, 1e4, least=1e-6),)
     mistaken_for: ClassVar = ("mass_scale", "friction_blending")
     separated_by: ClassVar = "braking hard and lightly"
-    n_per_pa: Any
+    n_per_unit: Any
 
     def force(self, row, car):
-        return -self.n_per_pa * jnp.where(row.speed_mps > 0.1, row.channels["brake_pressure_pa"], 0.0)
+        brake = row.get("brake_pressure_pa", row.get("brake_pedal_pct", 0.0))
+        return self.n_per_unit * jnp.where(row.speed_mps > 0.1, jnp.maximum(brake, 0.0), 0.0)

@@ -143,6 +143,12 @@ def _errors(data: ReportData) -> str:
 
 
 def _where(data: ReportData) -> str:
+    test, trip = data.row("test"), data.row("trip")
+    if shared := set(trip[test].tolist()) & set(trip[data.row("used") & ~test].tolist()):
+        i = min(shared)  # a log of one trip: its end is tested on
+        return (
+            f"on the part of {data.trip_names[i] if i < len(data.trip_names) else 'the trip'} that no choice has seen"
+        )
     n = len(data.summary.get("split", {}).get("test_trips", []))
     return f"on {count(n, 'trip')} that no choice has seen"
 
@@ -169,7 +175,9 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
         share = s.get("unexplained", {}).get("share_of_test_variance")
         text = f"\x02Something is missing that the library does not hold\x03: {remaining(data)}."
         if _finite(share):
-            text += f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of the error."
+            text += (
+                f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left."
+            )
     else:
         tried = sum(c.get("score") is not None for c in s.get("candidates", []))
         test = s["after"]["test"]

@@ -1,0 +1,245 @@
+"""What is left: how much of the residual anything in the log predicts, and what it looks like."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
+from hdev_jax.inference import Clusters
+from hdev_jax.segments import trip_slices
+
+__all__ = ["Remainder", "remainder"]
+
+LEVEL = 1e-3  # for each of the looks below; there are four, so false alarms stay under one in two hundred logs
+LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
+ROUNDS = 400
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """The contract's `unexplained`, and the smooth correction that a flexible learner makes on the test rows."""
+
+    significant: bool
+    share: float
+    noise_floor_rmse: float
+    depends_on: tuple[str, ...]
+    signature: str
+    correction: Float[np.ndarray, " test"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Features, residual (measured − predicted), trips and clock of one side of the split."""
+
+    features: Float[np.ndarray, "row feature"]
+    residual: Float[np.ndarray, " row"]
+    clusters: Clusters
+    trip: np.ndarray
+    duration_s: np.ndarray
+
+
+def remainder(
+    train: Rows, test: Rows, names: Sequence[str], unit: str, trip_names: Sequence[str], *, seed: int,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Remainder:  # fmt: skip
+    """Four looks at the residual: a flexible learner validated by trip, periods, change points, levels of trips.
+
+    The learner (LightGBM) is trained on training rows; its share is what it predicts of the test residual. It counts
+    only where it also helps on training clusters left out of its own fit. The others ask whether whitened noise could
+    have done it.
+    """
+    tell("what is left: a flexible learner, validated by trip")
+    correction, p_learner, order = _learner(train, test, names, seed)
+    sst = float(np.sum(test.residual**2))
+    share = float(np.clip(1.0 - np.sum((test.residual - correction) ** 2) / max(sst, 1e-300), 0.0, 1.0))
+    learned = p_learner < LEVEL and share > LEAST_SHARE
+    tell("what is left: periods, change points, levels of trips")
+    noise = estimate_noise(train.residual, train.trip, levels=False)
+    white = whiten(train.residual[:, None], noise, train.trip, train.clusters)[:, 0]
+    period = _period(train)
+    steps = _change_point(white, train.trip)
+    level = _levels(train)
+    parts, depends = [], []
+    if learned:
+        depends += list(order)
+        parts.append(f"{100 * share:.0f} % of it follows {', '.join(order)} in a way the library does not hold")
+    if period is not None:
+        seconds, amplitude = period
+        depends.append("time_s")
+        clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
+        parts.append(f"a {clock} cycle of about {amplitude:.3g} {unit}")
+    if steps is not None:
+        where, minutes = steps
+        depends.append("time_s")
+        parts.append(f"a change inside trip {trip_names[where]} after {minutes(train):.0f} min")
+    if level is not None:
+        where, size, sd = level
+        depends.append("trip_id")
+        parts.append(f"levels that differ by trip by about {sd:.2g} {unit}, most in {trip_names[where]} ({size:+.2g} {unit})")
+    rmse = float(np.sqrt(np.mean(test.residual**2)))
+    floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
+    signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
+    return Remainder(bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", correction)
+
+
+def _colour(noise: Noise) -> str:
+    """Words for the noise of a residual that nothing predicts."""
+    first = float(noise.coefficients[1, 0]) if noise.order else 0.0
+    return "independent from row to row" if abs(first) < 0.1 else f"correlated from row to row ({first:.2f})"
+
+
+def _learner(
+    train: Rows, test: Rows, names: Sequence[str], seed: int
+) -> tuple[np.ndarray, float, tuple[str, ...]]:
+    """Correction on test rows, p of its gain on left-out training clusters, and the features it leans on."""
+    import lightgbm as lgb
+
+    rng = np.random.default_rng(seed)
+    fold = rng.permutation(np.arange(train.clusters.count) % 4)[train.clusters.ids]
+    rows = len(train.residual)
+    parameters = {
+        "objective": "regression", "learning_rate": 0.05, "num_leaves": 15, "verbosity": -1, "num_threads": 2,
+        "min_data_in_leaf": int(max(20, rows // 200)), "lambda_l2": 10.0, "feature_fraction": 0.8, "seed": seed,
+        "deterministic": True, "force_row_wise": True, "max_bin": 127,
+    }  # fmt: skip
+    scale = float(np.std(train.residual)) + 1e-300
+    out_of_fold = np.zeros((rows, 2))
+    steps: list[int] = []
+    for k in range(4):
+        inside, outside = fold != k, fold == k
+        if not outside.any() or not inside.any():
+            continue
+        data = lgb.Dataset(train.features[inside], train.residual[inside] / scale, feature_name=_safe(names))
+        check = lgb.Dataset(train.features[outside], train.residual[outside] / scale, reference=data)
+        # rounds are chosen on the fold next to the one that is predicted, so that neither sees its own error
+        booster = lgb.train(
+            parameters, data, ROUNDS, valid_sets=[check], callbacks=[lgb.early_stopping(20, verbose=False)]
+        )
+        steps.append(max(booster.best_iteration, 0))
+    rounds = int(np.median(steps)) if steps else 0
+    if rounds < 2:
+        return np.zeros(len(test.residual)), 1.0, ()
+    for k in range(4):
+        inside, outside = fold != k, fold == k
+        if outside.any() and inside.any():
+            data = lgb.Dataset(train.features[inside], train.residual[inside] / scale, feature_name=_safe(names))
+            booster = lgb.train(parameters, data, rounds)
+            out_of_fold[outside, 0] = np.asarray(booster.predict(train.features[outside])) * scale
+    gain = train.clusters.sums(train.residual**2 - (train.residual - out_of_fold[:, 0]) ** 2)
+    size = train.clusters.sums(train.residual**2)
+    relative = gain / np.mean(size)
+    t = np.mean(relative) / (np.std(relative, ddof=1) / np.sqrt(len(relative)) + 1e-300)
+    p = float(stats.t.sf(t, len(relative) - 1))
+    data = lgb.Dataset(train.features, train.residual / scale, feature_name=_safe(names))
+    booster = lgb.train(parameters, data, rounds)
+    correction = np.asarray(booster.predict(test.features)) * scale
+    importance = booster.feature_importance("gain")
+    first = np.argsort(-importance)[:3]
+    leading = tuple(names[i] for i in first if importance[i] > 0.15 * importance.sum())
+    return correction, p, leading
+
+
+def _safe(names: Sequence[str]) -> list[str]:
+    return [f"f{i}" for i in range(len(names))]
+
+
+def _period(rows: Rows) -> tuple[float, float] | None:
+    """The strongest period of the residual, if noise with the spectrum around it could not have made it.
+
+    Periodograms of equal windows, averaged over trips whatever the phase; a peak is compared with the median of its
+    neighbours in frequency, where the continuous spectrum of any noise is smooth.
+    """
+    seconds = [float(np.sum(rows.duration_s[s])) for _, s in trip_slices(rows.trip)]
+    step = float(np.median(rows.duration_s))
+    window = int(np.median(seconds) / step)
+    if window < 64:
+        return None
+    window = min(window, 1 << 15)
+    taper = np.hanning(window)
+    total, count = np.zeros(window // 2 + 1), 0
+    for _, s in trip_slices(rows.trip):
+        clock = np.cumsum(rows.duration_s[s])
+        even = np.interp(np.arange(0.0, clock[-1], step), clock, rows.residual[s] - np.mean(rows.residual[s]))
+        for start in range(0, len(even) - window // 2, window):
+            part = even[start : start + window]
+            if len(part) < window // 2:
+                break
+            part = np.pad(part, (0, window - len(part)))
+            total += np.abs(np.fft.rfft(part * taper)) ** 2
+            count += 1
+    if count < 2:
+        return None
+    frequency = np.fft.rfftfreq(window, step)
+    power = total / count
+    low, high = 3, len(power) // 4  # three cycles or more in a window; nothing within four samples
+    best: tuple[float, int] | None = None
+    for k in range(low, high):
+        wide = max(3, k // 3)
+        around = np.r_[power[max(2, k - wide) : max(k - 1, 2)], power[k + 2 : k + 2 + wide]]
+        if len(around) < 4:
+            continue
+        # a smooth spectrum, falling as a power of frequency at most: its logarithm is linear in that of frequency
+        where = np.r_[np.arange(max(2, k - wide), max(k - 1, 2)), np.arange(k + 2, min(k + 2 + wide, len(power)))]
+        slope, height = np.polyfit(np.log(where), np.log(power[where] + 1e-300), 1)
+        floor = float(np.exp(height + slope * np.log(k)))
+        ratio = power[k] / max(floor, 1e-300)
+        if best is None or ratio > best[0]:
+            best = (ratio, k)
+    if best is None:
+        return None
+    # an average of `count` exponential variables; the Hann taper leaves about as many
+    p = float(stats.gamma.sf(best[0] * count, count)) * (high - low)
+    if p > LEVEL or best[0] < 3.0:
+        return None
+    k = best[1]
+    amplitude = 2.0 * np.sqrt(power[k]) / np.sum(taper)
+    if amplitude**2 / 2 < LEAST_SHARE * np.mean(rows.residual**2):
+        return None
+    return float(1.0 / frequency[k]), float(amplitude)
+
+
+def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[Rows], float]] | None:
+    """The trip in which the whitened residual shifts, by the maximum of its bridge (Kolmogorov's distribution)."""
+    best: tuple[float, int, int] | None = None
+    slices = list(trip_slices(trip))
+    for t, s in slices:
+        n = s.stop - s.start
+        if n < 50:
+            continue
+        path = np.cumsum(white[s] - np.mean(white[s])) / (np.std(white[s]) * np.sqrt(n) + 1e-300)
+        k = int(np.argmax(np.abs(path)))
+        if best is None or abs(path[k]) > best[0]:
+            best = (float(abs(path[k])), t, s.start + k)
+    if best is None or stats.kstwobign.sf(best[0]) * len(slices) > LEVEL / 10:
+        return None
+    _, t, row = best
+
+    def minutes(rows: Rows) -> float:
+        inside = (rows.trip == t) & (np.arange(len(rows.trip)) <= row)
+        return float(np.sum(rows.duration_s[inside]) / 60.0)
+
+    return t, minutes
+
+
+def _levels(rows: Rows) -> tuple[int, float, float] | None:
+    """Trips whose mean residual is further out than the noise inside trips allows: (worst, its level, sd of levels)."""
+    slices = list(trip_slices(rows.trip))
+    if len(slices) < 4:
+        return None
+    means, errors = [], []
+    for _, s in slices:
+        r = rows.residual[s]
+        blocks = np.array_split(r, max(4, min(20, len(r) // 50)))
+        centre = np.array([b.mean() for b in blocks])
+        means.append(r.mean())
+        errors.append(np.std(centre, ddof=1) / np.sqrt(len(centre)))
+    m, e = np.array(means), np.array(errors) + 1e-300
+    f = float(np.sum((m / e) ** 2) / len(m))
+    between = max(0.0, float(np.mean(m**2) - np.mean(e**2)))
+    if stats.f.sf(f, len(m), 3 * len(m)) > LEVEL / 10 or between < 0.1 * np.mean(rows.residual**2):
+        return None
+    worst = int(np.argmax(np.abs(m)))
+    return slices[worst][0], float(m[worst]), float(np.sqrt(between))
