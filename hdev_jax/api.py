@@ -72,9 +72,7 @@ def diagnose(
     with open_run(out, config, seed=seed) as run:
         if run.done:
             return (run.work / "answer.txt").read_text()
-        result = run_loop(
-            problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint
-        )
+        result = run_loop(problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
         progress.step("writing the report")
         data = _report(result, _command("diagnose", run), started)
         text = _augmented(result, sheet)
@@ -418,5 +416,3 @@ def _answer(data: ReportData, out: Path) -> str:
         lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")
     lines += [s["unexplained"]["signature"], str(out / "report.html")]
     return "\n".join(lines)
-
-

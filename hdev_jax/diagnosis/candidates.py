@@ -1,6 +1,6 @@
 """Candidates: what each effect that the vehicle lacks would add to every row, without refitting anything."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -16,7 +16,7 @@ from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unava
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["Candidate", "Column", "columns", "realised"]
+__all__ = ["Candidate", "Column", "columns", "finer", "realised"]
 
 FIXED = ("shape", "choice")  # what has no column of its own
 
@@ -69,28 +69,36 @@ def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
     return owner is None or owner in sizes
 
 
-def _grid(p: Parameter, segments: Segments, row_s: float) -> tuple[float, ...]:
+Grids = Mapping[str, tuple[float, ...]]
+
+
+def _grid(p: Parameter, segments: Segments, row_s: float, grids: Grids) -> tuple[float, ...]:
+    if p.name in grids:
+        return grids[p.name]
     if p.name == "at_trip":
         trips = np.unique(np.asarray(segments.trip))
-        return tuple(float(t) for t in trips[2:-1]) if len(trips) >= 6 else ()
+        # three trips on either side at least: with fewer, one odd trip would be a step
+        return tuple(float(t) for t in trips[3:-2]) if len(trips) >= 6 else ()
     return tuple(g * row_s if p.in_rows else g for g in p.grid)
 
 
-def _of_effect(effect: type[Effect], segments: Segments, row_s: float) -> Iterable[tuple[Any, ...]]:
+def _of_effect(effect: type[Effect], segments: Segments, row_s: float, grids: Grids) -> Iterable[tuple[Any, ...]]:
     """`(sizes, groups, shapes, kind)` for each way to have the effect."""
     by_name = {p.name: p for p in effect.parameters}
     sizes = tuple(p.name for p in effect.parameters if p.kind not in FIXED)
     for variant in effect.variants or (sizes,):
         shapes = [p for p in effect.parameters if p.kind in FIXED and _matters(p, variant)]
-        grids = [[(p.name, g) for g in _grid(p, segments, row_s)] for p in shapes]
+        grids = [[(p.name, g) for g in _grid(p, segments, row_s, grids)] for p in shapes]
         for at in product(*grids):
             first = by_name[variant[0]]
             if first.kind == "limit":
-                for g in _grid(first, segments, row_s):
+                for g in _grid(first, segments, row_s, grids):
                     yield variant, (None,), (*at, (first.name, g)), "limit"
             elif first.by == "gear":
                 gear = np.asarray(segments.channels["gear"]).astype(int)
-                seen = [int(k) for k, n in zip(*np.unique(gear, return_counts=True), strict=True) if n > 0.02 * len(gear)]
+                seen = [
+                    int(k) for k, n in zip(*np.unique(gear, return_counts=True), strict=True) if n > 0.02 * len(gear)
+                ]
                 if len(seen) > 1:  # one gear is the reference: the overall efficiency is declared already
                     most = max(seen, key=lambda k: int(np.sum(gear == k)))
                     groups = tuple(k for k in seen if k != most)
@@ -99,17 +107,41 @@ def _of_effect(effect: type[Effect], segments: Segments, row_s: float) -> Iterab
                 yield variant, (None,) * len(variant), at, "size"
 
 
+def finer(candidate: Candidate, row_s: float, points: int = 7) -> dict[str, tuple[float, ...]]:
+    """Grids for the candidate's shapes and limits, half a step to either side of where it stands."""
+    grids: dict[str, tuple[float, ...]] = {}
+    for name, at in candidate.shapes:
+        p = candidate.parameter(name)
+        grid = [g * row_s if p.in_rows else g for g in p.grid]
+        if p.kind == "choice" or len(grid) < 2 or p.smooth:
+            grids[name] = (at,)
+            continue
+        k = int(np.argmin(np.abs(np.array(grid) - at)))
+        below = grid[k - 1] if k > 0 else at - (grid[k + 1] - at)
+        above = grid[k + 1] if k + 1 < len(grid) else at + (at - grid[k - 1])
+        near = np.r_[
+            np.linspace((at + below) / 2, at, points // 2 + 1), np.linspace(at, (at + above) / 2, points // 2 + 1)
+        ]
+        grids[name] = tuple(float(x) for x in np.unique(np.clip(near, p.lower, p.upper)))
+    return grids
+
+
 def _row_level(effect: Effect) -> bool:
     return not any(effect.overrides(h) for h in ("across", "observe", "derive"))
 
 
 def columns(
-    vehicle: Vehicle, effects: Sequence[type[Effect]], segments: Segments, rows: int, target: Target
+    vehicle: Vehicle,
+    effects: Sequence[type[Effect]],
+    segments: Segments,
+    rows: int,
+    target: Target,
+    grids: Grids | None = None,
 ) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
     """Every candidate's columns on the first `rows` rows of padded segments.
 
     Effects of one row share one vehicle with all of them at their null value, so that one compiled `jvp` serves all;
-    what acts across rows has a vehicle of its own.
+    what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name.
 
     **Returns:** candidates, their columns in the target's unit, and why the other effects were left out.
     """
@@ -137,7 +169,7 @@ def columns(
         structure, null = _structure(group)
         base = None
         for e in group:
-            for sizes, subs, shapes, kind in _of_effect(type(e), segments, row_s):
+            for sizes, subs, shapes, kind in _of_effect(type(e), segments, row_s, grids or {}):
                 keys = [Column(e.id, s, g, shapes, kind) for s, g in zip(sizes, subs, strict=True)]
                 for key in keys:
                     if key in place:
@@ -196,6 +228,8 @@ def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int 
     for p in candidate.effect.parameters:
         if p.kind == "limit" and p.name not in candidate.sizes:
             values[p.name] = None  # not part of it: the effect skips what it costs
+    if candidate.kind == "limit" and candidate.parameter(candidate.sizes[0]).smooth:
+        values[candidate.sizes[0]] = np.asarray(dict(candidate.shapes)[candidate.sizes[0]] * float(beta[0]))
     if candidate.kind == "size":
         for name, group, b in zip(candidate.sizes, candidate.groups, beta, strict=True):
             if group is None:

@@ -136,7 +136,9 @@ def diagnose(
     predicted = [_predict(problem, fit.vehicle) for fit in steps]
     left = checkpoint("remainder", lambda: _remainder(problem, split, predicted[-1], predicted[0], seed, tell).__dict__)
     summary = _summary(problem, split, state, steps, predicted, Remainder(**left))
-    found = {e["id"]: {k: (p["value"], p["sd"], p["unit"]) for k, p in e["parameters"].items()} for e in summary["effects"]}
+    found = {
+        e["id"]: {k: (p["value"], p["sd"], p["unit"]) for k, p in e["parameters"].items()} for e in summary["effects"]
+    }
     return Diagnosis(
         problem, split, summary, base.vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
     )
@@ -239,7 +241,12 @@ def _effect_block(f: Found, fit: Calibration, before: float, after: float) -> di
 
 
 def _summary(
-    problem: Problem, split: Split, state: Search, steps: list[Calibration], predicted: list[np.ndarray], left: Remainder
+    problem: Problem,
+    split: Split,
+    state: Search,
+    steps: list[Calibration],
+    predicted: list[np.ndarray],
+    left: Remainder,
 ) -> dict[str, Any]:
     weight, y = problem.weight(), problem.measured
     train, test = problem.rows(split.train), problem.rows(split.test)
@@ -253,9 +260,7 @@ def _summary(
         }
 
     rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
-    effects = [
-        {**_effect_block(f, steps[-1], rmse[k], rmse[k + 1]), "order": k + 1} for k, f in enumerate(state.found)
-    ]
+    effects = [{**_effect_block(f, steps[-1], rmse[k], rmse[k + 1]), "order": k + 1} for k, f in enumerate(state.found)]
     verdict = {
         (False, False): "nothing_missing",
         (True, False): "effects_found",
@@ -263,9 +268,7 @@ def _summary(
         (True, True): "effects_found_and_unexplained_structure",
     }[bool(effects), left.significant]
     clusters = cluster_rows(problem.segments.take(train))
-    candidates = [
-        {"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts
-    ]
+    candidates = [{"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts]
     return {
         "schema": "hdev-diagnosis/1",
         "target": problem.target,

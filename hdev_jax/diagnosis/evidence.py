@@ -5,16 +5,17 @@ columns and residual. Gains, clustered tests, left-out gains, resampling and sig
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
+from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.inference import Clusters
 
-__all__ = ["Evidence", "Score", "adjusted", "gather"]
+__all__ = ["ABSORBED", "Evidence", "Score", "adjusted", "gather", "gather_plain", "wald"]
 
 ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
 
@@ -25,7 +26,7 @@ class Score:
 
     `gain` in log-likelihood on training rows, `p_model` from it (χ²), `p_cluster` from a Wald test with jackknifed
     clusters (F), `left_out_gain` in log-likelihood over clusters left out in turn, `left` the share of its columns
-    that the Jacobian does not hold.
+    that the Jacobian does not hold. `plain`: told by rows that weigh the same (`Evidence.plain_score`).
     """
 
     candidate: Candidate
@@ -35,58 +36,75 @@ class Score:
     p_cluster: float
     left_out_gain: float
     left: float
+    plain: bool = False
 
     @property
     def p(self) -> float:
-        """Both tests have to agree."""
-        return max(self.p_model, self.p_cluster)
+        """Both tests have to agree; twice that, since whitened and plain rows are both looked at."""
+        return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Gram matrices by cluster of [Jacobian | candidates | residual], and the prior on the Jacobian's part."""
+    """Gram matrices by cluster of [Jacobian | candidates | residual], and the prior on the Jacobian's part.
 
-    grams: Float[np.ndarray, "cluster d d"]
+    `grams[v]` is for the v-th of a few variances of the clusters' levels, `cost[v]` half its log-determinant. Each
+    model takes the variance that suits it: a candidate that explains the levels is not held against a variance that
+    still contains them, which would let no statistic exceed the number of trips.
+    """
+
+    grams: Float[np.ndarray, "variance cluster d d"]
+    cost: Float[np.ndarray, " variance"]
     base: int
     precision: Float[np.ndarray, " base"]
     pull: Float[np.ndarray, " base"]
-    rows: int
 
-    def weighted(self, weight: Float[np.ndarray, " cluster"]) -> Float[np.ndarray, "d d"]:
-        """One Gram matrix with each cluster counted so many times."""
-        return np.tensordot(weight, self.grams, axes=1)
+    @property
+    def count(self) -> int:
+        """Number of clusters."""
+        return self.grams.shape[1]
+
+    def totals(self, weight: Float[np.ndarray, " cluster"] | None = None) -> Float[np.ndarray, "variance d d"]:
+        """One Gram matrix for each variance, each cluster counted so many times."""
+        return self.grams.sum(axis=1) if weight is None else np.einsum("g,vgij->vij", weight, self.grams)
 
     def _normal(self, gram: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix and right-hand side for the base columns and those at `at`."""
+        """Normal matrices and right-hand sides for the base columns and those at `at`."""
         index = np.r_[np.arange(self.base), at].astype(int)
         a = gram[..., index[:, None], index[None, :]].copy()
         b = gram[..., index, -1].copy()
         diagonal = np.arange(self.base)
         a[..., diagonal, diagonal] += self.precision
         b[..., : self.base] -= self.pull
-        tiny = 1e-10 * np.einsum("...ii->...i", a)
-        a[..., np.arange(len(index)), np.arange(len(index))] += tiny + 1e-300
+        every = np.arange(len(index))
+        a[..., every, every] *= 1.0 + 1e-10
+        a[..., every, every] += 1e-300
         return a, b
 
-    def base_reduction(self, gram: np.ndarray) -> float:
-        """Half of what the base columns take off the sum of squares."""
-        if not self.base:
-            return 0.0
-        a, b = self._normal(gram, np.empty(0, int))
-        return 0.5 * float(b @ np.linalg.solve(a, b))
+    def _fit(self, gram: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Log-likelihood up to a constant and coefficients, for each variance."""
+        a, b = self._normal(gram, at)
+        if not a.shape[-1]:
+            return -0.5 * gram[..., -1, -1] - self.cost, b
+        d = np.sqrt(np.einsum("...ii->...i", a))
+        x = np.linalg.solve(a / (d[..., :, None] * d[..., None, :]), (b / d)[..., None])[..., 0] / d
+        return -0.5 * gram[..., -1, -1] + 0.5 * np.einsum("...i,...i->...", b, x) - self.cost, x
 
-    def gain(self, gram: np.ndarray, at: Sequence[int], reduction: float | None = None) -> tuple[float, np.ndarray]:
+    def base_likelihood(self, gram: np.ndarray) -> float:
+        """Log-likelihood of the base alone at its best variance, `gram` from `totals`."""
+        return float(np.max(self._fit(gram, np.empty(0, int))[0]))
+
+    def gain(self, gram: np.ndarray, at: Sequence[int], before: float | None = None) -> tuple[float, np.ndarray]:
         """Gain in log-likelihood of candidate columns (places from 0) over the base, and their coefficients."""
-        a, b = self._normal(gram, self.base + np.asarray(at, dtype=int))
-        x = np.linalg.solve(a, b)
-        before = self.base_reduction(gram) if reduction is None else reduction
-        return 0.5 * float(b @ x) - before, x[self.base :]
+        likelihood, x = self._fit(gram, self.base + np.asarray(at, dtype=int))
+        v = int(np.argmax(likelihood))
+        return float(likelihood[v]) - (self.base_likelihood(gram) if before is None else before), x[v, self.base :]
 
     def left(self, gram: np.ndarray, at: Sequence[int]) -> float:
         """Smallest share of the columns that is left after projecting the base columns off."""
         if not self.base:
             return 1.0
-        shares = []
+        gram, shares = gram[0], []
         for k in at:
             j = self.base + k
             a = gram[: self.base, : self.base]
@@ -98,71 +116,158 @@ class Evidence:
 
     def score(self, candidate: Candidate) -> Score:
         """All tests of one candidate."""
-        total = self.grams.sum(axis=0)
-        at = np.asarray(candidate.columns)
-        k, g = len(at), len(self.grams)
-        gain, beta = self.gain(total, at)
-        p_model = float(stats.chi2.sf(2 * max(gain, 0.0), k))
-        full, base = self._jackknife(self.base + at), self._jackknife(np.empty(0, int))
-        left_out = self._loss(full, np.r_[np.arange(self.base), self.base + at])
-        left_out_base = self._loss(base, np.arange(self.base))
-        spread = full[:, self.base :] - beta
-        covariance = (g - 1) / g * spread.T @ spread
-        p_cluster = 1.0
-        if g > k + 1:
-            d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-            wald = float((beta / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (beta / d))
-            p_cluster = float(stats.f.sf(wald * (g - k) / (k * (g - 1)), k, g - k))
-        return Score(
-            candidate, beta, gain, p_model, p_cluster, float(np.sum(left_out_base - left_out)), self.left(total, at)
-        )
-
-    def _jackknife(self, at: np.ndarray) -> np.ndarray:
-        """Coefficients of base and `at` columns with each cluster left out in turn."""
-        total = self.grams.sum(axis=0)
-        a, b = self._normal(total - self.grams, at)
-        d = np.sqrt(np.maximum(np.einsum("gii->gi", a), 1e-300))
-        scaled = a / (d[:, :, None] * d[:, None, :])
-        return np.linalg.solve(scaled, (b / d)[..., None])[..., 0] / d if a.shape[-1] else b
-
-    def _loss(self, x: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Half the sum of squares of each cluster under its own left-out coefficients."""
-        grams = self.grams[:, index[:, None], index[None, :]]
-        cross = self.grams[:, index, -1]
-        quadratic = np.einsum("gi,gij,gj->g", x, grams, x)
-        return 0.5 * (self.grams[:, -1, -1] - 2 * np.einsum("gi,gi->g", x, cross) + quadratic)
-
-    def sign_placebos(self, candidate: Candidate, rng: np.random.Generator, draws: int) -> Float[np.ndarray, " draw"]:
-        """Gains of the same columns with each cluster's sign drawn at random: what no consistent effect would give."""
+        totals = self.totals()
         at = self.base + np.asarray(candidate.columns)
+        k, g = len(at), self.count
+        gain, _ = self.gain(totals, candidate.columns)
+        p_model = float(stats.chi2.sf(2 * max(gain, 0.0), k))
+        likelihood, x = self._fit(totals, at)
+        v = int(np.argmax(likelihood))
+        beta = x[v, self.base :]
+        full, base = self._jackknife(at, v), self._jackknife(np.empty(0, int), v)
+        left_out = self._loss(full, np.r_[np.arange(self.base), at], v)
+        left_out_base = self._loss(base, np.arange(self.base), v)
+        p_cluster = wald(beta, full[:, self.base :]) if g > k + 1 else 1.0
+        return Score(
+            candidate, beta, gain, p_model, p_cluster, float(np.sum(left_out_base - left_out)),
+            self.left(totals, candidate.columns),
+        )  # fmt: skip
+
+    def plain_score(self, candidate: Candidate) -> Score:
+        """A candidate's tests where rows are as they were measured and only clusters count as independent.
+
+        Weights that suit the noise inside trips may drown what differs between them (a temperature that moves slowly
+        and is measured late). The gain is the likelihood ratio of as many observations as there are clusters.
+        """
+        at = self.base + np.asarray(candidate.columns)
+        _, x = self._fit(self.totals(), at)
+        full, base = self._jackknife(at, 0), self._jackknife(np.empty(0, int), 0)
+        beta, g, k = x[0, self.base :], self.count, len(at)
+        p = wald(beta, full[:, self.base :])
+        statistic = stats.f.isf(max(p, 1e-300), k, g - k) * k / (g - k) if g > k + 1 else 0.0
+        better = self._loss(base, np.arange(self.base), 0) - self._loss(full, np.r_[np.arange(self.base), at], 0)
+        t = float(np.mean(better) / (np.std(better) + 1e-300) * np.sqrt(g))
+        gain = 0.5 * g * float(np.log1p(statistic))
+        left_out = gain if t > 1.0 else 0.0
+        return Score(candidate, beta, gain, p, p, left_out, self.left(self.totals(), candidate.columns), plain=True)
+
+    def beside(self, other: Sequence[int], own: Sequence[int]) -> float:
+        """p of a candidate's columns against zero when another's are in, with jackknifed clusters."""
+        at = self.base + np.array([*other, *(k for k in own if k not in other)], dtype=int)
+        if len(at) == len(other):
+            return 1.0
+        _, x = self._fit(self.totals(), at)
+        skip = self.base + len(other)
+        return wald(x[0, skip:], self._jackknife(at, 0)[:, skip:])
+
+    def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
+        """The same evidence with the candidate's columns given a sign in each cluster."""
+        at = self.base + np.asarray(candidate.columns)
+        grams = self.grams.copy()
+        inner = grams[:, :, at[:, None], at[None, :]]
+        grams[:, :, :, at] *= sign[None, :, None, None]
+        grams[:, :, at, :] *= sign[None, :, None, None]
+        grams[:, :, at[:, None], at[None, :]] = inner
+        return replace(self, grams=grams)
+
+    def present(self, at: Sequence[int], values: Float[np.ndarray, " k"]) -> float:
+        """p of base columns against being taken out: their values against zero with jackknifed clusters."""
+        likelihood, x = self._fit(self.totals(), np.empty(0, int))
+        v = int(np.argmax(likelihood))
+        at = np.asarray(at)
+        return wald(x[v, at] + values, self._jackknife(np.empty(0, int), v)[:, at] + values)
+
+    def _jackknife(self, at: np.ndarray, v: int) -> np.ndarray:
+        """Coefficients of base and `at` columns with each cluster left out in turn."""
+        grams = self.grams[v]
+        a, b = self._normal(grams.sum(axis=0) - grams, at)
+        if not a.shape[-1]:
+            return b
+        d = np.sqrt(np.maximum(np.einsum("gii->gi", a), 1e-300))
+        return np.linalg.solve(a / (d[:, :, None] * d[:, None, :]), (b / d)[..., None])[..., 0] / d
+
+    def _loss(self, x: np.ndarray, index: np.ndarray, v: int) -> np.ndarray:
+        """Half the sum of squares of each cluster under its own left-out coefficients."""
+        grams = self.grams[v]
+        inner, cross = grams[:, index[:, None], index[None, :]], grams[:, index, -1]
+        quadratic = np.einsum("gi,gij,gj->g", x, inner, x)
+        return 0.5 * (grams[:, -1, -1] - 2 * np.einsum("gi,gi->g", x, cross) + quadratic)
+
+    def sign_placebos(self, s: Score, rng: np.random.Generator, draws: int) -> Float[np.ndarray, " draw"]:
+        """Gains of the same columns with each cluster's sign drawn at random: what no consistent effect would give."""
+        small, candidate = self.only(s.candidate)
         out = np.empty(draws)
         for i in range(draws):
-            sign = rng.choice([-1.0, 1.0], size=len(self.grams))
-            gram = self.grams.sum(axis=0)
-            flipped = np.tensordot(sign, self.grams[:, :, at], axes=1)
-            inner = gram[np.ix_(at, at)]
-            gram[:, at] = flipped
-            gram[at, :] = flipped.T
-            gram[np.ix_(at, at)] = inner
-            out[i] = self.gain(gram, np.asarray(candidate.columns))[0]
+            other = small.flipped(candidate, rng.choice([-1.0, 1.0], size=self.count))
+            out[i] = (
+                other.plain_score(candidate).gain if s.plain else other.gain(other.totals(), candidate.columns)[0]
+            )
         return out
+
+    def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:
+        """Evidence of one candidate alone, and the candidate with its columns' places in it."""
+        index = np.r_[np.arange(self.base), self.base + np.asarray(candidate.columns), self.grams.shape[-1] - 1]
+        grams = self.grams[:, :, index[:, None], index[None, :]]
+        return replace(self, grams=grams), replace(candidate, columns=tuple(range(len(candidate.columns))))
+
+
+def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
+    """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F)."""
+    g, k = left_out.shape
+    if g <= k + 1:
+        return 1.0
+    spread = left_out - beta
+    covariance = (g - 1) / g * spread.T @ spread
+    d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    w = float((beta / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (beta / d))
+    return float(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
+
+
+LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)  # variances of levels that are tried, over the one estimated
 
 
 def gather(
-    jacobian: np.ndarray,
-    candidates: np.ndarray,
-    residual: np.ndarray,
+    white: Float[np.ndarray, "row k"],
+    base: int,
     clusters: Clusters,
+    noise: Noise,
     *,
     moved: np.ndarray,
     prior_sd: np.ndarray,
 ) -> Evidence:
-    """Gram matrices by cluster of whitened rows. `moved` is how far the present coefficients are from their tables."""
-    z = np.concatenate([jacobian, candidates, residual[:, None]], axis=1)
-    edges = np.flatnonzero(np.diff(clusters.ids)) + 1
-    grams = np.stack([part.T @ part for part in np.split(z, edges)])  # one product per cluster: the only pass
+    """Gram matrices by cluster of whitened rows [Jacobian | candidates | residual | level].
+
+    **Arguments:** `white` from `whiten`; `base`, the number of Jacobian columns; `moved`, how far the present
+    coefficients are from their tables, whose sds are `prior_sd`. Clusters are trips where levels have a variance.
+    """
+    grams = _by_cluster(white, clusters)
+    inner, level, square = grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1]
+    variances = np.array(LEVELS if noise.level_sd > 0 else (0.0,)) * noise.level_sd**2
+    shrink = variances[:, None] / (1.0 + variances[:, None] * square)
+    out = inner[None] - shrink[:, :, None, None] * np.einsum("gi,gj->gij", level, level)[None]
+    cost = 0.5 * np.sum(np.log1p(variances[:, None] * square), axis=1)
     precision = 1.0 / prior_sd**2
-    return Evidence(grams, jacobian.shape[1], precision, precision * moved, len(residual))
+    return Evidence(out, cost, base, precision, precision * moved)
+
+
+def gather_plain(
+    rows: Float[np.ndarray, "row k"],
+    base: int,
+    clusters: Clusters,
+    *,
+    variance: float,
+    moved: np.ndarray,
+    prior_sd: np.ndarray,
+) -> Evidence:
+    """The same from rows [Jacobian | candidates | residual] as they are; `variance` is what one row counts for."""
+    precision = 1.0 / prior_sd**2
+    grams = _by_cluster(rows, clusters)[None] / variance
+    return Evidence(grams, np.zeros(1), base, precision, precision * moved)
+
+
+def _by_cluster(rows: np.ndarray, clusters: Clusters) -> np.ndarray:
+    """One Gram matrix per cluster: the only pass over the rows."""
+    return np.stack([part.T @ part for part in np.split(rows, np.flatnonzero(np.diff(clusters.ids)) + 1)])
 
 
 def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:

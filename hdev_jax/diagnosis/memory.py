@@ -27,6 +27,7 @@ def to_plain(state: Search) -> dict[str, Any]:
         "verdicts": [asdict(v) for v in state.verdicts],
         "absorbs": {k: list(v) for k, v in state.absorbs.items()},
         "taken_out": list(state.taken_out),
+        "refused": list(state.refused),
         "finished": state.finished,
     }
 
@@ -41,7 +42,7 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, library: Mapping[str
     calibration = Calibration(vehicle=vehicle, table=table, **fit)
     verdicts = [Verdict(**v) for v in plain["verdicts"]]
     absorbs, out = dict(plain["absorbs"]), tuple(plain["taken_out"])
-    return Search(vehicle, table, calibration, found, verdicts, absorbs, out, bool(plain["finished"]))
+    return Search(vehicle, table, calibration, found, verdicts, absorbs, out, tuple(plain["refused"]), bool(plain["finished"]))
 
 
 def _found(f: Found) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def _found(f: Found) -> dict[str, Any]:
         "id": f.id, "q_value": f.q_value, "stability": f.stability, "twins": list(f.twins), "gain": f.gain,
         "sizes": list(c.sizes), "groups": [-1 if g is None else g for g in c.groups], "kind": c.kind,
         "shapes": [[n, v] for n, v in c.shapes], "columns": list(c.columns), "beta": np.asarray(s.beta),
-        "score": [s.gain, s.p_model, s.p_cluster, s.left_out_gain, s.left],
+        "score": [s.gain, s.p_model, s.p_cluster, s.left_out_gain, s.left], "plain": s.plain,
     }  # fmt: skip
 
 
@@ -60,7 +61,7 @@ def _score(plain: Mapping[str, Any], library: Mapping[str, type[Effect]]) -> Fou
     candidate = Candidate(
         library[plain["id"]], tuple(plain["sizes"]), groups, shapes, plain["kind"], tuple(plain["columns"])
     )
-    score = Score(candidate, np.asarray(plain["beta"]), *map(float, plain["score"]))
+    score = Score(candidate, np.asarray(plain["beta"]), *map(float, plain["score"]), plain=bool(plain["plain"]))
     return Found(
         plain["id"], score, float(plain["q_value"]), float(plain["stability"]), tuple(plain["twins"]), plain["gain"]
     )

@@ -4,11 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates import Candidate, columns, realised
-from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, gather
+from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, gather, gather_plain
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import (
     Calibration,
@@ -30,6 +29,7 @@ MOST_EFFECTS = 10
 LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
+LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ class Search:
     verdicts: list[Verdict] = field(default_factory=list)
     absorbs: dict[str, list[str]] = field(default_factory=dict)
     taken_out: tuple[str, ...] = ()  # added once, superfluous later: not tried again
+    refused: tuple[str, ...] = ()  # cleared the tests but not the joint refit: tried again only before the end
     finished: bool = False
 
 
@@ -83,6 +84,10 @@ class _Problem:
     @property
     def trip(self) -> np.ndarray:
         return np.asarray(self.rows.segments.trip)[: self.rows.rows]
+
+    @property
+    def seconds(self) -> np.ndarray:
+        return np.asarray(self.rows.segments.duration_s)[: self.rows.rows]
 
     @property
     def measured(self) -> np.ndarray:
@@ -132,9 +137,12 @@ def _step(problem: _Problem, state: Search, step: int, tell: Callable[[str], Non
     view = _look(problem, state)
     if step == 1:
         state = replace(state, absorbs=view.absorbs)
-    choice = _choose(problem, state, view, tell) if step <= MOST_EFFECTS else None
+    choice = _choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
+    if choice is None and state.refused and step <= MOST_EFFECTS:
+        choice = _choose(problem, state, view, tell, skip=())
     if choice is None:
         return replace(state, verdicts=view.verdicts(state), finished=True)
+    choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
     return replace(_prune(problem, choice, tell), verdicts=view.verdicts(choice))
 
@@ -144,6 +152,7 @@ class _View:
     """One look at all candidates from where the vehicle stands."""
 
     evidence: Evidence
+    plain: Evidence
     noise: Noise
     best: dict[str, Score]
     ways: dict[str, int]
@@ -151,6 +160,7 @@ class _View:
     left_out: dict[str, str]
     absorbs: dict[str, list[str]]
     absorbed_by: dict[str, str]
+    fit: Calibration
     residual: np.ndarray
     jacobian: np.ndarray
     matrix: np.ndarray
@@ -173,7 +183,7 @@ def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
         return f"absorbed: this log cannot tell it from {absorbed_by}"
     if not _plausible(s):
         return "its best size has the wrong sign or is out of range"
-    if s.left_out_gain <= 0:
+    if s.left_out_gain <= LEFT_OUT:
         return "does not lower the error on trips left out of the fit"
     if s.p_cluster > s.p_model and q > 0.05:
         return f"not the same in every trip (q = {q:.2g} with errors clustered)"
@@ -186,14 +196,20 @@ def _plausible(s: Score) -> bool:
     """Signs, ranges and least sizes; a switch has to make about the whole of its difference."""
     c = s.candidate
     if c.kind == "limit":
-        return bool(0.4 <= s.beta[0] <= 2.5)
+        first = c.parameter(c.sizes[0])
+        size = abs(dict(c.shapes)[first.name] * s.beta[0])
+        return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5) and size >= first.least
     parameters = [c.parameter(n) for n in c.sizes]
     within = all(p.lower <= p.null + b <= p.upper for p, b in zip(parameters, s.beta, strict=True))
     return within and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
 
 
-def _bic(s: Score, rows: int) -> float:
-    return s.gain - 0.5 * s.candidate.freedoms * np.log(rows)
+def _worth(gain: float, c: Candidate) -> float:
+    """Gain less what its numbers cost: as BIC would for 400 independent rows a size, 20 a shape.
+
+    Rows of a log are not independent, and what differs only between trips has no more of them than trips.
+    """
+    return gain - 3.0 * len(c.columns) - 1.5 * (c.freedoms - len(c.columns))
 
 
 def _moved(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
@@ -206,48 +222,66 @@ def _look(problem: _Problem, state: Search) -> _View:
     """Whiten, gather and score everything once."""
     rows, n = problem.rows, problem.rows.rows
     residual = problem.measured - state.fit.predicted
-    noise = estimate_noise(residual, problem.trip, levels=problem.clusters.kind == "trip")
+    noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
     car = state.fit.vehicle
     jac = jacobian(car, state.table, rows.segments, problem.target)[:n]
     candidates, matrix, left_out = columns(car, problem.effects, rows.segments, n, problem.target)
-    white = whiten(np.concatenate([jac, matrix, residual[:, None]], axis=1), noise, problem.trip, problem.clusters)
-    moved, sd = _moved(state.fit)
-    p = jac.shape[1]
-    evidence = gather(white[:, :p], white[:, p:-1], white[:, -1], problem.clusters, moved=moved, prior_sd=sd)
-    best, ways = _best(evidence, candidates)
+    evidence, plain = _both(problem, state.fit, noise, jac, matrix, residual)
+    best, ways = _best(evidence, plain, candidates)
     for id_ in {c.id for c in candidates} - set(best):
         left_out[id_] = "does nothing on this log"
     absorbs, absorbed_by = _absorption(evidence, state, best)
     ids = list(best)
     ps = [min(1.0, best[i].p * ways[i]) if i not in absorbed_by else 1.0 for i in ids]
     q = dict(zip(ids, adjusted(ps), strict=True))
-    return _View(evidence, noise, best, ways, q, left_out, absorbs, absorbed_by, residual, jac, matrix)
+    return _View(evidence, plain, noise, best, ways, q, left_out, absorbs, absorbed_by, state.fit, residual, jac, matrix)
 
 
-def _best(evidence: Evidence, candidates: list[Candidate]) -> tuple[dict[str, Score], dict[str, int]]:
+def _best(
+    evidence: Evidence, plain: Evidence, candidates: list[Candidate]
+) -> tuple[dict[str, Score], dict[str, int]]:
     """The best plausible way to have each effect, and how many ways were tried."""
-    total = evidence.grams.sum(axis=0)
-    reduction = evidence.base_reduction(total)
+    totals = evidence.totals()
+    before = evidence.base_likelihood(totals)
     ways: dict[str, int] = {}
     ranked: dict[str, list[tuple[float, Candidate]]] = {}
     for c in candidates:
-        norms = [total[evidence.base + k, evidence.base + k] for k in c.columns]
-        if min(norms) <= 1e-20:
+        if min(totals[0, evidence.base + k, evidence.base + k] for k in c.columns) <= 1e-20:
             continue
-        gain, _ = evidence.gain(total, c.columns, reduction)
+        gain, _ = evidence.gain(totals, c.columns, before)
         ways[c.id] = ways.get(c.id, 0) + 1
-        ranked.setdefault(c.id, []).append((gain - 0.5 * c.freedoms * np.log(evidence.rows), c))
+        ranked.setdefault(c.id, []).append((_worth(gain, c), c))
     best = {}
     for id_, entries in ranked.items():
-        entries.sort(key=lambda e: -e[0])
-        scores = []
-        for _, c in entries[:4]:
-            s = evidence.score(c)
-            scores.append(s)
-            if _plausible(s):
-                break
-        best[id_] = next((s for s in scores if _plausible(s)), scores[0])
+        looks = [_first_plausible([evidence.score(c) for _, c in _leading(entries)])]
+        scores = [plain.plain_score(c) for _, c in entries]
+        looks.append(_first_plausible(sorted(scores, key=lambda s: -_worth(s.gain, s.candidate))))
+        # what both looks see is told by the whitened rows, which see it better
+        able = [s for s in looks if _plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
+        best[id_] = min(able, key=lambda s: (s.p > 1e-6, s.p if s.p > 1e-6 else 0.0))
     return best, ways
+
+
+def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
+    return sorted(entries, key=lambda e: -e[0])[:6]
+
+
+def _first_plausible(scores: list[Score]) -> Score:
+    return next((s for s in scores if _plausible(s)), scores[0])
+
+
+def _both(
+    problem: _Problem, fit: Calibration, noise: Noise, jac: np.ndarray, matrix: np.ndarray, residual: np.ndarray
+) -> tuple[Evidence, Evidence]:
+    """Evidence from whitened rows, and from rows as they are, each worth 1/inflation of its own variance."""
+    rows = np.concatenate([jac, matrix, residual[:, None]], axis=1)
+    moved, sd = _moved(fit)
+    white = whiten(rows, noise, problem.trip, problem.seconds)
+    variance = float(np.mean(residual**2)) * fit.inflation
+    return (
+        gather(white, jac.shape[1], problem.clusters, noise, moved=moved, prior_sd=sd),
+        gather_plain(rows, jac.shape[1], problem.clusters, variance=variance, moved=moved, prior_sd=sd),
+    )
 
 
 def _absorption(
@@ -257,7 +291,7 @@ def _absorption(
     names = [c.name for c in state.table.free]
     absorbs: dict[str, list[str]] = {n: [] for n in names}
     by: dict[str, str] = {}
-    total = evidence.grams.sum(axis=0)
+    total = evidence.totals()[0]
     for id_, s in best.items():
         if s.left > ABSORBED or not names:
             continue
@@ -271,33 +305,38 @@ def _absorption(
     return absorbs, by
 
 
-def _choose(problem: _Problem, state: Search, view: _View, tell: Callable[[str], None]) -> Search | None:
+def _choose(
+    problem: _Problem, state: Search, view: _View, tell: Callable[[str], None], *, skip: Sequence[str]
+) -> Search | None:
     """The candidate that clears every bar, refitted; None where none does. Keeps going past one that fails."""
-    n = view.evidence.rows
     able = [
         s
         for id_, s in view.best.items()
-        if id_ not in state.taken_out and view.q[id_] <= problem.fdr and s.left_out_gain > 0 and _plausible(s) and _bic(s, n) > 0
+        if id_ not in state.taken_out
+        and id_ not in skip
+        and view.q[id_] <= problem.fdr
+        and s.left_out_gain > 0
+        and _plausible(s)
+        and _worth(s.gain, s.candidate) > 0
     ]
-    able.sort(key=lambda s: -_bic(s, n))
+    able.sort(key=lambda s: -_worth(s.gain, s.candidate))
     while able:
-        close = [s for s in able[:LEADERS] if _bic(s, n) > 0.7 * _bic(able[0], n)]
+        first = _worth(able[0].gain, able[0].candidate)
+        close = [s for s in able[:LEADERS] if _worth(s.gain, s.candidate) > 0.85 * first]
         fits = []
         for s in close:
             tell(f"refitting with {s.candidate.id}")
             if (tried := _refit(problem, state, s, view)) is not None:
-                fits.append((tried[1] - 0.5 * s.candidate.freedoms * np.log(n), s, *tried))
+                gain = max(tried[1], s.gain) if s.plain else tried[1]
+                fits.append((_worth(gain, s.candidate), s, tried[0], gain))
             else:
-                view.reasons[s.candidate.id] = "the joint refit left its range or did not converge"
+                view.reasons[s.candidate.id] = "in the joint refit it is out of range or not told from nothing"
         able = [s for s in able if s not in close]
         fits.sort(key=lambda f: -f[0])
         for _, s, new, gain in fits:
             c = s.candidate
-            if np.any(view.evidence.sign_placebos(c, problem.rng, PLACEBOS) >= s.gain):
-                view.reasons[c.id] = "a placebo (its column with the trips' signs drawn at random) does as well"
-                continue
-            if not _beats_shifts(problem, state, s, view):
-                view.reasons[c.id] = "a placebo (its column shifted in time) does as well"
+            if why := _placebo(problem, s, view):
+                view.reasons[c.id] = why
                 continue
             twins = _twins(view, s, problem)
             stability = _stability(problem, view, {c.id, *twins})
@@ -308,6 +347,7 @@ def _choose(problem: _Problem, state: Search, view: _View, tell: Callable[[str],
 
 def _refit(problem: _Problem, state: Search, s: Score, view: _View) -> tuple[Search, float] | None:
     """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
+    s = _refined(problem, s, view)
     effect = realised(s.candidate, s.beta, gears=problem.gears)
     sizes = s.candidate.sizes
     groups = [str(g) for g in s.candidate.groups if g is not None]
@@ -318,10 +358,35 @@ def _refit(problem: _Problem, state: Search, s: Score, view: _View) -> tuple[Sea
     fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
     if not fit.converged and fit.steps < 5:
         return None
-    if not _in_range(fit, s.candidate):
+    if not _in_range(fit, s.candidate) or not _present(fit, s.candidate):
         return None
     gain = _whitened_gain(problem, state, fit, view)
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit), gain
+
+
+def _refined(problem: _Problem, s: Score, view: _View) -> Score:
+    """The same way to have the effect with its shapes on a finer grid: switches have many small optima."""
+    row_s = float(np.median(np.asarray(problem.rows.segments.duration_s)[: problem.rows.rows]))
+    grids = finer(s.candidate, row_s)
+    if all(len(g) == 1 for g in grids.values()):
+        return s
+    n = problem.rows.rows
+    effects = [s.candidate.effect]
+    found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
+    same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
+    evidence, plain = _both(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
+    best, _ = _best(evidence, plain, same)
+    finest = best.get(s.candidate.id)
+    return finest if finest is not None and finest.gain > s.gain and finest.plain == s.plain else s
+
+
+def _present(fit: Calibration, candidate: Candidate) -> bool:
+    """Whether a size stands in the joint refit too, where rows weigh the same, at 1 % with errors clustered."""
+    if candidate.kind == "limit":
+        return True
+    at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes
+          and c.path.startswith(f"effects.{candidate.id}.")]  # fmt: skip
+    return bool(np.any(np.abs(fit.values[at]) > 2.6 * fit.sd[at]))
 
 
 def _idle(candidate: Candidate, path: str) -> bool:
@@ -341,105 +406,107 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
 
 
 def _whitened_gain(problem: _Problem, state: Search, fit: Calibration, view: _View) -> float:
-    """Gain of a refitted vehicle over the present one, under the present noise, each at its whitened optimum."""
-    n = problem.rows.rows
-    jac = jacobian(fit.vehicle, fit.table, problem.rows.segments, problem.target)[:n]
-    residual = problem.measured - fit.predicted
-    white = whiten(np.c_[jac, residual], view.noise, problem.trip, problem.clusters)
+    """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
+    after = _evidence(problem, fit, view.noise)
+    prior = [0.5 * float(np.sum(np.square(np.divide(*_moved(f))))) for f in (state.fit, fit)]
+    before = view.evidence.base_likelihood(view.evidence.totals()) - prior[0]
+    return after.base_likelihood(after.totals()) - prior[1] - before
+
+
+def _evidence(problem: _Problem, fit: Calibration, noise: Noise) -> Evidence:
+    """A fitted vehicle's own Jacobian and residual, whitened; no candidates."""
+    jac = jacobian(fit.vehicle, fit.table, problem.rows.segments, problem.target)[: problem.rows.rows]
+    white = whiten(np.c_[jac, problem.measured - fit.predicted], noise, problem.trip, problem.seconds)
     moved, sd = _moved(fit)
-    empty = np.zeros((n, 0))
-    after = gather(white[:, :-1], empty, white[:, -1], problem.clusters, moved=moved, prior_sd=sd)
-    total, before = after.grams.sum(axis=0), view.evidence.grams.sum(axis=0)
-    prior_before = 0.5 * float(np.sum(np.square(np.divide(*_moved(state.fit))))) if state.table.free else 0.0
-    prior_after = 0.5 * float(np.sum(np.square(moved / sd)))
-    gain_after = after.base_reduction(total) - 0.5 * total[-1, -1] - prior_after
-    gain_before = view.evidence.base_reduction(before) - 0.5 * before[-1, -1] - prior_before
-    return gain_after - gain_before
+    return gather(white, jac.shape[1], problem.clusters, noise, moved=moved, prior_sd=sd)
 
 
-def _beats_shifts(problem: _Problem, state: Search, s: Score, view: _View, draws: int = 19) -> bool:
-    """Whether the column gains more than itself moved in time by a random amount inside each trip.
+def _placebo(problem: _Problem, s: Score, view: _View, draws: int = 19) -> str | None:
+    """Why a placebo does as well, or None.
 
-    A column that hardly changes in a trip cannot be moved in time; the sign placebos speak for it.
+    A column that changes inside trips is moved in time by a random amount in each; one that hardly does is given a
+    random sign in each trip instead. (Signs mean little to an effect of two or three trips, shifts nothing to a
+    constant.)
     """
-    n = problem.rows.rows
     column = view.matrix[:, list(s.candidate.columns)]
-    trip = problem.trip
-    edges = np.flatnonzero(np.diff(trip)) + 1
-    parts = np.split(np.arange(n), edges)
+    edges = np.flatnonzero(np.diff(problem.trip)) + 1
+    parts = np.split(np.arange(len(column)), edges)
     within = np.concatenate([column[p] - column[p].mean(axis=0) for p in parts])
-    if np.sum(within**2) < 0.05 * np.sum(column**2):
-        return True
+    if s.plain or np.sum(within**2) < 0.2 * np.sum(column**2):
+        evidence = view.plain if s.plain else view.evidence
+        signs = evidence.sign_placebos(s, problem.rng, PLACEBOS)
+        if np.mean(signs >= s.gain) > 0.01:
+            return "a placebo (its column with the trips' signs drawn at random) does as well"
+        return None
     shifted = []
     for _ in range(draws):
         moved = [np.roll(p, int(problem.rng.integers(len(p) // 8, max(len(p) - len(p) // 8, 2)))) for p in parts]
         shifted.append(column[np.concatenate(moved)])
-    white = whiten(np.concatenate(shifted, axis=1), view.noise, trip, problem.clusters)
-    base = whiten(np.c_[view.jacobian, view.residual], view.noise, trip, problem.clusters)
-    moved, sd = _moved(state.fit)
-    evidence = gather(base[:, :-1], white, base[:, -1], problem.clusters, moved=moved, prior_sd=sd)
-    total = evidence.grams.sum(axis=0)
-    k = column.shape[1]
-    gains = [evidence.gain(total, range(i * k, (i + 1) * k))[0] for i in range(draws)]
-    return bool(max(gains) < s.gain)
+    rows = np.concatenate([view.jacobian, *shifted, view.residual[:, None]], axis=1)
+    moved_by, sd = _moved(view.fit)
+    base = view.jacobian.shape[1]
+    white = whiten(rows, view.noise, problem.trip, problem.seconds)
+    evidence = gather(white, base, problem.clusters, view.noise, moved=moved_by, prior_sd=sd)
+    totals, k = evidence.totals(), column.shape[1]
+    before = evidence.base_likelihood(totals)
+    gains = [evidence.gain(totals, range(i * k, (i + 1) * k), before)[0] for i in range(draws)]
+    return "a placebo (its column shifted in time) does as well" if max(gains) >= s.gain else None
 
 
 def _twins(view: _View, s: Score, problem: _Problem) -> tuple[str, ...]:
     """At most two other effects that, put in its place, leave the chosen one insignificant and explain as much."""
-    total = view.evidence.grams.sum(axis=0)
+    total = view.evidence.totals()
+    before = view.evidence.base_likelihood(total)
     out: list[tuple[float, str]] = []
     for id_, other in view.best.items():
         if id_ == s.candidate.id or id_ in view.absorbed_by or not _plausible(other):
             continue
-        if other.gain < 0.8 * s.gain:
-            continue
         both = tuple(dict.fromkeys((*other.candidate.columns, *s.candidate.columns)))
-        beside = view.evidence.gain(total, both)[0] - other.gain
-        if 2 * beside < stats.chi2.ppf(0.95, len(s.candidate.columns)):
-            out.append((-other.gain, id_))
+        if s.plain:
+            rival = view.plain.plain_score(other.candidate).gain
+            beside = view.plain.beside(other.candidate.columns, s.candidate.columns)
+        else:
+            rival = view.evidence.gain(total, other.candidate.columns, before)[0]
+            gain = view.evidence.gain(total, both, before)[0] - rival
+            beside = float(stats.chi2.sf(2 * max(gain, 0.0), len(s.candidate.columns)))
+        if rival > 0.8 * s.gain and beside > 0.05:
+            out.append((-rival, id_))
     return tuple(id_ for _, id_ in sorted(out)[:2])
 
 
 def _stability(problem: _Problem, view: _View, names: set[str]) -> float:
     """Share of resampled sets of clusters in which the same effect (or its class) comes first."""
-    g = len(view.evidence.grams)
-    rivals = sorted(view.best.values(), key=lambda s: -s.gain)[:12]
+    g = view.evidence.count
+    rivals = [s for s in view.best.values() if s.candidate.id not in view.absorbed_by and _plausible(s)]
+    rivals = sorted(rivals, key=lambda s: -s.gain)[:8]
+    small = [(view.plain if s.plain else view.evidence).only(s.candidate) for s in rivals]
     hits = 0
     for _ in range(RESAMPLES):
-        weight = np.bincount(problem.rng.integers(0, g, g), minlength=g).astype(float)
-        gram = view.evidence.weighted(weight)
-        reduction = view.evidence.base_reduction(gram)
-        gains = [
-            view.evidence.gain(gram, s.candidate.columns, reduction)[0]
-            - 0.5 * s.candidate.freedoms * np.log(view.evidence.rows)
-            if s.candidate.id not in view.absorbed_by and _plausible(s) else -np.inf
-            for s in rivals
-        ]  # fmt: skip
-        hits += rivals[int(np.argmax(gains))].candidate.id in names and max(gains) > 0
+        drawn = problem.rng.integers(0, g, g)
+        weight = np.bincount(drawn, minlength=g).astype(float)
+        worth = []
+        for s, (evidence, candidate) in zip(rivals, small, strict=True):
+            if s.plain:
+                gain = replace(evidence, grams=evidence.grams[:, drawn]).plain_score(candidate).gain
+            else:
+                gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
+            worth.append(_worth(gain, candidate))
+        hits += rivals[int(np.argmax(worth))].candidate.id in names and max(worth) > 0
     return hits / RESAMPLES
 
 
 def _prune(problem: _Problem, state: Search, tell: Callable[[str], None]) -> Search:
     """Backward: an effect that the later ones made superfluous goes, the weakest first."""
     while len(state.found) > 1:
-        n = problem.rows.rows
-        jac = jacobian(state.fit.vehicle, state.table, problem.rows.segments, problem.target)[:n]
         residual = problem.measured - state.fit.predicted
-        noise = estimate_noise(residual, problem.trip, levels=problem.clusters.kind == "trip")
-        white = whiten(np.c_[jac, residual], noise, problem.trip, problem.clusters)
-        moved, sd = _moved(state.fit)
-        e = gather(
-            white[:, :-1], np.zeros((n, 0)), white[:, -1], problem.clusters, moved=moved, prior_sd=sd
-        )
+        noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
+        evidence = _evidence(problem, state.fit, noise)
         worst: tuple[float, Found] | None = None
         for f in state.found[:-1]:
-            sizes = [
-                k
-                for k, c in enumerate(state.table.free)
-                if c.path.startswith(f"effects.{f.id}.")
-                and c.path.rpartition(".")[2] in f.score.candidate.sizes + tuple(x for x, _ in f.score.candidate.shapes)
-            ]
-            p = _wald(e, sizes, state.fit.values, state.vehicle, f)
+            if f.score.candidate.kind == "limit":
+                continue  # a switch is either there or not: its size says nothing against zero
+            at = [k for k, c in enumerate(state.table.free) if _is_size(c.path, f)]
+            p = evidence.present(at, state.fit.values[at])
             if p > 0.05 and (worst is None or p > worst[0]):
                 worst = (p, f)
         if worst is None:
@@ -456,19 +523,6 @@ def _prune(problem: _Problem, state: Search, tell: Callable[[str], None]) -> Sea
     return state
 
 
-def _wald(e: Evidence, at: list[int], values: Float[np.ndarray, " free"], vehicle: Vehicle, f: Found) -> float:
-    """p of an effect already in the vehicle: its sizes against zero with jackknifed clusters. A limit always holds."""
-    sizes = [k for k in at if f.score.candidate.kind == "size"][: len(f.score.candidate.sizes)]
-    if not sizes:
-        return 0.0
-    g = len(e.grams)
-    beta = e._jackknife(np.empty(0, int))[:, sizes] + values[sizes]
-    mean = beta.mean(axis=0)
-    spread = beta - mean
-    covariance = (g - 1) / g * spread.T @ spread
-    d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    k = len(sizes)
-    if g <= k + 1:
-        return 0.0
-    wald = float((mean / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (mean / d))
-    return float(stats.f.sf(wald * (g - k) / (k * (g - 1)), k, g - k))
+def _is_size(path: str, f: Found) -> bool:
+    """Whether a coefficient is one of the sizes of a found effect."""
+    return any(path == f"effects.{f.id}.{name}" for name in f.score.candidate.sizes)

@@ -48,7 +48,9 @@ def split_trips(log: Log, train: Sequence[str] | None = None, test: Sequence[str
         chosen_train = tuple(i for i in every if i not in chosen_test)
     for ids, side, other in ((chosen_train, "training", "--test-trips"), (chosen_test, "test", "--train-trips")):
         if not ids:
-            raise InputError(f"no {side} trip is left: the log has {', '.join(log.trip_names)}; leave some out of {other}")
+            raise InputError(
+                f"no {side} trip is left: the log has {', '.join(log.trip_names)}; leave some out of {other}"
+            )
     unused = tuple(i for i in every if i not in chosen_train and i not in chosen_test)
     return Split(log, chosen_train, chosen_test, unused)
 

@@ -1,18 +1,20 @@
 """The noise of a log: its colour, the level of each trip, the scale of each trip; and what makes it white."""
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hdev_jax.inference import Clusters
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Noise", "estimate_noise", "whiten"]
 
 MAX_ORDER = 24
+BLOCK_S = 600.0
+BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
 
 
@@ -22,7 +24,8 @@ class Noise:
 
     `coefficients[k]` predicts the row at position k of its trip from the k rows before it (the last line serves all
     later rows), `scales[k]` is the standard deviation of that prediction's error. `level_sd` is the standard deviation
-    of the trips' levels; `trip_scale` multiplies `scales`, by trip in the order of the rows.
+    of the trips' levels, `block_sd` that of the levels of blocks of `BLOCK_S` inside them: what wanders more slowly
+    than an autoregression of a few rows can follow. `trip_scale` multiplies `scales`, by trip in the order of the rows.
     """
 
     coefficients: Float[np.ndarray, "position lag"]
@@ -30,6 +33,7 @@ class Noise:
     level_sd: float
     trip_scale: Float[np.ndarray, " trip"]
     log_likelihood: float
+    block_sd: float = 0.0
 
     @property
     def order(self) -> int:
@@ -59,7 +63,24 @@ def _positions(trip: np.ndarray) -> np.ndarray:
     return position
 
 
-def estimate_noise(residual: Float[np.ndarray, " row"], trip: Int[np.ndarray, " row"], *, levels: bool) -> Noise:
+def _blocks(trip: np.ndarray, duration_s: np.ndarray) -> list[slice]:
+    """Rows of each block of about `BLOCK_S`; a last piece under half of it joins the one before."""
+    out = []
+    for _, s in trip_slices(trip):
+        clock = np.cumsum(duration_s[s])
+        count = max(1, round(float(clock[-1]) / BLOCK_S))
+        edges = np.searchsorted(clock, np.linspace(0, clock[-1], count + 1)[1:-1])
+        out += [slice(int(a), int(b)) for a, b in itertools.pairwise(np.r_[s.start, s.start + edges, s.stop]) if b > a]
+    return out
+
+
+def estimate_noise(
+    residual: Float[np.ndarray, " row"],
+    trip: Int[np.ndarray, " row"],
+    duration_s: Float[np.ndarray, " row"],
+    *,
+    levels: bool,
+) -> Noise:
     """The colour of a residual, by trip: order by AIC up to 24, level of the trips by maximum likelihood.
 
     `levels=False` where trips are too few to have levels of their own. Trips of a scale of their own (`trip_scale`)
@@ -103,7 +124,25 @@ def estimate_noise(residual: Float[np.ndarray, " row"], trip: Int[np.ndarray, " 
     own = np.array([np.mean(white[s] ** 2) for s in slices])
     pooled = float(np.mean(white**2))
     scale = np.sqrt((rows * own + 50.0 * pooled) / (rows + 50.0))
-    return Noise(noise.coefficients, noise.scales, noise.level_sd, np.maximum(scale, 1e-6), best[0])
+    noise = replace(noise, trip_scale=np.maximum(scale, 1e-6), log_likelihood=best[0])
+    return replace(noise, block_sd=_block_sd(noise, residual, trip, duration_s, common))
+
+
+def _block_sd(
+    noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: np.ndarray, common: float
+) -> float:
+    """Standard deviation of the blocks' levels by maximum likelihood, 0 where it gains less than 5."""
+    blocks = _blocks(trip, duration_s)
+    if len(blocks) < 3 * len(np.unique(trip)) or len(residual) < 20 * len(blocks):
+        return 0.0
+    both = whiten(residual[:, None], noise, trip, duration_s)
+    starts = np.array([b.start for b in blocks])
+    uu = np.add.reduceat(both[:, 1] ** 2, starts)
+    uz = np.add.reduceat(both[:, 1] * both[:, 0], starts)
+    variances = np.array(BLOCK_VARIANCES)[:, None] * common**2
+    gain = np.sum(0.5 * variances * uz**2 / (1 + variances * uu) - 0.5 * np.log1p(variances * uu), axis=1)
+    k = int(np.argmax(gain))
+    return float(np.sqrt(variances[k, 0])) if gain[k] > 5.0 else 0.0
 
 
 def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices: list[slice]) -> float:
@@ -133,25 +172,27 @@ def _filter(columns: Array, coefficients: Array, scales: Array, position: Array)
 
 
 def whiten(
-    columns: Float[np.ndarray, "row k"], noise: Noise, trip: Int[np.ndarray, " row"], clusters: Clusters
-) -> Float[np.ndarray, "row k"]:
-    """Columns as the noise's own units see them: independent rows of variance 1.
+    columns: Float[np.ndarray, "row k"],
+    noise: Noise,
+    trip: Int[np.ndarray, " row"],
+    duration_s: Float[np.ndarray, " row"],
+) -> Float[np.ndarray, "row k+1"]:
+    """Columns as the noise's own units see them: independent rows of variance 1, but for the levels of the trips.
 
-    The level of each trip is taken out as far as its variance asks (a random intercept: all of it where levels are
-    large against the rest, nothing where there are none).
+    Levels of blocks are taken out as far as their variance asks (random intercepts). The last column is what a level
+    of 1 of the trip looks like; `evidence.gather` takes those out by their variance.
     """
     position = _positions(trip)
     n, k = columns.shape
-    pad = (-k) % 16  # a few widths only, so that the filter is compiled a few times
-    wide = np.concatenate([columns, np.ones((n, 1)), np.zeros((n, (pad - 1) % 16))], axis=1)
-    white = np.asarray(_filter(wide, noise.coefficients, noise.scales, position))
-    out, u = white[:, :k].copy(), white[:, k]
+    pad = (-(k + 1)) % 16  # a few widths only, so that the filter is compiled a few times
+    wide = np.concatenate([columns, np.ones((n, 1)), np.zeros((n, pad))], axis=1)
+    out = np.array(_filter(wide, noise.coefficients, noise.scales, position)[:, : k + 1])
     for t, (_, s) in enumerate(trip_slices(trip)):
-        scale = noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
-        out[s] /= scale
-        if noise.level_sd > 0:
-            v = u[s] / scale
-            vv = float(v @ v)
-            shrink = 1.0 - 1.0 / np.sqrt(1.0 + noise.level_sd**2 * vv)
-            out[s] -= (shrink / vv) * np.outer(v, v @ out[s])
+        out[s] /= noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
+    if noise.block_sd > 0:
+        for b in _blocks(trip, duration_s):
+            level = out[b, k].copy()
+            square = float(level @ level)
+            shrink = 1.0 - 1.0 / np.sqrt(1.0 + noise.block_sd**2 * square)
+            out[b] -= (shrink / square) * np.outer(level, level @ out[b])
     return out

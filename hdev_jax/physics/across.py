@@ -81,13 +81,29 @@ def low_pass(column: Any, segments: Segments, tau_s: Any) -> Float[Array, " row"
 
 
 def at_times(column: Any, segments: Segments, ahead_s: Any) -> Float[Array, " row"]:
-    """The column `ahead_s` seconds later inside its trip, linear in time, held at the trip's edges."""
+    """The column `ahead_s` seconds later inside its trip, linear in time, held at the trip's edges.
+
+    Exactly the column itself at 0, where the slope is that towards the next row.
+    """
+    x = jnp.asarray(column)
     clock = jnp.asarray(segments.time_s) + 0.5 * jnp.asarray(segments.duration_s)
     first, last = trip_bounds(segments.trip)
     wanted = jnp.clip(clock + ahead_s, clock[first], clock[last])
-    # one increasing clock for all trips, so that a single interpolation serves
-    lap = jnp.asarray(segments.trip) * (jnp.max(clock) + 1.0)
-    return jnp.interp(wanted + lap, clock + lap, jnp.asarray(column))
+    sought = jax.lax.stop_gradient(wanted)
+
+    def halve(_: Any, span: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = span
+        middle = (low + high + 1) // 2
+        before = clock[middle] <= sought
+        return jnp.where(before, middle, low), jnp.where(before, high, middle - 1)
+
+    # bisection in each row's own trip: the trips may come in any order
+    here, _ = jax.lax.fori_loop(0, x.shape[0].bit_length(), halve, (first, last))
+    here = jnp.clip(here, first, jnp.maximum(last - 1, first))
+    after = jnp.minimum(here + 1, last)
+    gap = clock[after] - clock[here]
+    part = jnp.where(gap > 0, (wanted - clock[here]) / jnp.where(gap > 0, gap, 1.0), 0.0)
+    return (1 - part) * x[here] + part * x[after]
 
 
 def distance_since_start(segments: Segments) -> Float[Array, " row"]:

@@ -26,6 +26,13 @@ __all__ = [
 
 OFF_W = 1e12  # a limit that no vehicle reaches, in place of infinity: products with it stay finite
 STANDSTILL_MPS = 0.1
+
+
+def _ladder(low: float, high: float, steps: int) -> tuple[float, ...]:
+    """A geometric grid of powers [W]."""
+    return tuple(round(low * (high / low) ** (k / (steps - 1)), -2) for k in range(steps))
+
+
 LIMITS = 90  # order of the switches: after every load and loss they act on
 
 
@@ -217,17 +224,21 @@ class FrictionBlending(Effect):
 
     id: ClassVar = "friction_blending"
     stage: ClassVar = "battery"
-    equation: ClassVar = "−s·min(P, 0)·[p_brake > 0.2 bar]"
+    equation: ClassVar = "−s·min(P, 0)·[p_brake > p₀]"
     source: ClassVar = "paper 2, eq. 7-9 (η_rg)"
     needs: ClassVar = ("brake_pressure_pa",)
-    parameters: ClassVar = (Parameter("share", "1", 0.0, 0.3, 0.0, 1.0, least=0.01),)
+    parameters: ClassVar = (
+        Parameter("share", "1", 0.0, 0.3, 0.0, 1.0, least=0.01),
+        Parameter("above_pa", "Pa", 2e4, 2e4, 0.0, 1e6, kind="choice", grid=(0.0, 2e4, 1e5)),
+    )
     mistaken_for: ClassVar = ("regen_cutoff", "regen_limit")
     separated_by: ClassVar = "braking with and without pressure at one speed"
     order: ClassVar = 30
     share: Any
+    above_pa: Any
 
     def power(self, row, car, point):
-        pressed = row.channels["brake_pressure_pa"] > 2e4
+        pressed = row.channels["brake_pressure_pa"] > self.above_pa
         return -self.share * jnp.where(pressed, jnp.minimum(point.power_w, 0.0), 0.0)
 
 
@@ -240,7 +251,7 @@ class RegenLimit(Effect):
     source: ClassVar = "charge limit of the battery management"
     parameters: ClassVar = (
         Parameter("power_w", "W", OFF_W, 5e3, 500.0, OFF_W, kind="limit",
-                  grid=(1e4, 2e4, 3e4, 4.5e4, 6e4, 8e4, 1.1e5, 1.5e5, 2e5)),
+                  grid=_ladder(1e4, 3.5e5, 14)),
     )  # fmt: skip
     mistaken_for: ClassVar = ("friction_blending",)
     separated_by: ClassVar = "hard braking from speed, battery full"
@@ -259,7 +270,9 @@ class RegenCutoff(Effect):
     equation: ClassVar = "−min(P, 0)·[v < v₀]"
     source: ClassVar = "blending out of regeneration at walking pace"
     parameters: ClassVar = (
-        Parameter("speed_mps", "m/s", 0.0, 1.0, 0.3, 12.0, kind="limit", grid=(1.5, 2.5, 3.5, 5.0, 7.0, 9.0)),
+        Parameter(
+            "speed_mps", "m/s", 0.0, 1.0, 0.3, 12.0, kind="limit", grid=(1.0, 1.7, 2.5, 3.5, 4.5, 5.5, 6.5, 8.0, 10.0)
+        ),
     )
     mistaken_for: ClassVar = ("friction_blending",)
     separated_by: ClassVar = "slow braking to standstill"
@@ -267,8 +280,8 @@ class RegenCutoff(Effect):
     speed_mps: Any
 
     def power(self, row, car, point):
-        # an edge of 0.05 m/s, finer than speeds are measured, so that v₀ has a slope; nothing at the null v₀ = 0
-        below = jax.nn.sigmoid((self.speed_mps - row.speed_mps) / 0.05)
+        # an edge of 0.1 m/s, about as fine as speeds are measured, so that v₀ has a slope; nothing at the null v₀ = 0
+        below = jax.nn.sigmoid((self.speed_mps - row.speed_mps) / 0.1)
         return jnp.where(self.speed_mps > 0, -below * jnp.minimum(point.power_w, 0.0), 0.0)
 
 
@@ -281,7 +294,7 @@ class TractionLimit(Effect):
     source: ClassVar = "derating of motor or battery"
     entries: ClassVar = ("road",)
     parameters: ClassVar = (
-        Parameter("power_w", "W", OFF_W, 1e4, 5e3, OFF_W, kind="limit", grid=(5e4, 1e5, 1.5e5, 2e5, 3e5, 4e5)),
+        Parameter("power_w", "W", OFF_W, 1e4, 5e3, OFF_W, kind="limit", grid=_ladder(3e4, 5e5, 12)),
     )
     mistaken_for: ClassVar = ("copper_loss",)
     separated_by: ClassVar = "full throttle uphill"
@@ -315,6 +328,7 @@ class StepChange(Effect):
     at_trip: Any
 
     def power(self, row, car, point):
-        after = jnp.where(row.trip >= self.at_trip - 0.5, 1.0, 0.0)
+        at_trip = jnp.asarray(self.at_trip)
+        after = jnp.where(jnp.asarray(row.trip).astype(at_trip.dtype) >= at_trip - 0.5, 1.0, 0.0)
         weight = car.mass(row) * 9.80665 * row.speed_mps
         return after * (self.power_w + self.c_rr * weight + self.loss * jnp.abs(point.power_w))

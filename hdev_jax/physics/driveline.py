@@ -26,7 +26,7 @@ class EfficiencyMap(eqx.Module):
     values: Float[Array, "gear speed torque"]
 
     def __call__(self, gear: Any, speed_radps: Any, torque_nm: Any) -> Any:
-        """Efficiency at one operating point. Gradients are those of the cell; zero past the edges."""
+        """Efficiency at one operating point. Slopes are those of the cell, at a node of the cell above; 0 past the edges."""
         g = jnp.argmin(jnp.abs(self.gears - gear))
         i, a = _cell(self.speeds_radps, speed_radps)
         j, b = _cell(self.torques_nm, torque_nm)
@@ -39,7 +39,8 @@ class EfficiencyMap(eqx.Module):
 def _cell(axis: Array, x: Any) -> tuple[Any, Any]:
     """The cell of `axis` that holds x and the place inside it, 0 to 1."""
     i = jnp.clip(jnp.searchsorted(axis, x, side="right") - 1, 0, axis.shape[0] - 2)
-    return i, jnp.clip((x - axis[i]) / (axis[i + 1] - axis[i]), 0.0, 1.0)
+    # clamped before it is divided: a clip of the place to 0..1 would halve the slope at every node
+    return i, (jnp.clip(x, axis[0], axis[-1]) - axis[i]) / (axis[i + 1] - axis[i])
 
 
 class Driveline(eqx.Module):

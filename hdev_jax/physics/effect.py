@@ -44,6 +44,7 @@ class Parameter:
     grid: tuple[float, ...] = ()
     least: float = 0.0
     by: Literal["", "gear"] = ""
+    smooth: bool = False  # a limit whose difference grows about in proportion: a fraction of a grid step is as good
     in_rows: bool = False  # `grid` and `scale` count rows of the log; multiplied by its median duration
 
 
@@ -64,7 +65,9 @@ class Grouped(eqx.Module):
 
     def at(self, row: Segments) -> Real:
         """The value that holds for this row; ids past the end take the last."""
-        key = {"vehicle": lambda: row.vehicle, "trip": lambda: row.trip, "gear": lambda: row.channels["gear"]}[self.by]()
+        key = {"vehicle": lambda: row.vehicle, "trip": lambda: row.trip, "gear": lambda: row.channels["gear"]}[
+            self.by
+        ]()
         return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, self.values.shape[0] - 1)]
 
 

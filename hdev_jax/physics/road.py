@@ -328,7 +328,7 @@ class Cornering(Effect):
     coefficient: Any
 
     def force(self, row, car):
-        lateral = row.speed_mps**2 * row.channels["curvature_1pm"]
+        lateral = mean_square_speed(row) * row.channels["curvature_1pm"]
         return self.coefficient * car.mass(row) * lateral**2
 
 

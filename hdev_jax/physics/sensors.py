@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from hdev_jax.physics.across import at_times, low_pass, neighbours, shifted
 from hdev_jax.physics.effect import Effect, Parameter
@@ -34,7 +35,7 @@ class MassScale(Effect):
     scale: Any
 
     def sense(self, row, car):
-        return row.with_channels(mass_kg=car.mass(row) * (1.0 + self.scale))
+        return row.with_channels(mass_kg=jnp.asarray(car.mass(row) * (1.0 + self.scale)))
 
 
 class GradeBias(Effect):
@@ -65,7 +66,7 @@ class GradeLag(Effect):
     needs: ClassVar = ("grade_rad",)
     entries: ClassVar = ("road",)
     parameters: ClassVar = (
-        Parameter("lag_s", "s", 0.0, 1.0, -60.0, 60.0, kind="limit", in_rows=True, least=0.05,
+        Parameter("lag_s", "s", 0.0, 1.0, -60.0, 60.0, kind="limit", in_rows=True, smooth=True, least=0.05,
                   grid=(-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0)),
     )  # fmt: skip
     mistaken_for: ClassVar = ("grade_bias",)
@@ -170,7 +171,7 @@ class TimeSkew(Effect):
     equation: ClassVar = "P(t) → P(t − s)"
     source: ClassVar = "messages of several control units on one bus"
     parameters: ClassVar = (
-        Parameter("skew_s", "s", 0.0, 0.5, -30.0, 30.0, kind="limit", in_rows=True, least=0.005,
+        Parameter("skew_s", "s", 0.0, 0.5, -30.0, 30.0, kind="limit", in_rows=True, smooth=True, least=0.005,
                   grid=(-4.0, -2.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0)),
         Parameter("cubic", "1", 0.0, 1.0, 0.0, 1.0, kind="choice", grid=(0.0, 1.0)),
     )  # fmt: skip
@@ -196,7 +197,9 @@ class SamplingFilter(Effect):
     parameters: ClassVar = (
         Parameter("tap_1", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
         Parameter("tap_2", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
-        Parameter("tau_s", "s", 0.0, 1.0, 0.0, 120.0, kind="limit", in_rows=True, grid=(0.5, 1.0, 2.0, 5.0)),
+        Parameter(
+            "tau_s", "s", 0.0, 1.0, 0.0, 120.0, kind="limit", in_rows=True, smooth=True, grid=(0.5, 1.0, 2.0, 5.0)
+        ),
     )
     variants: ClassVar = (("tap_1",), ("tap_1", "tap_2"), ("tau_s",))
     mistaken_for: ClassVar = ("time_skew",)

@@ -72,7 +72,9 @@ class Vehicle(eqx.Module):
     def minus(self, *ids: str) -> "Vehicle":
         """This vehicle without these effects. Raises `ValueError` for one it does not have."""
         if missing := set(ids) - {e.id for e in self.effects}:
-            raise ValueError(f"no such effect in this vehicle: {sorted(missing)}; it has {[e.id for e in self.effects]}")
+            raise ValueError(
+                f"no such effect in this vehicle: {sorted(missing)}; it has {[e.id for e in self.effects]}"
+            )
         return self._with(tuple(e for e in self.effects if e.id not in ids))
 
     def has(self, effect_id: str) -> bool:
@@ -87,9 +89,7 @@ class Vehicle(eqx.Module):
         raise KeyError(effect_id)
 
     def _with(self, effects: tuple[Effect, ...]) -> "Vehicle":
-        return Vehicle(
-            effects, mass_kg=self.mass_kg, driveline=self.driveline, machine=self.machine, entry=self.entry
-        )
+        return Vehicle(effects, mass_kg=self.mass_kg, driveline=self.driveline, machine=self.machine, entry=self.entry)
 
     # --- what effects read of the vehicle ------------------------------------------------------------------------
 
@@ -112,7 +112,7 @@ class Vehicle(eqx.Module):
         car = resolve(self, row)
         v = row.speed_mps
         added: dict[str, Any] = {}
-        zero = jnp.zeros(())
+        zero = jnp.zeros((), v.dtype)
         if self.entry == "road":
             force = zero
             for e in car.effects:

@@ -1,0 +1,148 @@
+"""The chain once more, row by row in plain Python and NumPy, sharing no code with the package.
+
+A row is a dict of numbers, a vehicle a dict of coefficients, effects a dict of parameters by id. Written from the
+papers (paper 1, equations 3-5; paper 2, equations 2-12) and from the equations that each effect states.
+"""
+
+import math
+
+G = 9.80665
+RHO0 = 1.225
+
+
+def energy_wh(rows: list[dict], car: dict, effects: dict[str, dict]) -> list[float]:
+    """Battery energy of each row [Wh]."""
+    rows = [dict(r) for r in rows]
+    trips: dict[int, list[dict]] = {}
+    for r in rows:
+        trips.setdefault(r["trip"], []).append(r)
+    for trip in trips.values():
+        prepare(trip, effects)
+    for r in rows:
+        r["power_w"] = battery_power_w(r, car, effects)
+    for trip in trips.values():
+        instrument(trip, effects)
+    return [r["power_w"] * r["duration_s"] / 3600.0 for r in rows]
+
+
+def prepare(trip: list[dict], effects: dict) -> None:
+    """What needs the rows before: slope that came late, distance since the start, time since braking."""
+    if "grade_lag" in effects:
+        middles = [r["time_s"] + r["duration_s"] / 2 for r in trip]
+        slopes = [r["grade_rad"] for r in trip]
+        for r, t in zip(trip, middles, strict=True):
+            r["grade_rad"] = between(middles, slopes, t + effects["grade_lag"]["lag_s"])
+    gone, released = 0.0, None
+    for r in trip:
+        r["gone_m"] = gone + r["distance_m"] / 2
+        gone += r["distance_m"]
+        if r["brake_pressure_pa"] > 2e4:
+            released = r["time_s"] + r["duration_s"]
+            r["since_s"] = None
+        else:
+            r["since_s"] = None if released is None else r["time_s"] + r["duration_s"] / 2 - released
+
+
+def between(times: list[float], values: list[float], t: float) -> float:
+    """Linear in time, held past the ends."""
+    if t <= times[0]:
+        return values[0]
+    for k in range(1, len(times)):
+        if t <= times[k]:
+            share = (t - times[k - 1]) / (times[k] - times[k - 1])
+            return values[k - 1] + share * (values[k] - values[k - 1])
+    return values[-1]
+
+
+def battery_power_w(r: dict, car: dict, effects: dict) -> float:
+    """One row, from the road to the battery."""
+    dt, d = r["duration_s"], r["distance_m"]
+    v0, v1 = r["speed_start_mps"], r["speed_end_mps"]
+    m, theta = r["mass_kg"], r["grade_rad"]
+    if p := effects.get("mass_scale"):
+        m = m * (1 + p["scale"])
+    if p := effects.get("grade_bias"):
+        theta = theta + p["bias_rad"]
+    if p := effects.get("speed_scale"):
+        d, v0, v1 = d * (1 + p["scale"]), v0 * (1 + p["scale"]), v1 * (1 + p["scale"])
+    v, a, square = d / dt, (v1 - v0) / dt, (v0**2 + v1**2) / 2
+
+    # paper 1, equations 3 and 4
+    force = car["rotating"] * m * a + m * G * math.sin(theta) + m * G * car["c_rr"] * math.cos(theta)
+    force += 0.5 * RHO0 * car["cda_m2"] * square
+    if p := effects.get("headwind"):
+        air = v + p["scale"] * r["wind_speed_mps"] * math.cos(r["wind_from_rad"] - r["heading_rad"])
+        force += 0.5 * RHO0 * car["cda_m2"] * (math.copysign(air**2, air) - v**2)
+    if p := effects.get("rolling_temperature"):
+        force += m * G * math.cos(theta) * p["per_k"] * (r["ambient_temp_c"] - 20)
+    if p := effects.get("tyre_warmup"):
+        force += m * G * math.cos(theta) * car["c_rr"] * p["excess"] * math.exp(-r["gone_m"] / p["distance_m"])
+    if p := effects.get("cornering"):
+        force += p["coefficient"] * m * (square * r["curvature_1pm"]) ** 2
+
+    # paper 1, equation 5
+    force = force / car["efficiency"] if force > 0 else force * car["efficiency"]
+    ratio = car["gear_ratios"][int(r["gear"]) - 1] * car["final_drive"] / car["wheel_radius_m"]
+    if (p := effects.get("brake_drag")) and r["since_s"] is not None and v > 0.1:
+        force += p["force_n"] * math.exp(-r["since_s"] / p["tau_s"])
+    if p := effects.get("driveline_drag"):
+        force += p["torque_nm"] * ratio
+    if p := effects.get("gear_efficiency"):
+        force += p["delta"][int(r["gear"])] * abs(force)
+    torque, omega, power = force / ratio, v * ratio, force * v
+
+    # paper 2, equations 5, 6, 10 and 11
+    if not car["covers_machine"]:
+        power = power / car["motoring"] if power > 0 else power * car["regenerating"]
+    if p := effects.get("copper_loss"):
+        power += p["w_per_nm2"] * torque**2
+    if p := effects.get("iron_loss"):
+        power += p["w_per_radps"] * abs(omega) + p["w_per_radps2"] * omega**2
+    power += car["auxiliary_w"]
+    if p := effects.get("auxiliary_power"):
+        power += p["power_w"]
+    if p := effects.get("hvac_power"):
+        t = r["ambient_temp_c"]
+        power += p["below_w_per_k"] * max(p["heat_c"] - t, 0) + p["above_w_per_k"] * max(t - p["cool_c"], 0)
+    if p := effects.get("cabin_warmup"):
+        power += p["power_w"] * math.exp(-(r["time_s"] + dt / 2) / p["tau_s"])
+    if (p := effects.get("friction_blending")) and r["brake_pressure_pa"] > p["above_pa"] and power < 0:
+        power -= p["share"] * power
+    if p := effects.get("battery_resistance"):
+        power += p["resistance_ohm"] * (power / r["voltage_v"]) ** 2
+    if p := effects.get("regen_limit"):
+        power = max(power, -p["power_w"])
+    return power
+
+
+def instrument(trip: list[dict], effects: dict) -> None:
+    """What the power sensor makes of it: delay, filter, gain."""
+    column = [r["power_w"] for r in trip]
+    if p := effects.get("time_skew"):
+        column = [late(column, k, p["skew_s"] / r["duration_s"]) for k, r in enumerate(trip)]
+    if p := effects.get("sampling_filter"):
+        held = lambda k: column[min(max(k, 0), len(column) - 1)]  # noqa: E731
+        bend = lambda k, j: held(k - j) - 2 * held(k) + held(k + j)  # noqa: E731
+        column = [x + p["tap_1"] * bend(k, 1) + p["tap_2"] * bend(k, 2) for k, x in enumerate(column)]
+        for k in range(1, len(column)):
+            keep = math.exp(-trip[k]["duration_s"] / p["tau_s"])
+            column[k] = keep * column[k - 1] + (1 - keep) * column[k]
+    if p := effects.get("power_gain"):
+        column = [x * (1 + p["gain"]) + p["offset_w"] for x in column]
+    for r, x in zip(trip, column, strict=True):
+        r["power_w"] = x
+
+
+def late(column: list[float], k: int, rows: float) -> float:
+    """The column `rows` rows earlier than row k, through the cubic of the four rows around; held past the ends."""
+    nodes = [math.floor(k - rows) + j for j in (-1, 0, 1, 2)]
+    if float(k - rows).is_integer():
+        nodes = [math.floor(k - rows)]
+    total = 0.0
+    for i in nodes:
+        weight = 1.0
+        for j in nodes:
+            if j != i:
+                weight *= (k - rows - j) / (i - j)
+        total += weight * column[min(max(i, 0), len(column) - 1)]
+    return total

@@ -1,0 +1,199 @@
+"""What acts across rows, against plain loops, SciPy and analytic shifts; and never from one trip into another."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import physics_rows as made
+import pytest
+from scipy.signal import lfilter
+
+from hdev_jax.physics import across
+from hdev_jax.segments import Segments
+
+TRIPS = (7, 6, 1, 5)
+
+
+def even(column: np.ndarray, lengths: tuple[int, ...], dt: float = 0.5) -> tuple[np.ndarray, Segments]:
+    """Trips of equal durations around a column."""
+    trip = np.repeat(np.arange(len(lengths)), lengths)
+    n = len(trip)
+    clock = np.concatenate([dt * np.arange(k) for k in lengths])
+    return column, Segments(trip, 0 * trip, clock, np.full(n, dt), np.ones(n), np.ones(n), np.ones(n), {})
+
+
+def noise(lengths: tuple[int, ...] = TRIPS, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=sum(lengths))
+
+
+def by_trip(f: Any, column: Any, segments: Segments) -> np.ndarray:
+    parts = [np.asarray(column)[segments.trip == k] for k in dict.fromkeys(segments.trip.tolist())]
+    return np.concatenate([f(x) for x in parts])
+
+
+def test_trip_bounds() -> None:
+    first, last = across.trip_bounds(np.array([3, 3, 0, 7, 7, 7]))
+    assert first.tolist() == [0, 0, 2, 3, 3, 3]
+    assert last.tolist() == [1, 1, 2, 5, 5, 5]
+
+
+# --- shifts --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cubic", [0.0, 1.0])
+@pytest.mark.parametrize("rows", [-9, -2, -1, 0, 1, 3, 9])
+def test_a_shift_by_whole_rows_is_a_shifted_column(rows: int, cubic: float) -> None:
+    """The first value of a trip holds before it and the last one after it; no other trip is seen."""
+    column, segments = even(noise(), TRIPS)
+    expected = by_trip(lambda x: x[np.clip(np.arange(len(x)) - rows, 0, len(x) - 1)], column, segments)
+    np.testing.assert_allclose(across.shifted(column, segments, rows * 0.5, cubic), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_time_skew_shifts_the_power() -> None:
+    column, segments = even(noise(), TRIPS)
+    segments = segments.with_channels(traction_force_n=1e4 * column)
+    car = made.baseline("wheel")
+    late = car.plus(type(made.null("time_skew"))(made.arr(1.0), made.arr(0.0)))
+    expected = by_trip(lambda x: x[np.clip(np.arange(len(x)) - 2, 0, None)], car.power(segments), segments)
+    np.testing.assert_allclose(late.power(segments), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("cubic", "order", "factor"), [(0.0, 2, 1 / 8), (1.0, 4, 3 / 128)])
+def test_a_fraction_of_a_row_on_a_sine(cubic: float, order: int, factor: float) -> None:
+    """Inside the trip the error is that of the interpolation: factor·(ω·dt)^order, less by 2^order at half the step."""
+    worst = []
+    for dt in (0.2, 0.1, 0.05):
+        column, segments = even(np.sin(2.0 * dt * np.arange(200)), (200,), dt)
+        error = 0.0
+        for share in (0.1, 0.5, 0.8, 2.3, -1.4):
+            shifted = across.shifted(column, segments, share * dt, cubic)
+            analytic = np.sin(2.0 * dt * (np.arange(200) - share))
+            error = max(error, float(np.max(np.abs(shifted - analytic)[5:-5])))
+        assert error < 1.05 * factor * (2.0 * dt) ** order
+        worst.append(error)
+    np.testing.assert_allclose(np.divide(worst[:-1], worst[1:]), 2.0**order, rtol=0.1)
+
+
+def test_slope_of_a_shift_from_both_sides() -> None:
+    """At a whole row the slope is that of the later side: one row back for linear, the four points for the cubic."""
+    column, segments = even(noise((9,)), (9,))
+    shift = lambda s, c: across.shifted(column, segments, s, c)[4]  # noqa: E731
+    slope = lambda s, c: jax.grad(shift)(jnp.asarray(s), c)  # noqa: E731
+    x = column
+    np.testing.assert_allclose(slope(0.0, 0.0), (x[3] - x[4]) / 0.5)
+    np.testing.assert_allclose(slope(1e-6, 0.0), (x[3] - x[4]) / 0.5)
+    np.testing.assert_allclose(slope(-1e-6, 0.0), (x[4] - x[5]) / 0.5)
+    later = (-x[5] / 3 - x[4] / 2 + x[3] - x[2] / 6) / 0.5
+    earlier = (x[6] / 6 - x[5] + x[4] / 2 + x[3] / 3) / 0.5
+    np.testing.assert_allclose(slope(0.0, 1.0), later, rtol=1e-10)
+    np.testing.assert_allclose(slope(1e-7, 1.0), later, rtol=1e-5)
+    np.testing.assert_allclose(slope(-1e-7, 1.0), earlier, rtol=1e-5)
+
+
+def test_neighbours() -> None:
+    column, segments = even(noise(), TRIPS)
+    for j in (1, 2):
+
+        def bend(x: np.ndarray, j: int = j) -> np.ndarray:
+            held = np.r_[[x[0]] * j, x, [x[-1]] * j]
+            return held[: len(x)] + held[2 * j :] - 2 * x
+
+        expected = by_trip(bend, column, segments)
+        np.testing.assert_allclose(across.neighbours(column, segments, j), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_sampling_taps() -> None:
+    """The taps are a symmetric filter: inside a trip a convolution, and a constant passes unchanged."""
+    column, segments = even(noise((12,)), (12,))
+    effect = made.typical("sampling_filter")
+    taps = type(effect)(made.arr(0.1), made.arr(-0.05), None)
+    kernel = [-0.05, 0.1, 1 - 2 * 0.1 + 2 * 0.05, 0.1, -0.05]
+    seen = taps.observe(jnp.asarray(column), segments)
+    np.testing.assert_allclose(seen[2:-2], np.convolve(column, kernel, "valid"), rtol=1e-12)
+    np.testing.assert_allclose(taps.observe(jnp.full(12, 3.0), segments), 3.0, rtol=1e-15)
+
+
+# --- filters -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tau", [0.05, 0.7, 30.0])
+def test_low_pass_is_the_recursion_of_scipy(tau: float) -> None:
+    column, segments = even(noise(), TRIPS)
+    keep = np.exp(-0.5 / tau)
+    expected = by_trip(lambda x: lfilter([1 - keep], [1, -keep], x, zi=[keep * x[0]])[0], column, segments)
+    np.testing.assert_allclose(across.low_pass(column, segments, tau), expected, rtol=1e-11, atol=1e-13)
+
+
+def test_low_pass_at_zero_is_the_column_with_a_slope_of_zero() -> None:
+    column, segments = even(noise(), TRIPS)
+    np.testing.assert_array_equal(across.low_pass(column, segments, 0.0), column)
+    total = jax.jit(lambda t: jnp.sum(across.low_pass(column, segments, t) * noise(seed=1)))
+    assert jax.grad(total)(0.0) == jax.jvp(total, (0.0,), (1.0,))[1] == 0.0
+    for tau in (1e-3, 0.7):
+        reverse, forward = jax.grad(total)(tau), jax.jvp(total, (tau,), (1.0,))[1]
+        np.testing.assert_allclose(reverse, forward, atol=1e-14)
+    np.testing.assert_allclose(reverse, (total(0.7 + 1e-5) - total(0.7 - 1e-5)) / 2e-5, rtol=1e-7)
+
+
+# --- times ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ahead", [-30.0, -1.3, 0.0, 0.4, 2.0, 30.0])
+def test_at_times_is_numpys_interpolation_by_trip(ahead: float) -> None:
+    """On rows of unequal duration, with trips in any order."""
+    log = made.drives(*TRIPS)
+    log = log.take(np.argsort((log.trip + 2) % 4, kind="stable"))
+    x, clock = noise(), log.time_s + 0.5 * log.duration_s
+    expected = np.zeros(len(x))
+    for k in range(4):
+        here = log.trip == k
+        expected[here] = np.interp(clock[here] + ahead, clock[here], x[here])
+    np.testing.assert_allclose(across.at_times(x, log, ahead), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_at_times_on_a_clock_that_float32_can_just_hold() -> None:
+    """A long trip after many: no clock runs on over the trips, so single precision is enough."""
+    column, segments = even(noise((4, 400)), (4, 400), 1.0)
+    segments = Segments(
+        np.where(segments.trip == 1, 5000, 0), segments.vehicle, segments.time_s.astype(np.float32),
+        segments.duration_s.astype(np.float32), segments.distance_m, segments.speed_start_mps, segments.speed_end_mps, {},
+    )  # fmt: skip
+    seen = np.asarray(across.at_times(column.astype(np.float32), segments, np.float32(0.25)))
+    np.testing.assert_allclose(seen[4:-1], 0.75 * column[4:-1] + 0.25 * column[5:], atol=1e-5)
+
+
+def test_grade_lag_takes_the_slope_of_later() -> None:
+    """A slope that comes 2 s late is found 2 s later in the log."""
+    theta, segments = even(0.02 * noise(), TRIPS)
+    segments = segments.with_channels(grade_rad=theta)
+    lagged = type(made.null("grade_lag"))(made.arr(1.0)).across(segments)
+    expected = by_trip(lambda x: x[np.clip(np.arange(len(x)) + 2, None, len(x) - 1)], theta, segments)
+    np.testing.assert_allclose(lagged.channels["grade_rad"], expected, rtol=1e-12)
+
+
+def test_distance_since_start() -> None:
+    log = made.drives(*TRIPS)
+    expected, gone, trip = [], 0.0, None
+    for k in range(len(log)):
+        if log.trip[k] != trip:
+            trip, gone = log.trip[k], 0.0
+        expected.append(gone + log.distance_m[k] / 2)
+        gone += log.distance_m[k]
+    np.testing.assert_allclose(across.distance_since_start(log), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_time_since_braking(seed: int) -> None:
+    log = made.drives(*TRIPS, seed=seed)
+    expected, released, trip = [], None, None
+    for k in range(len(log)):
+        if log.trip[k] != trip:
+            trip, released = log.trip[k], None
+        if log.channels["brake_pressure_pa"][k] > 2e4:
+            released = log.time_s[k] + log.duration_s[k]
+            expected.append(0.0)
+        else:
+            expected.append(0.0 if released is None else log.time_s[k] + log.duration_s[k] / 2 - released)
+    np.testing.assert_allclose(across.time_since_braking(log), expected, rtol=1e-12, atol=1e-12)
+    assert np.max(expected) > 0

@@ -1,0 +1,234 @@
+"""What holds for every effect of the library, each at its null and at a typical size."""
+
+import dataclasses
+import re
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import physics_rows as made
+import pytest
+from jax.test_util import check_grads
+
+from hdev_jax.physics import LIBRARY, library
+from hdev_jax.physics.effect import STAGES, Effect
+from hdev_jax.physics.library import DECLARED, unavailable
+
+HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
+STAGE_HOOKS = {
+    "sensors": {"across", "sense", "observe"},
+    "road": {"derive", "force"},
+    "driveline": {"derive", "drive"},
+    "machine": {"power"},
+    "battery": {"power"},
+}
+
+
+@pytest.fixture(params=list(made.EFFECTS))
+def effect_id(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def test_every_effect_is_tested() -> None:
+    assert sorted(made.EFFECTS) == sorted(LIBRARY)
+
+
+# --- what it says of itself ----------------------------------------------------------------------------------------
+
+
+def test_metadata(effect_id: str) -> None:
+    effect = LIBRARY[effect_id]
+    assert effect.id == effect_id
+    assert effect.stage in STAGES
+    assert effect.equation
+    assert effect.source
+    assert effect.separated_by
+    assert effect.__doc__
+    own = {h for h in HOOKS if getattr(effect, h) is not getattr(Effect, h)}
+    assert own, "an effect that does nothing"
+    assert own <= STAGE_HOOKS[effect.stage]
+    known = {*LIBRARY, *(d.id for d in DECLARED)}
+    assert effect.mistaken_for
+    assert set(effect.mistaken_for) <= known - {effect_id}
+    for name in (*(n for need in effect.needs for n in need.split("|")), *effect.lacks):
+        assert re.fullmatch(r"[a-z0-9_]+", name)
+    assert set(effect.entries) <= {"road", "wheel", "shaft"}
+    assert effect.entries
+
+
+def test_parameters(effect_id: str) -> None:
+    effect = LIBRARY[effect_id]
+    names = [p.name for p in effect.parameters]
+    assert [f.name for f in dataclasses.fields(effect)] == names
+    sizes = {p.name for p in effect.parameters if p.kind in ("size", "limit")}
+    assert sizes, "nothing to find"
+    for chosen in effect.variants:
+        assert set(chosen) <= sizes
+    for p in effect.parameters:
+        assert p.unit
+        assert p.scale != 0
+        assert p.lower < p.upper
+        assert all(p.lower <= g <= p.upper for g in p.grid) or p.kind == "choice" or p.in_rows
+        if p.kind == "size":
+            assert p.lower <= p.null <= p.upper
+            assert 0 < p.least < abs(p.scale)
+        if p.kind == "limit":
+            assert p.grid
+        if p.kind == "shape":
+            assert p.lower < p.null < p.upper
+
+
+def test_needs_are_what_it_reads(effect_id: str) -> None:
+    """Without any one of the channels that it needs, the library says so; with all of them, it says nothing."""
+    effect, entry = LIBRARY[effect_id], made.entry_of(effect_id)
+    log = made.log_for(effect_id)
+    assert unavailable(effect, log, entry) is None
+    for need in effect.needs:
+        assert need.replace("|", " or ") in str(unavailable(effect, log.without(*need.split("|")), entry))
+    for lacking in effect.lacks:
+        assert unavailable(effect, log.with_channels(**{lacking: log.time_s}), entry)
+    for other in {"road", "wheel", "shaft"} - set(effect.entries):
+        assert unavailable(effect, log, other)
+
+
+def test_reads_nothing_else(effect_id: str) -> None:
+    """The effect runs on a log of its own channels and those of the chain's entry alone, each alternative in turn."""
+    effect = LIBRARY[effect_id]
+    log = made.log_for(effect_id)
+    entry = {"road": (), "wheel": ("traction_force_n",), "shaft": ("motor_torque_nm", "motor_speed_radps")}
+    car = made.without_effect(effect_id).plus(made.typical(effect_id))
+    longest = max((len(need.split("|")) for need in effect.needs), default=1)
+    for k in range(longest):
+        names = {need.split("|")[min(k, need.count("|"))] for need in effect.needs}
+        names |= set(entry[made.entry_of(effect_id)])
+        assert np.all(np.isfinite(car.energy(log.without(*set(log.channels) - names))))
+
+
+def test_a_users_effect_must_have_a_name_of_its_own(effect_id: str) -> None:
+    with pytest.raises(ValueError, match=effect_id):
+        library([LIBRARY[effect_id]])
+
+
+# --- what it adds --------------------------------------------------------------------------------------------------
+
+
+def test_null_adds_exactly_nothing(effect_id: str) -> None:
+    log, car = made.log_for(effect_id), made.without_effect(effect_id)
+    with_null = car.plus(made.null(effect_id))
+    np.testing.assert_array_equal(with_null.energy(log), car.energy(log))
+    np.testing.assert_array_equal(with_null.breakdown(log)[effect_id], np.zeros(len(log)))
+
+
+def test_typical_adds_something(effect_id: str) -> None:
+    log, car = made.log_for(effect_id), made.without_effect(effect_id)
+    added = car.plus(made.typical(effect_id)).energy(log) - car.energy(log)
+    assert np.max(np.abs(added)) > 0.1  # Wh in a second; the drive itself is at some 10² Wh
+
+
+@pytest.mark.parametrize(("size", "forceless"), [("null", False), ("typical", False), ("typical", True)])
+def test_finite_with_finite_gradients(effect_id: str, size: str, forceless: bool) -> None:
+    """Forward and reverse agree and are finite, in every number of the vehicle and of the log.
+
+    The log has standstill, distance 0, zero and negative power; without resistances the flat stretch has zero force.
+    """
+    base = {"c_rr": 0.0, "cda_m2": 0.0, "auxiliary_w": 0.0} if forceless and made.entry_of(effect_id) == "road" else {}
+    car = made.without_effect(effect_id, **base).plus(getattr(made, size)(effect_id))
+    log = made.log_for(effect_id)
+    numbers, rest = eqx.partition((car, log), made.is_real)
+    weights = np.linspace(0.5, 1.5, len(log))
+
+    def total(numbers: Any) -> Any:
+        vehicle, segments = eqx.combine(numbers, rest)
+        return jnp.sum(vehicle.energy(segments) * weights)
+
+    value, forward = jax.linearize(total, numbers)
+    assert np.isfinite(value)
+    (reverse,) = jax.linear_transpose(forward, numbers)(jnp.ones(()))
+    # each number on the scale of its own size, so that one direction sees them all
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda x: (np.abs(x) + 1e-3) * rng.choice([-1.0, 1.0], np.shape(x)), numbers)
+    terms = np.concatenate([np.ravel(a * b) for a, b in zip(*map(jax.tree.leaves, (reverse, direction)), strict=True)])
+    assert np.all(np.isfinite(terms))
+    np.testing.assert_allclose(forward(direction), np.sum(terms), atol=1e-9 * np.sum(np.abs(terms)))
+
+
+def test_gradient_against_differences(effect_id: str) -> None:
+    """Away from switches: no row of this log lies on one at the typical size."""
+    car, effect = made.without_effect(effect_id), made.typical(effect_id)
+    log = made.log_for(effect_id, seed=3)
+    held = {p.name for p in effect.parameters if p.kind == "choice"}
+    flat, back = jax.flatten_util.ravel_pytree({k: v for k, v in vars(effect).items() if k not in held})
+    scale = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
+    largest = float(np.max(np.abs(car.energy(log))))
+
+    def relative(x: Any) -> Any:
+        changed = dataclasses.replace(effect, **back(flat + x * scale))
+        return car.plus(changed).energy(log) / largest
+
+    check_grads(relative, (jnp.zeros_like(flat),), order=1, modes=("fwd", "rev"), eps=1e-5, atol=1e-6, rtol=1e-6)
+
+
+# --- the vehicle as a sum ------------------------------------------------------------------------------------------
+
+
+def test_plus_and_minus_round_trip(effect_id: str) -> None:
+    car, effect = made.without_effect(effect_id), made.typical(effect_id)
+    longer = car.plus(effect)
+    assert longer.has(effect_id)
+    assert not car.has(effect_id), "plus changed the vehicle that it was called on"
+    assert longer.effect(effect_id) is effect
+    assert eqx.tree_equal(longer.minus(effect_id), car)
+    assert eqx.tree_equal(longer.minus(effect_id).plus(effect), longer)
+    with pytest.raises(ValueError, match="each effect once"):
+        longer.plus(effect)
+    with pytest.raises(ValueError, match=f"no such effect.*{effect_id}"):
+        car.minus(effect_id)
+    with pytest.raises(KeyError, match=effect_id):
+        car.effect(effect_id)
+
+
+def assert_adds_up(car: Any, log: Any) -> None:
+    parts = car.breakdown(log)
+    total = np.asarray(car.energy(log))
+    largest = np.maximum(np.sum([np.abs(p) for p in parts.values()], axis=0), 1e-9)
+    assert np.max(np.abs(np.sum(list(parts.values()), axis=0) - total) / largest) < 1e-13
+    assert {e.id for e in car.effects} <= set(parts)
+
+
+def test_breakdown_adds_up(effect_id: str) -> None:
+    for entry in LIBRARY[effect_id].entries:
+        assert_adds_up(made.baseline(entry).plus(made.typical(effect_id)), made.log_for(effect_id))
+
+
+@pytest.mark.parametrize("covers_machine", [True, False])
+@pytest.mark.parametrize("entry", ["road", "wheel", "shaft"])
+def test_breakdown_adds_up_with_all_effects_together(entry: str, covers_machine: bool) -> None:
+    acting = [i for i, e in LIBRARY.items() if entry in e.entries]
+    car = made.baseline(entry, covers_machine=covers_machine).plus(*(made.typical(i) for i in acting))
+    assert_adds_up(car, made.drives(*made.LENGTHS))
+
+
+# --- precision -----------------------------------------------------------------------------------------------------
+
+
+def test_float32_stays_float32_under_strict_promotion(effect_id: str) -> None:
+    """A vehicle and a log in float32 give float32, though float64 is switched on, and the same numbers."""
+    car, log = made.without_effect(effect_id).plus(made.typical(effect_id)), made.log_for(effect_id)
+    half = jax.tree.map(lambda x: jnp.asarray(x, np.float32) if made.is_real(x) else x, (car, log))
+    with jax.numpy_dtype_promotion("strict"):
+        energy = half[0].energy(half[1])
+    assert energy.dtype == jnp.float32
+    exact = np.asarray(car.energy(log))
+    assert np.max(np.abs(energy - exact)) < 1e-4 * np.max(np.abs(exact))
+
+
+def test_strict_promotion_in_float64_with_all_effects() -> None:
+    car, log = made.baseline(covers_machine=False), made.drives(*made.LENGTHS)
+    car = car.plus(*(made.typical(i) for i in LIBRARY if i != "torque_offset"))
+    with jax.numpy_dtype_promotion("strict"):
+        energy = jax.jit(lambda c, s: c.energy(s))(car, log)
+    assert energy.dtype == jnp.float64
+    np.testing.assert_allclose(energy, car.energy(log), rtol=1e-9)

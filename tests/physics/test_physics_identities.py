@@ -1,0 +1,267 @@
+"""The papers' equations by hand, and identities that hold whatever the numbers."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import physics_rows as made
+import pytest
+
+from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
+from hdev_jax.physics.battery import FrictionBlending, RegenCutoff, RegenLimit, TractionLimit
+from hdev_jax.physics.machine import switch
+from hdev_jax.physics.road import Aero, ConstantHeadwind, Grade, Headwind, Inertia, Rolling
+from hdev_jax.segments import Segments
+
+M, G, RHO = 24e3, 9.80665, 1.225
+
+
+def joules(car: Vehicle, log: Segments) -> float:
+    return float(jnp.sum(car.energy(log))) * 3600.0
+
+
+def same(actual: Any, expected: Any) -> None:
+    np.testing.assert_allclose(actual, expected, rtol=1e-12, atol=1e-12)
+
+
+# --- equations, by hand --------------------------------------------------------------------------------------------
+
+
+def row_by_hand(up: bool) -> tuple[Segments, float, float]:
+    """One row with its force [N] and energy at the wheels [J], from equations 3 and 4 of paper 1."""
+    theta = 0.02 if up else -0.05
+    row = made.one_row(
+        duration_s=8.0, distance_m=100.0, speed_start_mps=12.0, speed_end_mps=13.0, grade_rad=theta, mass_kg=M
+    )
+    inertia, slope = M * (13.0 - 12.0) / 8.0, M * G * np.sin(theta)
+    rolling, drag = M * G * 0.006 * np.cos(theta), 0.5 * RHO * 5.6 * (12.0**2 + 13.0**2) / 2
+    force = inertia + slope + rolling + drag
+    return row, force, force * 100.0
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_paper_1_equations_3_to_5(up: bool) -> None:
+    row, force, e_w = row_by_hand(up)
+    assert (e_w > 0) == up
+    car = made.baseline(rotating=1.0, auxiliary_w=0.0)
+    same(car.force(row), [force])
+    same(car.energy(row), [e_w / 3600 / 0.91 if up else e_w / 3600 * 0.91])
+    same(car.power(row), car.energy(row) * 3600 / 8.0)
+    same(car.predict(row, "energy_wh"), car.energy(row))
+    same(car.predict(row, "battery_power_kw"), car.power(row) / 1000)
+    same(car.predict(row, "traction_force_n"), [force])
+
+
+def test_drag_without_wind_is_equation_4() -> None:
+    log = made.drives(*made.LENGTHS)
+    drag = 0.5 * RHO * 5.6 * (log.speed_start_mps**2 + log.speed_end_mps**2) / 2
+    same(made.single(Aero(made.arr(5.6))).force(log), drag)
+    calm = log.with_channels(wind_speed_mps=np.zeros(len(log)))
+    same(made.single(Aero(made.arr(5.6))).plus(Headwind(made.arr(1.0))).force(calm), drag)
+
+
+@pytest.mark.parametrize("wind", [4.0, -4.0])
+def test_paper_2_equation_2(wind: float) -> None:
+    """F = m·g·C_r·cosα + m·g·sinα + ½ρC_dA(v + v_w)² + λ·m·a at a steady speed, where v_i = v_f = v."""
+    row = made.one_row(grade_rad=0.01, mass_kg=M)
+    car = made.baseline(rotating=1.05).plus(ConstantHeadwind(made.arr(wind)))
+    drag = 0.5 * RHO * 5.6 * (10.0 + wind) ** 2
+    same(car.force(row), [M * G * 0.006 * np.cos(0.01) + M * G * np.sin(0.01) + drag])
+    faster = made.one_row(speed_start_mps=9.0, speed_end_mps=11.0)
+    same(made.single(Inertia(made.arr(1.05))).force(faster), [1.05 * M * 2.0 / 10.0])
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_paper_2_equations_3_4_and_9(up: bool) -> None:
+    """Power is F·v; the motor's torque is F·r/(o·η) driving and F·η·r/o braking."""
+    row, force, _ = row_by_hand(up)
+    car = made.baseline(rotating=1.0, covers_machine=False, auxiliary_w=0.0)
+    row = row.with_channels(gear=np.array([2.0]))
+    ratio = 5.27 * 4.5
+    torque = force * 0.5 / (ratio * 0.91) if up else force * 0.91 * 0.5 / ratio
+    same(car.torque(row), [torque])
+    same(car.predict(row, "motor_torque_nm"), [torque])
+    # equations 5, 6, 8 and 10: at the battery
+    machine = 1 / 0.93 if up else 0.88
+    same(car.power(row), [torque * ratio / 0.5 * (100.0 / 8.0) * machine])
+
+
+@pytest.mark.parametrize("torque", [-300.0, 0.0, 300.0])
+def test_paper_2_equations_6_10_and_11_from_the_shaft(torque: float) -> None:
+    row = made.one_row(motor_torque_nm=torque, motor_speed_radps=150.0)
+    expected = torque * 150.0 / 0.93 if torque >= 0 else torque * 150.0 * 0.88
+    same(made.baseline("shaft", auxiliary_w=0.0).power(row), [expected])
+
+
+@pytest.mark.parametrize("force", [-5000.0, 0.0, 5000.0])
+def test_entry_at_the_wheel(force: float) -> None:
+    row = made.one_row(traction_force_n=force)
+    expected = force * 10.0 / 0.93 if force >= 0 else force * 10.0 * 0.88
+    same(made.baseline("wheel", auxiliary_w=800.0).power(row), [expected + 800.0])
+
+
+def test_paper_2_equations_7_and_8() -> None:
+    """Friction blending of share s is η_rg = 1 − s."""
+    braking = made.one_row(traction_force_n=-5000.0, brake_pressure_pa=1e6)
+    released = made.one_row(traction_force_n=-5000.0, brake_pressure_pa=0.0)
+    car = made.baseline("wheel", auxiliary_w=0.0)
+    blended = car.plus(FrictionBlending(share=made.arr(0.3), above_pa=made.arr(2e4)))
+    same(blended.power(braking), 0.7 * car.power(braking))
+    same(blended.power(released), car.power(released))
+
+
+def test_the_log_has_the_last_word_on_mass() -> None:
+    car = made.single(Rolling(made.arr(0.006)))
+    same(car.force(made.one_row()), [24e3 * G * 0.006])
+    same(car.force(made.one_row(mass_kg=1000.0)), [1000.0 * G * 0.006])
+
+
+# --- identities ----------------------------------------------------------------------------------------------------
+
+
+def test_accelerating_costs_the_kinetic_energy() -> None:
+    v1, v2 = 5.0, 17.0
+    ends = np.linspace(v1, v2, 13)
+    duration = np.linspace(0.5, 2.0, 12)
+    n = np.zeros(12, int)
+    distance = 0.5 * (ends[1:] + ends[:-1]) * duration
+    log = Segments(n, n, np.cumsum(duration) - duration, duration, distance, ends[:-1], ends[1:], {})
+    same(joules(made.single(Inertia(made.arr(1.0))), log), 0.5 * M * (v2**2 - v1**2))
+
+
+def test_up_and_down_a_hill_sums_to_zero() -> None:
+    rng = np.random.default_rng(1)
+    slope, distance = rng.normal(0, 0.04, 9), rng.uniform(50, 200, 9)
+    n, there_and_back = np.zeros(18, int), np.r_[distance, distance[::-1]]
+    grade = {"grade_rad": np.r_[slope, -slope[::-1]]}
+    log = Segments(n, n, 10.0 * np.arange(18), np.full(18, 10.0), there_and_back, np.full(18, 9.0), np.full(18, 9.0), grade)
+    climbed = M * G * np.sum(np.sin(slope) * distance)
+    np.testing.assert_allclose(joules(made.single(Grade()), log.take(np.arange(9))), climbed)
+    assert abs(joules(made.single(Grade()), log)) < 1e-9 * abs(climbed)
+
+
+def test_doubling_the_mass_doubles_rolling() -> None:
+    log = made.drives(*made.LENGTHS)
+    heavy = log.with_channels(mass_kg=2 * log.channels["mass_kg"])
+    one, two = made.baseline().breakdown(log), made.baseline().breakdown(heavy)
+    for effect, factor in {"rolling": 2, "inertia": 2, "grade": 2, "aero": 1, "auxiliary": 1}.items():
+        np.testing.assert_array_equal(two[effect], factor * one[effect])
+
+
+def test_tailwind_at_the_speed_of_the_vehicle_gives_no_drag() -> None:
+    row = made.one_row(wind_speed_mps=10.0, wind_from_rad=0.3 + np.pi, heading_rad=0.3)
+    car = made.single(Aero(made.arr(5.6))).plus(Headwind(made.arr(1.0)))
+    assert abs(float(car.force(row)[0])) < 1e-9
+    ahead = row.with_channels(wind_from_rad=np.array([0.3]))
+    same(car.force(ahead), [4 * 0.5 * RHO * 5.6 * 10.0**2])
+    # a wind from behind that is faster still pushes
+    assert float(car.force(row.with_channels(wind_speed_mps=np.array([15.0])))[0]) < 0
+    same(made.single(Aero(made.arr(5.6))).plus(ConstantHeadwind(made.arr(-10.0))).force(row), [0.0])
+
+
+def test_standstill_costs_the_auxiliary_alone() -> None:
+    row = made.one_row(distance_m=0.0, speed_start_mps=0.0, speed_end_mps=0.0, grade_rad=0.03)
+    same(made.baseline(auxiliary_w=720.0).energy(row), [720.0 * 10.0 / 3600.0])
+
+
+# --- switches: value and slope, from both sides --------------------------------------------------------------------
+
+
+def test_efficiency_switch_at_zero() -> None:
+    """0 at e_w = 0, where the slope is the braking one, "otherwise" in equation 5; forward and reverse."""
+    f = lambda x: switch(x, 0.9, 0.8)  # noqa: E731
+    for gradient in (jax.grad(f), jax.jacfwd(f)):
+        same(gradient(0.0), 0.8)
+        same(gradient(-1e-300), 0.8)
+        same(gradient(1e-300), 1 / 0.9)
+    assert f(0.0) == 0.0
+    step = 1e-6
+    same((f(step) - f(0.0)) / step, 1 / 0.9)
+    same((f(0.0) - f(-step)) / step, 0.8)
+    in_efficiency = jax.grad(lambda e: switch(0.0, e, e))
+    assert in_efficiency(0.9) == 0.0
+
+
+def test_energy_at_the_switch() -> None:
+    """A row whose forces are exactly zero: no energy, finite slopes, braking side in c_rr."""
+    row = made.one_row(grade_rad=0.0)
+    car = lambda c: made.baseline(c_rr=c, cda_m2=0.0, auxiliary_w=0.0)  # noqa: E731
+    energy = lambda c: car(c).energy(row)[0]  # noqa: E731
+    assert energy(jnp.asarray(0.0)) == 0.0
+    per_joule = M * G * 100.0 / 3600
+    for gradient in (jax.grad(energy), jax.jacfwd(energy)):
+        same(gradient(jnp.asarray(0.0)), per_joule * 0.91)
+        same(gradient(jnp.asarray(-1e-9)), per_joule * 0.91)
+        same(gradient(jnp.asarray(1e-9)), per_joule / 0.91)
+
+
+@pytest.mark.parametrize(
+    ("effect", "power", "slopes"),
+    [
+        (RegenLimit(made.arr(3e4)), -3e4, (-1.0, 0.0)),
+        (TractionLimit(made.arr(9e4)), 9e4, (0.0, -1.0)),
+    ],
+)
+def test_limits_from_both_sides(effect: Any, power: float, slopes: tuple[float, float]) -> None:
+    """What the limit adds is 0 at the limit, and its slope in the power one of the two sides' or between."""
+
+    def added(p: Any) -> Any:
+        point = made.one_row()
+        return effect.power(point, None, type("Point", (), {"power_w": p})())
+
+    assert added(jnp.asarray(power)) == 0.0
+    same(jax.grad(added)(jnp.asarray(power - 1.0)), slopes[0])
+    same(jax.grad(added)(jnp.asarray(power + 1.0)), slopes[1])
+    assert min(slopes) <= jax.grad(added)(jnp.asarray(power)) <= max(slopes)
+    assert jax.jacfwd(added)(jnp.asarray(power)) == jax.grad(added)(jnp.asarray(power))
+
+
+def test_regen_cutoff_takes_all_below_and_nothing_above() -> None:
+    car = made.baseline("wheel", auxiliary_w=0.0)
+    slow = made.one_row(traction_force_n=-3000.0, distance_m=20.0)
+    fast = made.one_row(traction_force_n=-3000.0, distance_m=60.0)
+    cut = car.plus(RegenCutoff(made.arr(4.0)))
+    assert abs(float(cut.power(slow)[0])) < 1e-3
+    np.testing.assert_allclose(cut.power(fast), car.power(fast), rtol=1e-6)
+    driving = made.one_row(traction_force_n=3000.0, distance_m=20.0)
+    same(cut.power(driving), car.power(driving))
+    assert jax.grad(lambda v: car.plus(RegenCutoff(v)).power(slow)[0])(jnp.asarray(0.0)) == 0.0
+
+
+# --- the vehicle ---------------------------------------------------------------------------------------------------
+
+
+def test_the_map_stands_in_for_the_number() -> None:
+    """A constant map is the number; one of two levels acts by the row's own gear."""
+    log = made.drives(*made.LENGTHS, without=("motor_speed_radps",))
+    gears, axis = jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array([-1e4, 1e4])
+    flat = EfficiencyMap(gears, axis, axis, jnp.full((4, 2, 2), 0.91))
+    same(made.baseline(efficiency=flat).energy(log), made.baseline().energy(log))
+    by_gear = EfficiencyMap(gears, axis, axis, jnp.broadcast_to(jnp.array([0.8, 0.85, 0.9, 0.95])[:, None, None], (4, 2, 2)))
+    energy = np.asarray(made.baseline(efficiency=by_gear).energy(log))
+    for k, efficiency in enumerate([0.8, 0.85, 0.9, 0.95], start=1):
+        here = log.channels["gear"] == k
+        same(energy[here], np.asarray(made.baseline(efficiency=efficiency).energy(log))[here])
+
+
+def test_effects_are_kept_by_stage_whatever_the_order_given() -> None:
+    ids = ["regen_limit", "power_gain", "headwind", "battery_resistance", "driveline_drag", "mass_scale"]
+    effects = [made.typical(i) for i in ids]
+    one = made.baseline().plus(*effects)
+    two = made.baseline().plus(*reversed(effects))
+    assert [e.id for e in one.effects] == [e.id for e in two.effects]
+    assert one.effects[-1].id == "regen_limit"
+    log = made.drives(*made.LENGTHS)
+    np.testing.assert_array_equal(one.energy(log), two.energy(log))
+
+
+def test_without_ratios_torque_is_that_of_a_wheel() -> None:
+    row = made.one_row()
+    car = Vehicle(
+        (Rolling(made.arr(0.006)),),
+        mass_kg=made.arr(M),
+        driveline=Driveline(made.arr(1.0), wheel_radius_m=made.arr(0.5)),
+        machine=Machine(made.arr(1.0), made.arr(1.0)),
+    )
+    same(car.torque(row), [M * G * 0.006 * 0.5])
