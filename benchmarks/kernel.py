@@ -82,11 +82,13 @@ def drive(rows: int, seed: int = 0) -> Segments:
 
 def cast(tree: Any, dtype: Any) -> Any:
     """Every real leaf in this precision, on the device."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype if np.issubdtype(np.asarray(x).dtype, np.floating) else None), tree)
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, dtype if np.issubdtype(np.asarray(x).dtype, np.floating) else None), tree
+    )
 
 
 def contestants(segments: Segments, dtype: Any) -> dict[str, dict[str, Callable[[], Any]]]:
-    """For each task: by name, a call that returns once its result is there, and `compile:name`, the seconds that took."""
+    """For each task: by name, a call that returns once its result is there, and `compile:name`, seconds to compile."""
     built = read_sheet(SHEET).build(segments, "road", "energy_wh")
     rows = tuple(r for name in NAMES for r in built.table.rows if r.name == name)
     table = ParameterTable(rows).with_free(**dict.fromkeys(NAMES, True))
@@ -137,7 +139,9 @@ def measure(calls: dict[str, Any], repeats: int) -> dict[str, Any]:
     for n in names:
         worst = np.max(np.abs(results[n] - reference)) / scale
         if worst > accuracy:
-            raise SystemExit(f"{n} and hand differ by {worst:.1e} of the largest value; expected {accuracy:.0e} at most")
+            raise SystemExit(
+                f"{n} and hand differ by {worst:.1e} of the largest value; expected {accuracy:.0e} at most"
+            )
     times: dict[str, list[float]] = {n: [] for n in names}
     for turn in range(repeats):
         for n in names if turn % 2 else reversed(names):
@@ -189,11 +193,15 @@ def main(argv: list[str] | None = None) -> int:
     for task in TASKS:
         r = results[f"float64/{task}"]
         if r["kernel/hand"] > LIMITS["kernel/hand"]:
-            missed.append(f"{task}: {r['kernel/hand']:.2f} times the expression by hand, at most {LIMITS['kernel/hand']}")
+            missed.append(
+                f"{task}: {r['kernel/hand']:.2f} times the expression by hand, at most {LIMITS['kernel/hand']}"
+            )
         if r["compile_s"] >= LIMITS["compile_s"]:
             missed.append(f"{task}: {r['compile_s']:.1f} s to compile, expected under {LIMITS['compile_s']:.0f}")
     if (r := results["float64/evaluation"])["numpy/kernel"] < LIMITS["numpy/kernel"]:
-        missed.append(f"evaluation: {r['numpy/kernel']:.2f} times faster than NumPy, at least {LIMITS['numpy/kernel']:.0f}")
+        missed.append(
+            f"evaluation: {r['numpy/kernel']:.2f} times faster than NumPy, at least {LIMITS['numpy/kernel']:.0f}"
+        )
     print("float64 within the limits" if not missed else "MISSED\n  " + "\n  ".join(missed))
     return 1 if missed else 0
 

@@ -72,6 +72,12 @@ def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
 Grids = Mapping[str, tuple[float, ...]]
 
 
+def _own(effect: Effect, size: str, shapes: tuple[tuple[str, float], ...]) -> tuple[tuple[str, float], ...]:
+    """The shapes that act on one size: two sizes with a shape each need a column each, not one for every pair."""
+    by_name = {p.name: p for p in effect.parameters}
+    return tuple((n, v) for n, v in shapes if n == size or _matters(by_name[n], (size,)))
+
+
 def _grid(p: Parameter, segments: Segments, row_s: float, grids: Grids) -> tuple[float, ...]:
     if p.name in grids:
         return grids[p.name]
@@ -158,19 +164,24 @@ def columns(
     gears = int(np.max(np.asarray(segments.channels["gear"]))) if segments.has("gear") else 1
     nulls = {c.id: at_null(c, gears=gears) for c in usable}
     shared = [e for e in nulls.values() if _row_level(e)]
-    groups = ([shared] if shared else []) + [[e] for e in nulls.values() if not _row_level(e)]
+    groups = [(shared, None)] if shared else []
+    for e in (e for e in nulls.values() if not _row_level(e)):
+        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.kind not in FIXED),):
+            groups.append(([_only(e, sizes)], sizes))
 
     found: list[Candidate] = []
     data: list[np.ndarray] = []
     place: dict[Column, int] = {}
     segments = jax.tree.map(jnp.asarray, segments)
-    for group in groups:
+    for group, only in groups:
         car = vehicle.plus(*group)
         structure, null = _structure(group)
         base = None
         for e in group:
             for sizes, subs, shapes, kind in _of_effect(type(e), segments, row_s, grids or {}):
-                keys = [Column(e.id, s, g, shapes, kind) for s, g in zip(sizes, subs, strict=True)]
+                if only is not None and sizes != only:
+                    continue
+                keys = [Column(e.id, s, g, _own(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
                 for key in keys:
                     if key in place:
                         continue
@@ -191,11 +202,19 @@ def columns(
     return found, matrix, left_out
 
 
+def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
+    """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
+    idle = {p.name for p in effect.parameters if p.kind == "limit" and p.name not in sizes}
+    return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
+
+
 def _structure(effects: Sequence[Effect]) -> tuple[tuple[Any, ...], np.ndarray]:
     structure, null = [], []
     for e in effects:
         for p in e.parameters:
             leaf = getattr(e, p.name)
+            if leaf is None:
+                continue
             count = len(leaf.values) if isinstance(leaf, Grouped) else None
             for g in range(count) if count is not None else (None,):
                 structure.append((f"effects.{e.id}.{p.name}", g, -np.inf, np.inf))

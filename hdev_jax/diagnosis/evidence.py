@@ -144,7 +144,8 @@ class Evidence:
         full, base = self._jackknife(at, 0), self._jackknife(np.empty(0, int), 0)
         beta, g, k = x[0, self.base :], self.count, len(at)
         p = wald(beta, full[:, self.base :])
-        statistic = stats.f.isf(max(p, 1e-300), k, g - k) * k / (g - k) if g > k + 1 else 0.0
+        # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
+        statistic = min(float(stats.f.isf(max(p, 1e-60), k, g - k)), 1e12) * k / (g - k) if g > k + 1 else 0.0
         better = self._loss(base, np.arange(self.base), 0) - self._loss(full, np.r_[np.arange(self.base), at], 0)
         t = float(np.mean(better) / (np.std(better) + 1e-300) * np.sqrt(g))
         gain = 0.5 * g * float(np.log1p(statistic))
@@ -199,9 +200,7 @@ class Evidence:
         out = np.empty(draws)
         for i in range(draws):
             other = small.flipped(candidate, rng.choice([-1.0, 1.0], size=self.count))
-            out[i] = (
-                other.plain_score(candidate).gain if s.plain else other.gain(other.totals(), candidate.columns)[0]
-            )
+            out[i] = other.plain_score(candidate).gain if s.plain else other.gain(other.totals(), candidate.columns)[0]
         return out
 
     def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:

@@ -28,6 +28,7 @@ def to_plain(state: Search) -> dict[str, Any]:
         "absorbs": {k: list(v) for k, v in state.absorbs.items()},
         "taken_out": list(state.taken_out),
         "refused": list(state.refused),
+        "trail": state.trail,
         "finished": state.finished,
     }
 
@@ -42,7 +43,18 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, library: Mapping[str
     calibration = Calibration(vehicle=vehicle, table=table, **fit)
     verdicts = [Verdict(**v) for v in plain["verdicts"]]
     absorbs, out = dict(plain["absorbs"]), tuple(plain["taken_out"])
-    return Search(vehicle, table, calibration, found, verdicts, absorbs, out, tuple(plain["refused"]), bool(plain["finished"]))
+    return Search(
+        vehicle,
+        table,
+        calibration,
+        found,
+        verdicts,
+        absorbs,
+        out,
+        tuple(plain["refused"]),
+        dict(plain["trail"]),
+        bool(plain["finished"]),
+    )
 
 
 def _found(f: Found) -> dict[str, Any]:

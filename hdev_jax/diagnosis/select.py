@@ -66,6 +66,7 @@ class Search:
     absorbs: dict[str, list[str]] = field(default_factory=dict)
     taken_out: tuple[str, ...] = ()  # added once, superfluous later: not tried again
     refused: tuple[str, ...] = ()  # cleared the tests but not the joint refit: tried again only before the end
+    trail: dict[str, list[float]] = field(default_factory=dict)  # values of the fit, by the effects it had
     finished: bool = False
 
 
@@ -144,7 +145,9 @@ def _step(problem: _Problem, state: Search, step: int, tell: Callable[[str], Non
         return replace(state, verdicts=view.verdicts(state), finished=True)
     choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
-    return replace(_prune(problem, choice, tell), verdicts=view.verdicts(choice))
+    state = _prune(problem, choice, tell)
+    trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
+    return replace(state, verdicts=view.verdicts(state), trail=trail)
 
 
 @dataclass
@@ -234,12 +237,12 @@ def _look(problem: _Problem, state: Search) -> _View:
     ids = list(best)
     ps = [min(1.0, best[i].p * ways[i]) if i not in absorbed_by else 1.0 for i in ids]
     q = dict(zip(ids, adjusted(ps), strict=True))
-    return _View(evidence, plain, noise, best, ways, q, left_out, absorbs, absorbed_by, state.fit, residual, jac, matrix)
+    return _View(
+        evidence, plain, noise, best, ways, q, left_out, absorbs, absorbed_by, state.fit, residual, jac, matrix
+    )
 
 
-def _best(
-    evidence: Evidence, plain: Evidence, candidates: list[Candidate]
-) -> tuple[dict[str, Score], dict[str, int]]:
+def _best(evidence: Evidence, plain: Evidence, candidates: list[Candidate]) -> tuple[dict[str, Score], dict[str, int]]:
     """The best plausible way to have each effect, and how many ways were tried."""
     totals = evidence.totals()
     before = evidence.base_likelihood(totals)
@@ -315,14 +318,18 @@ def _choose(
         if id_ not in state.taken_out
         and id_ not in skip
         and view.q[id_] <= problem.fdr
-        and s.left_out_gain > 0
+        and s.left_out_gain > LEFT_OUT
         and _plausible(s)
         and _worth(s.gain, s.candidate) > 0
     ]
-    able.sort(key=lambda s: -_worth(s.gain, s.candidate))
+    # what rows tell comes first; what only the clusters tell, when nothing else is left
+    able.sort(key=lambda s: (s.plain, -_worth(s.gain, s.candidate)))
     while able:
-        first = _worth(able[0].gain, able[0].candidate)
-        close = [s for s in able[:LEADERS] if _worth(s.gain, s.candidate) > 0.85 * first]
+        first = able[0]
+        bar = 0.85 * _worth(first.gain, first.candidate)
+        close = [
+            s for s in able[:LEADERS] if s is first or (s.plain == first.plain and _worth(s.gain, s.candidate) >= bar)
+        ]
         fits = []
         for s in close:
             tell(f"refitting with {s.candidate.id}")

@@ -16,7 +16,7 @@ __all__ = ["Remainder", "remainder"]
 LEVEL = 1e-3  # for each of the looks below; there are four, so false alarms stay under one in two hundred logs
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
-MOST_ROWS = 50_000  # that the flexible learner is trained on
+MOST_ROWS = 30_000  # that the flexible learner is trained on
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Remainder:
     noise_floor_rmse: float
     depends_on: tuple[str, ...]
     signature: str
+    rms: float  # of the structure seen, in the target's unit; 0 where none is
     correction: Float[np.ndarray, " test"]
 
 
@@ -63,12 +64,14 @@ def remainder(
     period = _period(train)
     steps = _change_point(white, train.trip)
     level = _levels(train)
-    parts, depends = [], []
+    parts, depends, sizes = [], [], [0.0]
     if learned:
+        sizes.append(float(np.sqrt(share * np.mean(test.residual**2))))
         depends += list(order)
         parts.append(f"{100 * share:.0f} % of it follows {', '.join(order)} in a way the library does not hold")
     if period is not None:
         seconds, amplitude = period
+        sizes.append(amplitude / np.sqrt(2.0))
         depends.append("time_s")
         clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
         parts.append(f"a {clock} cycle of about {amplitude:.3g} {unit}")
@@ -78,6 +81,7 @@ def remainder(
         parts.append(f"a change inside trip {trip_names[where]} after {minutes(train):.0f} min")
     if level is not None:
         where, size, sd = level
+        sizes.append(sd)
         depends.append("trip_id")
         parts.append(
             f"levels that differ by trip by about {sd:.2g} {unit}, most in {trip_names[where]} ({size:+.2g} {unit})"
@@ -85,7 +89,7 @@ def remainder(
     rmse = float(np.sqrt(np.mean(test.residual**2)))
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
-    return Remainder(bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", correction)
+    return Remainder(bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", max(sizes), correction)
 
 
 def _colour(noise: Noise) -> str:
@@ -107,7 +111,7 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
     fold = rng.permutation(np.arange(train.clusters.count) % 4)[train.clusters.ids]
     rows = len(train.residual)
     parameters = {
-        "objective": "regression", "learning_rate": 0.05, "num_leaves": 15, "verbosity": -1, "num_threads": 2,
+        "objective": "regression", "learning_rate": 0.05, "num_leaves": 15, "verbosity": -1, "num_threads": 1,
         "min_data_in_leaf": int(max(20, rows // 200)), "lambda_l2": 10.0, "feature_fraction": 0.8, "seed": seed,
         "deterministic": True, "force_row_wise": True, "max_bin": 127,
     }  # fmt: skip

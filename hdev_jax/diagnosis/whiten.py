@@ -128,9 +128,7 @@ def estimate_noise(
     return replace(noise, block_sd=_block_sd(noise, residual, trip, duration_s, common))
 
 
-def _block_sd(
-    noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: np.ndarray, common: float
-) -> float:
+def _block_sd(noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: np.ndarray, common: float) -> float:
     """Standard deviation of the blocks' levels by maximum likelihood, 0 where it gains less than 5."""
     blocks = _blocks(trip, duration_s)
     if len(blocks) < 3 * len(np.unique(trip)) or len(residual) < 20 * len(blocks):

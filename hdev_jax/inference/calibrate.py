@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from hdev_jax.inference.clusters import Clusters
 from hdev_jax.inference.parameters import ParameterTable, insert
-from hdev_jax.physics import Vehicle
+from hdev_jax.physics import Vehicle, derived
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
@@ -73,6 +73,7 @@ def padded(segments: Segments, measured: np.ndarray) -> Fit:
         out,
         (pad(segments.trip, fill=int(np.max(np.asarray(segments.trip))) + 1), pad(segments.distance_m, fill=0.0)),
     )
+    out = jax.tree.map(np.asarray, derived(out))
     return Fit(out, pad(measured, fill=0.0), np.r_[np.ones(n), np.zeros(extra)], n)
 
 

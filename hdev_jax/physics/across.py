@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -16,12 +17,18 @@ __all__ = [
     "shifted",
     "time_since_braking",
     "trip_bounds",
+    "with_bounds",
 ]
 
 
-def trip_bounds(trip: Any) -> tuple[Int[Array, " row"], Int[Array, " row"]]:
+FIRST, LAST = "first_row_of_trip", "last_row_of_trip"  # channels, where they have been worked out before
+
+
+def trip_bounds(segments: Segments) -> tuple[Int[Array, " row"], Int[Array, " row"]]:
     """First and last row of each row's trip (rows of a trip are contiguous)."""
-    trip = jnp.asarray(trip)
+    if segments.has(FIRST, LAST):
+        return jnp.asarray(segments.channels[FIRST]), jnp.asarray(segments.channels[LAST])
+    trip = jnp.asarray(segments.trip)
     index = jnp.arange(trip.shape[0])
     change = trip[1:] != trip[:-1]
     starts = jnp.concatenate([jnp.array([True]), change])
@@ -31,6 +38,13 @@ def trip_bounds(trip: Any) -> tuple[Int[Array, " row"], Int[Array, " row"]]:
     return first, last
 
 
+def with_bounds(segments: Segments) -> Segments:
+    """The same rows with their trips' bounds worked out once, for those who evaluate many times."""
+    first, last = trip_bounds(segments)
+    # not by with_channels: columns of a log are real, these are indices
+    return eqx.tree_at(lambda s: s.channels, segments, {**segments.channels, FIRST: first, LAST: last})
+
+
 def shifted(column: Any, segments: Segments, seconds: Any, cubic: Any = 0.0) -> Float[Array, " row"]:
     """The column `seconds` earlier, by a fraction of a row: x(t − s). The trip's edges hold their value.
 
@@ -38,7 +52,7 @@ def shifted(column: Any, segments: Segments, seconds: Any, cubic: Any = 0.0) -> 
     difference. Rows of unequal duration are shifted by their own.
     """
     x = jnp.asarray(column)
-    first, last = trip_bounds(segments.trip)
+    first, last = trip_bounds(segments)
     rows = seconds / jnp.asarray(segments.duration_s)
     whole = jnp.floor(rows)
     a = rows - whole
@@ -62,7 +76,7 @@ def shifted(column: Any, segments: Segments, seconds: Any, cubic: Any = 0.0) -> 
 def neighbours(column: Any, segments: Segments, rows: int) -> Float[Array, " row"]:
     """x(k−j) + x(k+j) − 2x(k) with j = `rows`; the trip's edges hold their value."""
     x = jnp.asarray(column)
-    first, last = trip_bounds(segments.trip)
+    first, last = trip_bounds(segments)
     index = jnp.arange(x.shape[0])
     return x[jnp.clip(index - rows, first, last)] + x[jnp.clip(index + rows, first, last)] - 2 * x
 
@@ -70,14 +84,18 @@ def neighbours(column: Any, segments: Segments, rows: int) -> Float[Array, " row
 def low_pass(column: Any, segments: Segments, tau_s: Any) -> Float[Array, " row"]:
     """First-order lag with time constant `tau_s` [s], started at each trip's first value; the column itself at 0."""
     x = jnp.asarray(column)
-    first, _ = trip_bounds(segments.trip)
+    first, _ = trip_bounds(segments)
     keep = jnp.exp(-jnp.asarray(segments.duration_s) / jnp.maximum(tau_s, 1e-9))
     keep = jnp.where(first == jnp.arange(x.shape[0]), 0.0, keep)
 
-    def compose(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
-        return one[0] * two[0], one[1] * two[0] + two[1]
+    return jax.lax.scan(_lagged, jnp.zeros_like(x[0]), (keep, x), unroll=8)[1]
 
-    return jax.lax.associative_scan(compose, (keep, (1 - keep) * x))[1]
+
+def _lagged(carry: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+    """One row of a first-order lag."""
+    keep, x = row
+    y = keep * carry + (1 - keep) * x
+    return y, y
 
 
 def at_times(column: Any, segments: Segments, ahead_s: Any) -> Float[Array, " row"]:
@@ -87,7 +105,7 @@ def at_times(column: Any, segments: Segments, ahead_s: Any) -> Float[Array, " ro
     """
     x = jnp.asarray(column)
     clock = jnp.asarray(segments.time_s) + 0.5 * jnp.asarray(segments.duration_s)
-    first, last = trip_bounds(segments.trip)
+    first, last = trip_bounds(segments)
     wanted = jnp.clip(clock + ahead_s, clock[first], clock[last])
     sought = jax.lax.stop_gradient(wanted)
 
@@ -109,14 +127,14 @@ def at_times(column: Any, segments: Segments, ahead_s: Any) -> Float[Array, " ro
 def distance_since_start(segments: Segments) -> Float[Array, " row"]:
     """Distance from the start of the trip to the middle of the row [m]."""
     d = jnp.asarray(segments.distance_m)
-    first, _ = trip_bounds(segments.trip)
+    first, _ = trip_bounds(segments)
     before = jnp.cumsum(d) - d
     return before - before[first] + 0.5 * d
 
 
 def time_since_braking(segments: Segments, threshold_pa: float = 2e4) -> Float[Array, " row"]:
     """Seconds from the end of the trip's last braked row to the middle of this one; 0 while braking and before."""
-    first, _ = trip_bounds(segments.trip)
+    first, _ = trip_bounds(segments)
     start, duration = jnp.asarray(segments.time_s), jnp.asarray(segments.duration_s)
     braking = jnp.asarray(segments.channels["brake_pressure_pa"]) > threshold_pa
     last = jax.lax.cummax(jnp.where(braking, jnp.arange(start.shape[0]), -1))

@@ -26,7 +26,7 @@ class EfficiencyMap(eqx.Module):
     values: Float[Array, "gear speed torque"]
 
     def __call__(self, gear: Any, speed_radps: Any, torque_nm: Any) -> Any:
-        """Efficiency at one operating point. Slopes are those of the cell, at a node of the cell above; 0 past the edges."""
+        """Efficiency at one operating point. Slopes are the cell's (at a node of the one above), 0 past the edges."""
         g = jnp.argmin(jnp.abs(self.gears - gear))
         i, a = _cell(self.speeds_radps, speed_radps)
         j, b = _cell(self.torques_nm, torque_nm)

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.physics import battery, losses, road, sensors
+from hdev_jax.physics.across import with_bounds
 from hdev_jax.physics.effect import STAGES, Effect
 from hdev_jax.segments import Segments
 
-__all__ = ["DECLARED", "LIBRARY", "at_null", "library", "unavailable"]
+__all__ = ["DECLARED", "LIBRARY", "at_null", "derived", "library", "unavailable"]
 
 DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, road.Aero, battery.Auxiliary)
 
@@ -48,6 +49,16 @@ def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
         else:
             values[p.name] = np.asarray(p.null, dtype=float)
     return effect(**values)
+
+
+def derived(segments: Segments) -> Segments:
+    """The same rows with what any effect of the library derives by trip worked out once."""
+    segments = with_bounds(segments)
+    for c in LIBRARY.values():
+        e = at_null(c)
+        if e.overrides("derive") and all(any(segments.has(n) for n in need.split("|")) for need in c.needs):
+            segments = e.derive(segments)
+    return segments
 
 
 def unavailable(effect: type[Effect], segments: Segments, entry: str) -> str | None:

@@ -46,6 +46,8 @@ class BrakeDrag(Effect):
     tau_s: Any
 
     def derive(self, segments):
+        if segments.has("time_since_braking_s"):  # worked out before
+            return segments
         return segments.with_channels(time_since_braking_s=time_since_braking(segments))
 
     def drive(self, row, car, point):

@@ -281,6 +281,8 @@ class TyreWarmup(Effect):
     distance_m: Any
 
     def derive(self, segments):
+        if segments.has("distance_since_start_m"):  # worked out before
+            return segments
         return segments.with_channels(distance_since_start_m=distance_since_start(segments))
 
     def force(self, row, car):

@@ -110,11 +110,11 @@ class Vehicle(eqx.Module):
     def _chain(self, row: Segments) -> _Chain:
         """One row from the entry to the battery. Sensors have been applied."""
         car = resolve(self, row)
-        v = row.speed_mps
+        v = jnp.asarray(row.speed_mps)
         added: dict[str, Any] = {}
         zero = jnp.zeros((), v.dtype)
+        force: Any = zero
         if self.entry == "road":
-            force = zero
             for e in car.effects:
                 if e.overrides("force"):
                     with jax.named_scope(e.id):

@@ -82,7 +82,9 @@ def entry_of(effect_id: str) -> str:
     return LIBRARY[effect_id].entries[0]
 
 
-def drives(*lengths: int, seed: int = 0, dt: float = 1.0, channels: bool = True, without: tuple[str, ...] = ()) -> Segments:
+def drives(
+    *lengths: int, seed: int = 0, dt: float = 1.0, channels: bool = True, without: tuple[str, ...] = ()
+) -> Segments:
     """Trips of these lengths, with every channel that an effect reads.
 
     Rows 1-5 of each trip long enough: a standstill, a flat stretch at one speed, hard braking, a hard start, creeping.
@@ -94,7 +96,9 @@ def drives(*lengths: int, seed: int = 0, dt: float = 1.0, channels: bool = True,
     v0, v1 = rng.uniform(2.5, 24.0, n), rng.uniform(2.5, 24.0, n)
     v1 = v0 + 0.06 * (v1 - v0)
     slope = rng.normal(0.0, 0.03, n)
-    for place, (start, end, theta) in enumerate([(0, 0, 0.01), (15, 15, 0), (14, 12, -0.03), (9, 11, 0.04), (4, 3, 0)], start=1):
+    for place, (start, end, theta) in enumerate(
+        [(0, 0, 0.01), (15, 15, 0), (14, 12, -0.03), (9, 11, 0.04), (4, 3, 0)], start=1
+    ):
         here = within == place
         v0[here], v1[here], slope[here] = start, end, theta
     duration = dt * rng.uniform(0.8, 1.2, n)
@@ -166,9 +170,9 @@ def arr(x: Any) -> Any:
     return np.asarray(x) if isinstance(x, int | float) else x
 
 
-def without_effect(effect_id: str, **options: Any) -> Vehicle:
+def without_effect(effect_id: str) -> Vehicle:
     """What the effect is added to: the baseline at an entry where it acts."""
-    car = baseline(entry_of(effect_id), **options)
+    car = baseline(entry_of(effect_id))
     return car.plus(RoadGrade(arr(1.0))) if effect_id == "accelerometer_bias" else car
 
 

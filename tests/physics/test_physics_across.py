@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from hdev_jax.physics import across
+from hdev_jax.physics.library import derived
 from hdev_jax.segments import Segments
 
 TRIPS = (7, 6, 1, 5)
@@ -33,9 +34,21 @@ def by_trip(f: Any, column: Any, segments: Segments) -> np.ndarray:
 
 
 def test_trip_bounds() -> None:
-    first, last = across.trip_bounds(np.array([3, 3, 0, 7, 7, 7]))
+    """First and last row of the trip, in whatever order the ids come."""
+    _, segments = even(noise((2, 1, 3)), (2, 1, 3))
+    renamed = Segments(**{**vars(segments), "trip": np.array([3, 3, 0, 7, 7, 7])})
+    first, last = across.trip_bounds(renamed)
     assert first.tolist() == [0, 0, 2, 3, 3, 3]
     assert last.tolist() == [1, 1, 2, 5, 5, 5]
+
+
+def test_what_is_worked_out_before_changes_nothing() -> None:
+    log = made.drives(*made.LENGTHS)
+    ids = ("grade_lag", "tyre_warmup", "brake_drag", "sampling_filter", "time_skew")
+    car = made.baseline().plus(*(made.typical(i) for i in ids))
+    once = derived(log)
+    assert set(log.channels) < set(once.channels)
+    np.testing.assert_array_equal(car.energy(once), car.energy(log))
 
 
 # --- shifts --------------------------------------------------------------------------------------------------------
@@ -155,11 +168,8 @@ def test_at_times_is_numpys_interpolation_by_trip(ahead: float) -> None:
 def test_at_times_on_a_clock_that_float32_can_just_hold() -> None:
     """A long trip after many: no clock runs on over the trips, so single precision is enough."""
     column, segments = even(noise((4, 400)), (4, 400), 1.0)
-    segments = Segments(
-        np.where(segments.trip == 1, 5000, 0), segments.vehicle, segments.time_s.astype(np.float32),
-        segments.duration_s.astype(np.float32), segments.distance_m, segments.speed_start_mps, segments.speed_end_mps, {},
-    )  # fmt: skip
-    seen = np.asarray(across.at_times(column.astype(np.float32), segments, np.float32(0.25)))
+    single = jax.tree.map(lambda x: x.astype(np.float32) if made.is_real(x) else 5000 * x, segments)
+    seen = np.asarray(across.at_times(column.astype(np.float32), single, np.float32(0.25)))
     np.testing.assert_allclose(seen[4:-1], 0.75 * column[4:-1] + 0.25 * column[5:], atol=1e-5)
 
 

@@ -13,9 +13,10 @@ import physics_rows as made
 import pytest
 from jax.test_util import check_grads
 
-from hdev_jax.physics import LIBRARY, library
+from hdev_jax.physics import LIBRARY, Vehicle, library
 from hdev_jax.physics.effect import STAGES, Effect
 from hdev_jax.physics.library import DECLARED, unavailable
+from hdev_jax.segments import Segments
 
 HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
 STAGE_HOOKS = {
@@ -128,15 +129,8 @@ def test_typical_adds_something(effect_id: str) -> None:
     assert np.max(np.abs(added)) > 0.1  # Wh in a second; the drive itself is at some 10² Wh
 
 
-@pytest.mark.parametrize(("size", "forceless"), [("null", False), ("typical", False), ("typical", True)])
-def test_finite_with_finite_gradients(effect_id: str, size: str, forceless: bool) -> None:
-    """Forward and reverse agree and are finite, in every number of the vehicle and of the log.
-
-    The log has standstill, distance 0, zero and negative power; without resistances the flat stretch has zero force.
-    """
-    base = {"c_rr": 0.0, "cda_m2": 0.0, "auxiliary_w": 0.0} if forceless and made.entry_of(effect_id) == "road" else {}
-    car = made.without_effect(effect_id, **base).plus(getattr(made, size)(effect_id))
-    log = made.log_for(effect_id)
+def assert_finite(car: Vehicle, log: Segments) -> None:
+    """Forward and reverse agree and are finite, in every number of the vehicle and of the log."""
     numbers, rest = eqx.partition((car, log), made.is_real)
     weights = np.linspace(0.5, 1.5, len(log))
 
@@ -155,8 +149,24 @@ def test_finite_with_finite_gradients(effect_id: str, size: str, forceless: bool
     np.testing.assert_allclose(forward(direction), np.sum(terms), atol=1e-9 * np.sum(np.abs(terms)))
 
 
+@pytest.mark.parametrize("size", ["null", "typical"])
+def test_finite_with_finite_gradients(effect_id: str, size: str) -> None:
+    """The log has standstill, distance 0 and negative power; zero force is below."""
+    assert_finite(made.without_effect(effect_id).plus(getattr(made, size)(effect_id)), made.log_for(effect_id))
+
+
+@pytest.mark.parametrize("size", ["null", "typical"])
+@pytest.mark.parametrize("entry", ["road", "wheel", "shaft"])
+def test_finite_with_all_effects_at_zero_force(entry: str, size: str) -> None:
+    """Without resistances and loads the flat stretch at one speed has no force and no power at any entry."""
+    nothing = {"auxiliary_w": 0.0} | ({"c_rr": 0.0, "cda_m2": 0.0} if entry == "road" else {})
+    car, log = made.baseline(entry, **nothing), made.drives(*made.LENGTHS)
+    assert np.any((np.asarray(car.power(log)) == 0) & (log.distance_m > 0))
+    assert_finite(car.plus(*(getattr(made, size)(i) for i, e in LIBRARY.items() if entry in e.entries)), log)
+
+
 def test_gradient_against_differences(effect_id: str) -> None:
-    """Away from switches: no row of this log lies on one at the typical size."""
+    """Away from switches: no row of this log lies on one at the typical size. (That reverse is forward is above.)"""
     car, effect = made.without_effect(effect_id), made.typical(effect_id)
     log = made.log_for(effect_id, seed=3)
     held = {p.name for p in effect.parameters if p.kind == "choice"}
@@ -168,7 +178,7 @@ def test_gradient_against_differences(effect_id: str) -> None:
         changed = dataclasses.replace(effect, **back(flat + x * scale))
         return car.plus(changed).energy(log) / largest
 
-    check_grads(relative, (jnp.zeros_like(flat),), order=1, modes=("fwd", "rev"), eps=1e-5, atol=1e-6, rtol=1e-6)
+    check_grads(relative, (jnp.zeros_like(flat),), order=1, modes=("fwd",), eps=1e-5, atol=1e-6, rtol=1e-6)
 
 
 # --- the vehicle as a sum ------------------------------------------------------------------------------------------
@@ -190,7 +200,7 @@ def test_plus_and_minus_round_trip(effect_id: str) -> None:
         car.effect(effect_id)
 
 
-def assert_adds_up(car: Any, log: Any) -> None:
+def assert_adds_up(car: Vehicle, log: Segments) -> None:
     parts = car.breakdown(log)
     total = np.asarray(car.energy(log))
     largest = np.maximum(np.sum([np.abs(p) for p in parts.values()], axis=0), 1e-9)
@@ -203,8 +213,9 @@ def test_breakdown_adds_up(effect_id: str) -> None:
         assert_adds_up(made.baseline(entry).plus(made.typical(effect_id)), made.log_for(effect_id))
 
 
-@pytest.mark.parametrize("covers_machine", [True, False])
-@pytest.mark.parametrize("entry", ["road", "wheel", "shaft"])
+@pytest.mark.parametrize(
+    ("entry", "covers_machine"), [("road", True), ("road", False), ("wheel", False), ("shaft", False)]
+)
 def test_breakdown_adds_up_with_all_effects_together(entry: str, covers_machine: bool) -> None:
     acting = [i for i, e in LIBRARY.items() if entry in e.entries]
     car = made.baseline(entry, covers_machine=covers_machine).plus(*(made.typical(i) for i in acting))
@@ -214,21 +225,17 @@ def test_breakdown_adds_up_with_all_effects_together(entry: str, covers_machine:
 # --- precision -----------------------------------------------------------------------------------------------------
 
 
-def test_float32_stays_float32_under_strict_promotion(effect_id: str) -> None:
-    """A vehicle and a log in float32 give float32, though float64 is switched on, and the same numbers."""
-    car, log = made.without_effect(effect_id).plus(made.typical(effect_id)), made.log_for(effect_id)
-    half = jax.tree.map(lambda x: jnp.asarray(x, np.float32) if made.is_real(x) else x, (car, log))
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("entry", ["road", "shaft"])
+def test_precision_is_kept_under_strict_promotion(entry: str, dtype: Any) -> None:
+    """All effects together: a vehicle and a log in float32 give float32, though float64 is switched on."""
+    acting = [i for i, e in LIBRARY.items() if entry in e.entries]
+    car = made.baseline(entry, covers_machine=False).plus(*(made.typical(i) for i in acting))
+    log = made.drives(*made.LENGTHS)
+    cast = jax.tree.map(lambda x: jnp.asarray(x, dtype) if made.is_real(x) else x, (car, log))
     with jax.numpy_dtype_promotion("strict"):
-        energy = half[0].energy(half[1])
-    assert energy.dtype == jnp.float32
+        energy = eqx.filter_jit(lambda c, s: c.energy(s))(*cast)
+    assert energy.dtype == dtype
     exact = np.asarray(car.energy(log))
-    assert np.max(np.abs(energy - exact)) < 1e-4 * np.max(np.abs(exact))
-
-
-def test_strict_promotion_in_float64_with_all_effects() -> None:
-    car, log = made.baseline(covers_machine=False), made.drives(*made.LENGTHS)
-    car = car.plus(*(made.typical(i) for i in LIBRARY if i != "torque_offset"))
-    with jax.numpy_dtype_promotion("strict"):
-        energy = jax.jit(lambda c, s: c.energy(s))(car, log)
-    assert energy.dtype == jnp.float64
-    np.testing.assert_allclose(energy, car.energy(log), rtol=1e-9)
+    tolerance = 1e-4 if dtype == jnp.float32 else 1e-11
+    assert np.max(np.abs(energy - exact)) < tolerance * np.max(np.abs(exact))

@@ -135,7 +135,9 @@ def test_up_and_down_a_hill_sums_to_zero() -> None:
     slope, distance = rng.normal(0, 0.04, 9), rng.uniform(50, 200, 9)
     n, there_and_back = np.zeros(18, int), np.r_[distance, distance[::-1]]
     grade = {"grade_rad": np.r_[slope, -slope[::-1]]}
-    log = Segments(n, n, 10.0 * np.arange(18), np.full(18, 10.0), there_and_back, np.full(18, 9.0), np.full(18, 9.0), grade)
+    log = Segments(
+        n, n, 10.0 * np.arange(18), np.full(18, 10.0), there_and_back, np.full(18, 9.0), np.full(18, 9.0), grade
+    )
     climbed = M * G * np.sum(np.sin(slope) * distance)
     np.testing.assert_allclose(joules(made.single(Grade()), log.take(np.arange(9))), climbed)
     assert abs(joules(made.single(Grade()), log)) < 1e-9 * abs(climbed)
@@ -238,7 +240,9 @@ def test_the_map_stands_in_for_the_number() -> None:
     gears, axis = jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.array([-1e4, 1e4])
     flat = EfficiencyMap(gears, axis, axis, jnp.full((4, 2, 2), 0.91))
     same(made.baseline(efficiency=flat).energy(log), made.baseline().energy(log))
-    by_gear = EfficiencyMap(gears, axis, axis, jnp.broadcast_to(jnp.array([0.8, 0.85, 0.9, 0.95])[:, None, None], (4, 2, 2)))
+    by_gear = EfficiencyMap(
+        gears, axis, axis, jnp.broadcast_to(jnp.array([0.8, 0.85, 0.9, 0.95])[:, None, None], (4, 2, 2))
+    )
     energy = np.asarray(made.baseline(efficiency=by_gear).energy(log))
     for k, efficiency in enumerate([0.8, 0.85, 0.9, 0.95], start=1):
         here = log.channels["gear"] == k

@@ -62,7 +62,9 @@ def test_equals_the_loop(effect_id: str | None, covers_machine: bool) -> None:
     ids = REFERENCED if effect_id == "all" else [effect_id] if effect_id else []
     car = made.baseline(covers_machine=covers_machine).plus(*(made.typical(i) for i in ids))
     log = road_log(*made.LENGTHS, seed=11)
-    expected = reference.energy_wh(as_rows(log), CAR | {"covers_machine": covers_machine}, {i: parameters(i) for i in ids})
+    expected = reference.energy_wh(
+        as_rows(log), CAR | {"covers_machine": covers_machine}, {i: parameters(i) for i in ids}
+    )
     np.testing.assert_allclose(car.energy(log), expected, rtol=1e-11, atol=1e-11)
 
 

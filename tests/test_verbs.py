@@ -1,0 +1,437 @@
+"""The verbs end to end, through the command line, on a small synthetic log in a temporary folder."""
+
+import contextlib
+import importlib.util
+import io
+import json
+import math
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hdev_jax import cli
+from hdev_jax.fleet import SyntheticLog, synthetic_log
+from hdev_jax.rundir import Run
+
+CHECKER = Path(__file__).parents[2] / "shared" / "check_diagnosis.py"
+ONLY = ["--only", "headwind,auxiliary_power"]  # two candidates: quick
+FILES = {
+    "diagnosis.json", "report.html", "augmented_vehicle.toml", "answer.txt", "config.toml", "environment.json",
+    "figures",
+}  # fmt: skip
+
+# A user's own effect: what it adds is linear in the time since the start, which nothing in the library is.
+USER_EFFECT = '''
+from typing import Any, ClassVar
+
+from hdev_jax.physics import Effect, Parameter
+
+
+class SlowDrift(Effect):
+    """A load that grows with the time since the start."""
+
+    id: ClassVar = "slow_drift"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "k·t"
+    parameters: ClassVar = (Parameter("w_per_s", "W/s", 0.0, 1.0, 0.0, 100.0),)
+    w_per_s: Any
+
+    def power(self, row, car, point):
+        return self.w_per_s * row.time_s
+'''
+
+
+def hdev(*argv: object) -> tuple[int, str]:
+    """Exit status and standard output of one command."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(io.StringIO()):
+        status = cli.main([str(a) for a in argv])
+    return status, out.getvalue()
+
+
+def refused(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
+    """The one line of a command that the input is to blame for; progress lines begin with the seconds."""
+    capsys.readouterr()
+    assert cli.main([str(a) for a in argv]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = [line for line in captured.err.splitlines() if line.startswith("hdev: ")]
+    assert captured.err.splitlines()[-1:] == lines
+    assert "Traceback" not in captured.err
+    return lines[0]
+
+
+def read(folder: Path) -> dict:
+    """A folder's diagnosis.json, which has to keep the contract wherever it was made."""
+    found = json.loads((folder / "diagnosis.json").read_text())
+    if CHECKER.is_file():  # not part of the repository: what it checks is skipped where it is not beside it
+        spec = importlib.util.spec_from_file_location("check_diagnosis", CHECKER)
+        assert spec is not None
+        assert spec.loader is not None
+        checker = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(checker)
+        assert checker.check(found) == []
+    return found
+
+
+@pytest.fixture(scope="module")
+def synthetic() -> SyntheticLog:
+    return synthetic_log(seed=3, trips=9, rows_per_trip=80, effects={"headwind": {"scale": 0.98}}, noise_level=0.02)
+
+
+@pytest.fixture(scope="module")
+def files(synthetic: SyntheticLog, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return synthetic.write(tmp_path_factory.mktemp("log"), truth=False)
+
+
+@pytest.fixture(scope="module")
+def given(files: dict[str, Path]) -> list[object]:
+    return [files["log"], "--vehicle", files["sheet"]]
+
+
+@pytest.fixture(scope="module")
+def first(given: list[object], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """One diagnosis that ran through, and what it said."""
+    out = tmp_path_factory.mktemp("first") / "result"
+    status, text = hdev("diagnose", *given, *ONLY, "--out", out)
+    assert status == 0
+    return out, text
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "result"
+
+
+# --- check -----------------------------------------------------------------------------------------------------------
+
+
+def test_check_shows_trips_and_energy_per_km(given, synthetic, capsys):
+    assert cli.main(["check", *map(str, given)]) == 0
+    text = capsys.readouterr().out
+    assert f"{len(synthetic.frame)} rows, 9 trips, 1 vehicles" in text
+    assert "kWh/km" in text
+    for name, rows in synthetic.frame.groupby("trip_id"):
+        line = next(line.split() for line in text.splitlines() if line.split()[:1] == [name])
+        assert int(line[1]) == len(rows)
+        km = rows.distance_m.sum() / 1e3
+        assert float(line[3]) == pytest.approx(km, abs=0.01)
+        # three decimals are printed
+        assert float(line[-1]) == pytest.approx(rows.energy_wh.sum() / 1e3 / km, abs=1e-3)
+
+
+def test_check_says_what_a_sheet_leaves_open(given, capsys):
+    assert cli.main(["check", *map(str, given)]) == 0
+    assert "entered at the road; estimated: road.c_rr, road.cda_m2" in capsys.readouterr().out
+
+
+# --- diagnose --------------------------------------------------------------------------------------------------------
+
+
+def test_the_folder_is_complete(first):
+    out, text = first
+    assert {p.name for p in out.iterdir()} == FILES
+    assert {p.name for p in out.parent.iterdir()} == {"result"}  # nothing half-done beside it
+    assert list((out / "figures").glob("*.png"))
+    assert str(out / "report.html") in text
+    assert tomllib.loads((out / "config.toml").read_text())["only"] == ["headwind", "auxiliary_power"]
+    environment = json.loads((out / "environment.json").read_text())
+    assert set(environment["files"]) == {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+
+
+def test_what_was_planted_is_found(first, synthetic):
+    found = read(first[0])
+    assert [e["id"] for e in found["effects"]] == ["headwind"]
+    assert found["after"]["test"]["rmse"] < found["before"]["test"]["rmse"]
+    scale = found["effects"][0]["parameters"]["scale"]
+    # three of its standard errors, and the 3 % that the drag area's own uncertainty leaves open in w·C_dA
+    assert abs(scale["value"] - 0.98) < 3 * scale["sd"] + 0.03
+    assert found["split"]["test_trips"] == ["T03", "T06", "T09"]
+    # the noise is what no model can explain
+    assert found["after"]["test"]["rmse"] == pytest.approx(synthetic.noise_rms, rel=0.3)
+
+
+def test_the_report_opens_offline(first):
+    page = (first[0] / "report.html").read_text()
+    assert "headwind" in page
+    assert 'src="http' not in page
+    assert 'href="http' not in page.replace('href="https://doi.org', "")
+
+
+def test_predict_reproduces_the_error_after(first, files, out):
+    folder, _ = first
+    predicted = out.with_suffix(".csv")
+    status, text = hdev("predict", files["log"], "--vehicle", folder / "augmented_vehicle.toml", "--out", predicted)
+    assert status == 0
+    assert str(predicted) in text
+    log, rows, found = pd.read_csv(files["log"]), pd.read_csv(predicted), read(folder)
+    assert list(rows.columns) == ["trip_id", "time_s", "predicted", "lower", "upper", "level"]
+    assert (rows.trip_id == log.trip_id).all()
+    assert ((rows.lower < rows.predicted) & (rows.predicted < rows.upper)).all()
+    test = rows.trip_id.isin(found["split"]["test_trips"])
+    rmse = np.sqrt(np.mean((rows.predicted - log.energy_wh)[test] ** 2))
+    # the CSV has 8 digits of each row and the sheet all digits of each coefficient
+    assert rmse == pytest.approx(found["after"]["test"]["rmse"], rel=1e-6)
+
+
+def test_the_interval_holds_its_share(first, files, out):
+    """Rows of one log are correlated, so the share of a 90 % interval is only about that."""
+    rows_file = out.with_suffix(".parquet")
+    sheet = first[0] / "augmented_vehicle.toml"
+    assert hdev("predict", files["log"], "--vehicle", sheet, "--level", "0.9", "--out", rows_file)[0] == 0
+    log, rows = pd.read_csv(files["log"]), pd.read_parquet(rows_file)
+    assert 0.8 < np.mean((rows.lower < log.energy_wh) & (log.energy_wh < rows.upper)) < 0.97
+    assert set(rows.level) == {0.9}
+
+
+def test_a_log_without_a_target_is_predicted_too(first, files, out, tmp_path):
+    log = pd.read_csv(files["log"])
+    log.drop(columns="energy_wh").to_csv(tmp_path / "bare.csv", index=False)
+    sheet = first[0] / "augmented_vehicle.toml"
+    for name in (files["log"], tmp_path / "bare.csv"):
+        assert hdev("predict", name, "--vehicle", sheet, "--out", out / f"{Path(name).stem}.csv")[0] == 0
+    with_target, bare = pd.read_csv(out / f"{files['log'].stem}.csv"), pd.read_csv(out / "bare.csv")
+    np.testing.assert_allclose(bare.predicted, with_target.predicted, rtol=1e-6, atol=1e-6)
+
+
+def test_the_same_command_is_done_at_once(first, given, monkeypatch):
+    """The text is the same, and nothing is computed for it."""
+    folder, text = first
+    before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
+    monkeypatch.setattr("hdev_jax.api.run_loop", lambda *a, **k: pytest.fail("the loop ran again"))
+    assert hdev("diagnose", *given, *ONLY, "--out", folder) == (0, text)
+    assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == before
+
+
+def test_the_same_command_twice_gives_the_same_answer(first, given, out):
+    assert hdev("diagnose", *given, *ONLY, "--out", out)[0] == 0
+    assert (out / "diagnosis.json").read_bytes() == (first[0] / "diagnosis.json").read_bytes()
+    assert (out / "augmented_vehicle.toml").read_bytes() == (first[0] / "augmented_vehicle.toml").read_bytes()
+
+
+@pytest.mark.parametrize("stage", ["step-0", "step-1", "remainder"])
+def test_a_killed_run_is_resumed(stage, first, given, out, monkeypatch, capsys):
+    """Interrupted after a stage, nothing is there but the work; the same command ends as if it had not been."""
+    keep, kept, resumed = Run.checkpoint, [], []
+
+    def until(run, name, compute):
+        value = keep(run, name, compute)
+        if name == stage:
+            raise KeyboardInterrupt
+        return value
+
+    def counted(run, name, compute):
+        def again():
+            kept.append(name)
+            return compute()
+
+        resumed.append(name)
+        return keep(run, name, again)
+
+    command = ["diagnose", *map(str, given), *ONLY, "--out", str(out)]
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "checkpoint", until)
+        assert cli.main(command) == 130
+    assert "the same command resumes" in capsys.readouterr().err
+    assert not out.exists()
+    assert out.with_name("result.partial").is_dir()
+    monkeypatch.setattr(Run, "checkpoint", counted)
+    assert cli.main(command) == 0
+    assert stage in resumed
+    assert stage not in kept  # what was done is not done again
+    assert read(out) == read(first[0])
+    assert not out.with_name("result.partial").exists()
+
+
+def test_with_the_effect_declared_nothing_is_missing(first, files, out):
+    """Exit status 0 with nothing found; the sheet that a diagnosis writes is a sheet like any other."""
+    sheet = first[0] / "augmented_vehicle.toml"
+    status, text = hdev("diagnose", files["log"], "--vehicle", sheet, *ONLY, "--out", out)
+    found = read(out)
+    assert status == 0
+    assert found["effects"] == []
+    assert found["verdict"] in ("nothing_missing", "unexplained_structure")
+    assert found["after"] == found["before"]
+    assert text
+
+
+def test_an_effect_of_ones_own(files, given, tmp_path, out):
+    """It is searched beside the library's, found where it acts, and the sheet with it can be read with the file."""
+    effect = tmp_path / "mine.py"
+    effect.write_text(USER_EFFECT)
+    log = pd.read_csv(files["log"])
+    log["energy_wh"] += 60.0 * log.time_s * log.duration_s / 3600
+    log.to_csv(tmp_path / "drift.csv", index=False)
+    argv = ["--effects", effect, "--only", "headwind,auxiliary_power,slow_drift", "--out", out]
+    assert hdev("diagnose", tmp_path / "drift.csv", *given[1:], *argv)[0] == 0
+    found = {e["id"]: e for e in read(out)["effects"]}
+    assert "slow_drift" in found
+    drift = found["slow_drift"]["parameters"]["w_per_s"]
+    assert abs(drift["value"] - 60.0) < 4 * drift["sd"]
+    assert drift["unit"] == "W/s"
+
+
+# --- calibrate -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", ["normal", "student_t"])
+def test_calibrate(noise, first, given, out):
+    """calibration.json holds the blocks of a diagnosis's declared model."""
+    status, text = hdev("calibrate", *given, "--noise", noise, "--out", out)
+    assert status == 0
+    found = json.loads((out / "calibration.json").read_text())
+    assert found["converged"]
+    assert {p.name for p in out.iterdir()} >= {"calibration.json", "report.html", "config.toml", "environment.json"}
+    assert list((out / "figures").glob("*.png"))
+    block = found["baseline"]["parameters"]
+    assert set(block) == {"road.c_rr", "road.cda_m2"}
+    for p in block.values():
+        assert 0 < p["sd"] <= p["prior_sd"] * (1 + 1e-9)  # a log never makes a tabular value less certain
+        assert p["prior_z"] == pytest.approx((p["value"] - p["prior_value"]) / p["prior_sd"])
+    assert "road.cda_m2" in text
+    if noise == "normal":
+        same = read(first[0])
+        assert found["before"] == same["before"]
+        for name, p in block.items():
+            assert p["value"] == pytest.approx(same["baseline"]["parameters"][name]["value"], rel=1e-9)
+        predicted = out.with_suffix(".csv")
+        sheet = out / "calibrated_vehicle.toml"
+        assert hdev("predict", given[0], "--vehicle", sheet, "--out", predicted)[0] == 0
+        rows, log = pd.read_csv(predicted), pd.read_csv(str(given[0]))
+        test = rows.trip_id.isin(found["split"]["test_trips"])
+        rmse = math.sqrt(np.mean((rows.predicted - log.energy_wh)[test] ** 2))
+        assert rmse == pytest.approx(found["before"]["test"]["rmse"], rel=1e-6)
+
+
+def test_nothing_to_calibrate(files, tmp_path, capsys, out):
+    sheet = tmp_path / "known.toml"
+    sheet.write_text('name = "k"\nmass_kg = 1.0\n[road]\nc_rr = 0.006\ncda_m2 = 5.6\n[driveline]\nefficiency = 0.9\n')
+    line = refused(capsys, "calibrate", files["log"], "--vehicle", sheet, "--out", out)
+    assert "nothing to calibrate" in line
+    assert not out.exists()
+
+
+# --- refused ---------------------------------------------------------------------------------------------------------
+
+
+def test_another_configuration_into_the_same_folder(first, given, capsys):
+    before = (first[0] / "diagnosis.json").read_bytes()
+    line = refused(capsys, "diagnose", *given, *ONLY, "--seed", "1", "--out", first[0])
+    assert "another configuration" in line
+    assert (first[0] / "diagnosis.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "calibrate"])
+def test_a_folder_with_other_files(verb, given, tmp_path, capsys):
+    (tmp_path / "thesis.txt").write_text("mine")
+    line = refused(capsys, verb, *given, "--out", tmp_path)
+    assert "holds other files" in line
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "calibrate", "predict"])
+def test_a_folder_that_cannot_be_written(verb, given, tmp_path, capsys):
+    (tmp_path / "file").write_text("in the way")
+    line = refused(capsys, verb, *given, "--out", tmp_path / "file" / "result")
+    assert "cannot be written" in line
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--train-trips", "T01,T99"], ["T99", "T01"]),
+        (["--test-trips", "T1"], ["--test-trips", "T1"]),
+        (["--train-trips", "T01,T02", "--test-trips", "T02"], ["T02", "--train-trips", "--test-trips"]),
+        (["--train-trips", ",".join(f"T{k:02d}" for k in range(1, 10))], ["test"]),
+        (["--target", "traction_force_n"], ["traction_force_n"]),
+    ],
+)
+@pytest.mark.parametrize("verb", ["diagnose", "calibrate"])
+def test_trips_and_targets_that_do_not_exist(verb, options, words, given, out, capsys):
+    line = refused(capsys, verb, *given, *options, "--out", out)
+    assert all(w in line for w in words), line
+    assert list(out.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--only", "headwnd"], ["headwnd", "did you mean 'headwind'"]),
+        (["--exclude", "auxilary_power"], ["did you mean 'auxiliary_power'"]),
+        (["--only", "qqqqq"], ["qqqqq", "hdev effects"]),
+        (["--only", "headwind", "--exclude", "headwind"], ["no candidate"]),
+        (["--effects", "absent.py"], ["absent.py", "no such"]),
+    ],
+)
+def test_effects_that_do_not_exist(options, words, given, out, capsys):
+    line = refused(capsys, "diagnose", *given, *options, "--out", out)
+    assert all(w in line for w in words), line
+    assert list(out.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("def half(:\n", ["SyntaxError"]),
+        ("import no_such_module_at_all\n", ["no_such_module_at_all"]),
+        ("x = 1\n", ["no subclass"]),
+        (USER_EFFECT.replace("slow_drift", "headwind"), ["headwind", "in the library already"]),
+    ],
+)
+def test_a_file_of_effects_that_is_none(text, words, given, tmp_path, out, capsys):
+    effect = tmp_path / "mine.py"
+    effect.write_text(text)
+    line = refused(capsys, "diagnose", *given, "--effects", effect, "--out", out)
+    assert all(w in line for w in ("mine.py", *words)), line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("c_rr ", "c_r ", ["c_r", "c_rr"]),
+        ("sd = 0.5", "sd = 0", ["cda_m2", "sd"]),
+        ("mass_kg = 29000.0", "mass_kg = -29000.0", ["mass_kg", "-29000"]),
+        ("[road]", "[road", ["line"]),
+        ("value = 5.6", 'value = "5.6"', ["cda_m2"]),
+    ],
+)
+@pytest.mark.parametrize("verb", ["diagnose", "calibrate", "predict", "check"])
+def test_a_sheet_at_fault(verb, old, new, words, files, tmp_path, capsys):
+    """One line that names the file and the key; nothing is written."""
+    text = files["sheet"].read_text()
+    assert old in text
+    sheet = tmp_path / "bad.toml"
+    sheet.write_text(text.replace(old, new, 1))
+    argv = [] if verb == "check" else ["--out", tmp_path / "result"]
+    line = refused(capsys, verb, files["log"], "--vehicle", sheet, *argv)
+    assert all(w in line for w in ("bad.toml", *words)), line
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "check"])
+def test_a_misspelt_column(verb, given, files, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    pd.read_csv(files["log"]).rename(columns={"distance_m": "distanc_m"}).to_csv(log, index=False)
+    argv = [] if verb == "check" else ["--out", tmp_path / "result"]
+    line = refused(capsys, verb, log, *given[1:], *argv)
+    assert "distanc_m" in line
+    assert "distance_m" in line
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+def test_a_log_that_is_not_there(given, tmp_path, capsys):
+    line = refused(capsys, "diagnose", tmp_path / "no.csv", *given[1:], "--out", tmp_path / "result")
+    assert "no.csv" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_effects_lists_the_library(capsys):
+    assert cli.main(["effects"]) == 0
+    text = capsys.readouterr().out
+    assert "headwind" in text
+    assert "wind_speed_mps" in text
