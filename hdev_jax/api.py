@@ -4,7 +4,6 @@ import json
 import shlex
 import time
 from collections.abc import Sequence
-
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from hdev_jax.inference import calibrate as fit_map
 from hdev_jax.inference import cluster_rows, padded
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.inference.sheet_text import augmented_sheet
-from hdev_jax.logs import Log, read_log, write_adapter_skeleton
+from hdev_jax.logs import read_log, write_adapter_skeleton
 from hdev_jax.physics import LIBRARY, Effect, library
 from hdev_jax.report.data import ReportData
 from hdev_jax.report.page import write_calibration_report, write_report
@@ -224,7 +223,7 @@ def check(
     With `skeleton`, an adapter to fill in instead. Raises `InputError`.
     """
     if skeleton:
-        return write_adapter_skeleton(Path(list(logs)[0]))
+        return write_adapter_skeleton(Path(next(iter(logs))))
     log = read_log(list(logs), adapter)
     s = log.segments
     lines = [f"{len(log)} rows, {len(log.trip_names)} trips, {len(log.vehicle_names)} vehicles"]
@@ -333,7 +332,7 @@ def _config(
         "train_trips": split.names(split.train),
         "test_trips": split.names(split.test),
         "seed": seed,
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": bool(jax.config.read("jax_enable_x64")),
     }
 
 
@@ -364,7 +363,7 @@ def _data(
         synthetic="synthetic" in f"{problem.sheet.name} {' '.join(problem.log.files)}".lower(),
         unit=problem.unit,
         rows={
-            "trip": s.trip, "time_s": s.time_s, "duration_s": s.duration_s, "distance_m": s.distance_m,
+            "trip": np.asarray(s.trip), "time_s": np.asarray(s.time_s), "duration_s": np.asarray(s.duration_s), "distance_m": np.asarray(s.distance_m),
             "measured": problem.measured, "before": before, "after": after,
             "test": problem.rows(split.test), "used": used,
         },

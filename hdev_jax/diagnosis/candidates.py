@@ -94,8 +94,8 @@ def _of_effect(effect: type[Effect], segments: Segments, row_s: float, grids: Gr
     sizes = tuple(p.name for p in effect.parameters if p.kind not in FIXED)
     for variant in effect.variants or (sizes,):
         shapes = [p for p in effect.parameters if p.kind in FIXED and _matters(p, variant)]
-        grids = [[(p.name, g) for g in _grid(p, segments, row_s, grids)] for p in shapes]
-        for at in product(*grids):
+        each = [[(p.name, g) for g in _grid(p, segments, row_s, grids)] for p in shapes]
+        for at in product(*each):
             first = by_name[variant[0]]
             if first.kind == "limit":
                 for g in _grid(first, segments, row_s, grids):
@@ -164,7 +164,7 @@ def columns(
     gears = int(np.max(np.asarray(segments.channels["gear"]))) if segments.has("gear") else 1
     nulls = {c.id: at_null(c, gears=gears) for c in usable}
     shared = [e for e in nulls.values() if _row_level(e)]
-    groups = [(shared, None)] if shared else []
+    groups: list[tuple[list[Effect], tuple[str, ...] | None]] = [(shared, None)] if shared else []
     for e in (e for e in nulls.values() if not _row_level(e)):
         for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.kind not in FIXED),):
             groups.append(([_only(e, sizes)], sizes))
@@ -227,12 +227,12 @@ def _index(structure: Sequence[Any], effect_id: str, name: str, group: int | Non
 
 
 @eqx.filter_jit
-def _predict(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Array) -> Array:
+def _predict(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Any) -> Array:
     return insert(car, structure, jnp.asarray(values)).predict(segments, target)
 
 
 @eqx.filter_jit
-def _slope(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Array, tangent: Array) -> Array:
+def _slope(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Any, tangent: Any) -> Array:
     def predict(x: Array) -> Array:
         return insert(car, structure, x).predict(segments, target)
 

@@ -56,7 +56,7 @@ class Problem:
 
     def weight(self) -> np.ndarray:
         """What each row weighs in a sum."""
-        return sum_weight(self.target, self.segments.duration_s, self.segments.distance_m)
+        return sum_weight(self.target, np.asarray(self.segments.duration_s), np.asarray(self.segments.distance_m))
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,8 @@ def diagnose(
         plain = checkpoint(f"step-{step}", lambda: to_plain(compute()))
         return from_plain(plain, problem.vehicle, library, gears)
 
+    if problem.target in ("traction_force_n", "motor_torque_nm"):  # a power sensor's fault is none of theirs
+        library = {k: c for k, c in library.items() if k != "power_gain"}
     state = search(
         problem.vehicle, problem.table, rows, problem.target, list(library.values()),
         fdr=fdr, seed=seed, tell=tell, remember=remember,
@@ -165,7 +167,7 @@ def _shadow(
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
-        reads_nothing = not effect.needs and effect.stage == "battery" or effect.id in ("power_gain", "inverter_loss")
+        reads_nothing = (not effect.needs and effect.stage == "battery") or effect.id in ("power_gain", "inverter_loss")
         if reads_nothing and max(mse[k] - mse[k + 1], 0.0) < left.rms**2:
             return f.id
     return None
@@ -239,7 +241,9 @@ def _remainder(
         at = problem.rows(trips)
         segments = problem.segments.take(at)
         residual = (problem.measured - predicted)[at]
-        return Rows(features[at], residual, cluster_rows(segments), segments.trip, segments.duration_s)
+        return Rows(
+            features[at], residual, cluster_rows(segments), np.asarray(segments.trip), np.asarray(segments.duration_s)
+        )
 
     trip_names = problem.log.trip_names
     return remainder(side(split.train), side(split.test), names, problem.unit, trip_names, seed=seed, tell=tell)

@@ -175,8 +175,8 @@ class Evidence:
         """p of base columns against being taken out: their values against zero with jackknifed clusters."""
         likelihood, x = self._fit(self.totals(), np.empty(0, int))
         v = int(np.argmax(likelihood))
-        at = np.asarray(at)
-        return wald(x[v, at] + values, self._jackknife(np.empty(0, int), v)[:, at] + values)
+        index = np.asarray(at)
+        return wald(x[v, index] + values, self._jackknife(np.empty(0, int), v)[:, index] + values)
 
     def _jackknife(self, at: np.ndarray, v: int) -> np.ndarray:
         """Coefficients of base and `at` columns with each cluster left out in turn."""
@@ -271,11 +271,11 @@ def _by_cluster(rows: np.ndarray, clusters: Clusters) -> np.ndarray:
 
 def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:
     """q-values that bound the share of false discoveries (Benjamini and Hochberg 1995)."""
-    p = np.asarray(p, dtype=float)
-    if not len(p):
-        return p
-    order = np.argsort(p)
-    ranked = p[order] * len(p) / (np.arange(len(p)) + 1)
+    every = np.asarray(p, dtype=float)
+    if not len(every):
+        return every
+    order = np.argsort(every)
+    ranked = every[order] * len(every) / (np.arange(len(every)) + 1)
     q = np.minimum.accumulate(ranked[::-1])[::-1]
     out = np.empty_like(q)
     out[order] = np.minimum(q, 1.0)

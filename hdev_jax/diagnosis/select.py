@@ -29,6 +29,7 @@ MOST_EFFECTS = 10
 LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
+STABLE = 0.5  # least share of resampled sets of clusters in which it comes first
 LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
 
@@ -347,6 +348,9 @@ def _choose(
                 continue
             twins = _twins(view, s, problem)
             stability = _stability(problem, view, {c.id, *twins})
+            if stability < STABLE:
+                view.reasons[c.id] = f"comes first in only {100 * stability:.0f} % of resampled sets of trips"
+                continue
             found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain))
             return replace(new, found=[*state.found, found])
     return None

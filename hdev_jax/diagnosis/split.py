@@ -13,7 +13,7 @@ __all__ = ["Split", "split_trips"]
 
 @dataclass(frozen=True)
 class Split:
-    """Trip ids by use; ids index `log.trip_names`. `log` is the log they belong to: one trip alone becomes two parts."""
+    """Trip ids by use; they index `log.trip_names`. `log` is the log they belong to: one trip alone becomes two."""
 
     log: Log
     train: tuple[int, ...]

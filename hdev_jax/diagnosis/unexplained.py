@@ -148,7 +148,7 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
     correction = np.asarray(booster.predict(test.features)) * scale
     importance = booster.feature_importance("gain")
     first = np.argsort(-importance)[:3]
-    leading = tuple(names[i] for i in first if importance[i] > 0.15 * importance.sum())
+    leading = tuple(str(names[int(i)]) for i in first if importance[i] > 0.15 * importance.sum())
     return correction, p, leading
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -157,7 +158,7 @@ def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices
 
 
 @jax.jit
-def _filter(columns: Array, coefficients: Array, scales: Array, position: Array) -> Array:
+def _filter(columns: Any, coefficients: Any, scales: Any, position: Any) -> Array:
     order = coefficients.shape[1]
     at = jnp.minimum(position, order)
     phi = coefficients[at]

@@ -23,13 +23,16 @@ STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
 
 
+Real = Float[Array, " row"] | Float[np.ndarray, " row"]
+
+
 class Fit(eqx.Module):
     """The rows of one problem, padded to a shape that others share. Rows past the log have weight 0."""
 
     segments: Segments
-    measured: Float[Array, " row"]
-    weight: Float[Array, " row"]
-    rows: int = eqx.field(static=False)
+    measured: Real
+    weight: Real
+    rows: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def padded(segments: Segments, measured: np.ndarray) -> Fit:
     size = int(np.ceil(n / quantum) * quantum)
     extra = size - n
 
-    def pad(x: Any, fill: float | None = None) -> np.ndarray:
+    def pad(x: Any, fill: Any = None) -> np.ndarray:
         x = np.asarray(x)
         return np.concatenate([x, np.full(extra, x[-1] if fill is None else fill, dtype=x.dtype)]) if extra else x
 
@@ -77,7 +80,7 @@ def padded(segments: Segments, measured: np.ndarray) -> Fit:
     return Fit(out, pad(measured, fill=0.0), np.r_[np.ones(n), np.zeros(extra)], n)
 
 
-def _to_support(z: Array, start: Array, scale: Array, structure: Any) -> Array:
+def _to_support(z: Array, start: Any, scale: Any, structure: Any) -> Array:
     """From the solver's space to the coefficient's support; z = 0 is the start, slope `scale` there."""
     out = []
     for k, (_, _, lower, upper) in enumerate(structure):
@@ -99,10 +102,10 @@ def _solve(
     structure: Any,
     target: Target,
     fit: Fit,
-    start: Array,
-    scale: Array,
-    prior: Array,
-    prior_sd: Array,
+    start: Any,
+    scale: Any,
+    prior: Any,
+    prior_sd: Any,
 ) -> Any:
     def residuals(z: Array, args: Any) -> Array:
         vehicle, fit = args
@@ -119,7 +122,7 @@ def _solve(
 
 
 @eqx.filter_jit
-def _jacobian(vehicle: Vehicle, structure: Any, target: Target, segments: Segments, theta: Array) -> Array:
+def _jacobian(vehicle: Vehicle, structure: Any, target: Target, segments: Segments, theta: Any) -> Array:
     def predict(x: Array) -> Array:
         return insert(vehicle, structure, x).predict(segments, target)
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hdev_jax.physics import Effect, Grouped, Vehicle
 
@@ -95,7 +95,7 @@ class ParameterTable:
         """The free coefficients as they are in the vehicle."""
         return np.array([_pick(_leaf(vehicle, c.path), c.group) for c in self.free], dtype=float)
 
-    def insert(self, vehicle: Vehicle, values: Float[Array, " free"] | Sequence[float]) -> Vehicle:
+    def insert(self, vehicle: Vehicle, values: Any) -> Vehicle:
         """A vehicle with these values for the free coefficients; traceable in `values`."""
         return insert(vehicle, self.structure, jnp.asarray(values))
 
@@ -104,7 +104,7 @@ def _pick(leaf: Any, group: int | None) -> Any:
     return leaf if group is None else leaf.values[group]
 
 
-def insert(vehicle: Vehicle, structure: Any, values: Float[Array, " free"]) -> Vehicle:
+def insert(vehicle: Vehicle, structure: Any, values: Any) -> Vehicle:
     """`ParameterTable.insert` from the table's static structure."""
     for k, (path, group, _, _) in enumerate(structure):
         where = lambda v, p=path: _leaf(v, p)  # noqa: E731

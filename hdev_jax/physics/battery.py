@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from hdev_jax.physics.effect import Effect, Parameter
 
 __all__ = [
-    "AuxiliaryPower",
     "Auxiliary",
+    "AuxiliaryPower",
     "BatteryResistance",
     "CabinWarmup",
     "CoolingPower",

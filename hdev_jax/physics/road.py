@@ -225,7 +225,7 @@ class Drafting(Effect):
         return -self.reduction * near * car.drag() * mean_square_speed(row)
 
 
-# --- tyres and surface -------------------------------------------------------------------------------------------------
+# --- tyres and surface -----------------------------------------------------------------------------------------------
 
 
 class RollingSpeed(Effect):
@@ -334,7 +334,7 @@ class Cornering(Effect):
         return self.coefficient * car.mass(row) * lateral**2
 
 
-# --- mass and slope ------------------------------------------------------------------------------------------------------
+# --- mass and slope --------------------------------------------------------------------------------------------------
 
 
 class RotatingMass(Effect):
