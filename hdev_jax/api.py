@@ -363,7 +363,10 @@ def _data(
         synthetic="synthetic" in f"{problem.sheet.name} {' '.join(problem.log.files)}".lower(),
         unit=problem.unit,
         rows={
-            "trip": np.asarray(s.trip), "time_s": np.asarray(s.time_s), "duration_s": np.asarray(s.duration_s), "distance_m": np.asarray(s.distance_m),
+            "trip": np.asarray(s.trip),
+            "time_s": np.asarray(s.time_s),
+            "duration_s": np.asarray(s.duration_s),
+            "distance_m": np.asarray(s.distance_m),
             "measured": problem.measured, "before": before, "after": after,
             "test": problem.rows(split.test), "used": used,
         },

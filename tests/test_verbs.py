@@ -266,7 +266,7 @@ def test_with_the_effect_declared_nothing_is_missing(first, files, out):
 
 
 def test_an_effect_of_ones_own(files, given, tmp_path, out):
-    """It is searched beside the library's, found where it acts, and the sheet with it can be read with the file."""
+    """It is searched beside the library's and found where it acts, with its size and unit."""
     effect = tmp_path / "mine.py"
     effect.write_text(USER_EFFECT)
     log = pd.read_csv(files["log"])
@@ -420,14 +420,17 @@ def test_a_sheet_at_fault(verb, old, new, words, files, tmp_path, capsys):
     assert [p.name for p in tmp_path.iterdir()] == ["bad.toml"]
 
 
-@pytest.mark.parametrize("verb", ["diagnose", "check"])
-def test_a_misspelt_column(verb, given, files, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("verb", "right", "wrong"),
+    [("diagnose", "speed_start_mps", "sped_start_mps"), ("check", "speed_start_mps", "sped_start_mps"),
+     ("diagnose", "energy_wh", "enrgy_wh")],
+)  # fmt: skip
+def test_a_misspelt_column(verb, right, wrong, given, files, tmp_path, capsys):
     log = tmp_path / "log.csv"
-    pd.read_csv(files["log"]).rename(columns={"distance_m": "distanc_m"}).to_csv(log, index=False)
+    pd.read_csv(files["log"]).rename(columns={right: wrong}).to_csv(log, index=False)
     argv = [] if verb == "check" else ["--out", tmp_path / "result"]
     line = refused(capsys, verb, log, *given[1:], *argv)
-    assert "distanc_m" in line
-    assert "distance_m" in line
+    assert all(w in line for w in (f"'{wrong}'", right)), line
     assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
 
 

@@ -255,5 +255,5 @@ def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int 
                 values[name] = np.asarray(float(b))
             else:
                 old = values[name]
-                values[name] = Grouped(np.r_[old.values[:group], float(b), old.values[group + 1 :]], old.by)
+                values[name] = Grouped(jnp.asarray(old.values).at[group].set(float(b)), old.by)
     return candidate.effect(**values)

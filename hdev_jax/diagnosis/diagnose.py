@@ -167,7 +167,7 @@ def _shadow(
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
-        reads_nothing = (not effect.needs and effect.stage == "battery") or effect.id in ("power_gain", "inverter_loss")
+        reads_nothing = effect.id == "power_gain" or (effect.stage == "battery" and not effect.needs)
         if reads_nothing and max(mse[k] - mse[k + 1], 0.0) < left.rms**2:
             return f.id
     return None

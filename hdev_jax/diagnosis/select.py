@@ -29,6 +29,7 @@ MOST_EFFECTS = 10
 LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
+TRIES = 4  # rounds of refits in one step before the loop ends
 STABLE = 0.5  # least share of resampled sets of clusters in which it comes first
 LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
@@ -202,7 +203,7 @@ def _plausible(s: Score) -> bool:
     if c.kind == "limit":
         first = c.parameter(c.sizes[0])
         size = abs(dict(c.shapes)[first.name] * s.beta[0])
-        return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5) and size >= first.least
+        return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5 and size >= first.least)
     parameters = [c.parameter(n) for n in c.sizes]
     within = all(p.lower <= p.null + b <= p.upper for p, b in zip(parameters, s.beta, strict=True))
     return within and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
@@ -231,7 +232,7 @@ def _look(problem: _Problem, state: Search) -> _View:
     jac = jacobian(car, state.table, rows.segments, problem.target)[:n]
     candidates, matrix, left_out = columns(car, problem.effects, rows.segments, n, problem.target)
     evidence, plain = _both(problem, state.fit, noise, jac, matrix, residual)
-    best, ways = _best(evidence, plain, candidates)
+    best, ways = _best(evidence, plain, candidates, _slow(matrix, problem.trip))
     for id_ in {c.id for c in candidates} - set(best):
         left_out[id_] = "does nothing on this log"
     absorbs, absorbed_by = _absorption(evidence, state, best)
@@ -243,7 +244,17 @@ def _look(problem: _Problem, state: Search) -> _View:
     )
 
 
-def _best(evidence: Evidence, plain: Evidence, candidates: list[Candidate]) -> tuple[dict[str, Score], dict[str, int]]:
+def _slow(matrix: np.ndarray, trip: np.ndarray) -> np.ndarray:
+    """Which columns hardly change inside a trip: those that only trips can tell."""
+    edges = np.r_[0, np.flatnonzero(np.diff(trip)) + 1]
+    rows = np.diff(np.r_[edges, len(trip)])
+    means = np.add.reduceat(matrix, edges, axis=0)
+    return np.sum(means**2 / rows[:, None], axis=0) > 0.5 * np.sum(matrix**2, axis=0)
+
+
+def _best(
+    evidence: Evidence, plain: Evidence, candidates: list[Candidate], slow: np.ndarray
+) -> tuple[dict[str, Score], dict[str, int]]:
     """The best plausible way to have each effect, and how many ways were tried."""
     totals = evidence.totals()
     before = evidence.base_likelihood(totals)
@@ -258,8 +269,9 @@ def _best(evidence: Evidence, plain: Evidence, candidates: list[Candidate]) -> t
     best = {}
     for id_, entries in ranked.items():
         looks = [_first_plausible([evidence.score(c) for _, c in _leading(entries)])]
-        scores = [plain.plain_score(c) for _, c in entries]
-        looks.append(_first_plausible(sorted(scores, key=lambda s: -_worth(s.gain, s.candidate))))
+        scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
+        if scores:
+            looks.append(_first_plausible(sorted(scores, key=lambda s: -_worth(s.gain, s.candidate))))
         # what both looks see is told by the whitened rows, which see it better
         able = [s for s in looks if _plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
         best[id_] = min(able, key=lambda s: (s.p > 1e-6, s.p if s.p > 1e-6 else 0.0))
@@ -325,7 +337,9 @@ def _choose(
     ]
     # what rows tell comes first; what only the clusters tell, when nothing else is left
     able.sort(key=lambda s: (s.plain, -_worth(s.gain, s.candidate)))
-    while able:
+    for _ in range(TRIES):
+        if not able:
+            break
         first = able[0]
         bar = 0.85 * _worth(first.gain, first.candidate)
         close = [
@@ -345,11 +359,13 @@ def _choose(
             c = s.candidate
             if why := _placebo(problem, s, view):
                 view.reasons[c.id] = why
+                tell(f"turned down {c.id}: {why}")
                 continue
             twins = _twins(view, s, problem)
-            stability = _stability(problem, view, {c.id, *twins})
+            stability = _stability(problem, view, s, {c.id, *twins})
             if stability < STABLE:
                 view.reasons[c.id] = f"comes first in only {100 * stability:.0f} % of resampled sets of trips"
+                tell(f"turned down {c.id}: {view.reasons[c.id]}")
                 continue
             found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain))
             return replace(new, found=[*state.found, found])
@@ -386,7 +402,7 @@ def _refined(problem: _Problem, s: Score, view: _View) -> Score:
     found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
     same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
     evidence, plain = _both(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
-    best, _ = _best(evidence, plain, same)
+    best, _ = _best(evidence, plain, same, _slow(matrix, problem.trip))
     finest = best.get(s.candidate.id)
     return finest if finest is not None and finest.gain > s.gain and finest.plain == s.plain else s
 
@@ -485,11 +501,18 @@ def _twins(view: _View, s: Score, problem: _Problem) -> tuple[str, ...]:
     return tuple(id_ for _, id_ in sorted(out)[:2])
 
 
-def _stability(problem: _Problem, view: _View, names: set[str]) -> float:
-    """Share of resampled sets of clusters in which the same effect (or its class) comes first."""
+def _stability(problem: _Problem, view: _View, chosen: Score, names: set[str]) -> float:
+    """Share of resampled sets of clusters in which the same effect (or its class) comes first of its kind.
+
+    Its rivals are those that clusters could be speaking for at all (p at most 0.01 before any correction).
+    """
     g = view.evidence.count
-    rivals = [s for s in view.best.values() if s.candidate.id not in view.absorbed_by and _plausible(s)]
-    rivals = sorted(rivals, key=lambda s: -s.gain)[:8]
+    rivals = [
+        s
+        for s in view.best.values()
+        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in view.absorbed_by and _plausible(s)
+    ]
+    rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
     small = [(view.plain if s.plain else view.evidence).only(s.candidate) for s in rivals]
     hits = 0
     for _ in range(RESAMPLES):

@@ -201,8 +201,8 @@ class Crosswind(Effect):
         delta = row.channels["wind_from_rad"] - row.channels["heading_rad"]
         side = row.channels["wind_speed_mps"] * jnp.sin(delta)
         along = row.speed_mps + row.channels["wind_speed_mps"] * jnp.cos(delta)
-        # a floor on the air speed along: at walking pace ψ means nothing and the drag is nil
-        yaw = jnp.arctan2(jnp.abs(side), jnp.maximum(along, 1.0))
+        # still air at standstill has no direction: a breath along keeps the angle and its slope finite
+        yaw = jnp.arctan2(jnp.abs(side), along + jnp.where(along == 0.0, 1e-6, 0.0))
         return self.drag_per_rad2 * yaw**2 * car.drag() * mean_square_speed(row)
 
 

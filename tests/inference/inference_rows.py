@@ -1,4 +1,4 @@
-"""A log on which the model is linear in its coefficients, its vehicle and table, and the same physics in plain NumPy."""
+"""A log on which the model is linear in its coefficients, its vehicle and table, and the same in plain NumPy."""
 
 from typing import Any
 

@@ -1,0 +1,220 @@
+"""Columns of candidates against refits of nothing: differences of whole vehicles. And a step of the loop kept."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.diagnose import Problem, prepare
+from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.memory import from_plain, to_plain
+from hdev_jax.diagnosis.select import Found, Search, Verdict
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY, Effect, Grouped, Vehicle, at_null
+from hdev_jax.rundir import open_run
+
+# by hook and kind: force, power and sensor effects of one row, sums over a trip, groups, switches, shifts
+SIZES = ("headwind", "auxiliary_power", "mass_scale", "tyre_warmup", "hvac_power", "gear_efficiency", "brake_drag")
+LIMITS = ("regen_cutoff", "regen_limit", "grade_lag")
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    files = synthetic_log(seed=2, trips=9, rows_per_trip=60).write(tmp_path_factory.mktemp("log"), truth=False)
+    return prepare(read_log([files["log"]], None), read_sheet(files["sheet"]), None)
+
+
+@pytest.fixture(scope="module")
+def rows(problem: Problem):
+    return padded(problem.segments, problem.measured)
+
+
+@pytest.fixture(scope="module")
+def gathered(problem: Problem, rows) -> tuple[list[Candidate], np.ndarray, dict[str, str]]:
+    effects = [LIBRARY[k] for k in (*SIZES, *LIMITS, "traction_limit", "drafting")]
+    return columns(problem.vehicle, effects, rows.segments, rows.rows, problem.target)
+
+
+def with_values(cls: type[Effect], gears: int, **values: Any) -> Effect:
+    """The effect at its null with some values; `(gear, x)` sets one of a group. No code of the candidates."""
+    null = at_null(cls, gears=gears)
+    leaves = {p.name: getattr(null, p.name) for p in cls.parameters}
+    for name, value in values.items():
+        if isinstance(value, tuple):
+            leaves[name] = Grouped(leaves[name].values.at[value[0]].set(value[1]), leaves[name].by)
+        else:
+            leaves[name] = np.asarray(value, dtype=float)
+    return cls(**leaves)
+
+
+def predicted(problem: Problem, rows, vehicle: Vehicle) -> np.ndarray:
+    return np.asarray(vehicle.predict(rows.segments, problem.target))[: rows.rows]
+
+
+def of(gathered, effect_id: str) -> list[Candidate]:
+    found = [c for c in gathered[0] if c.id == effect_id]
+    assert found
+    return found
+
+
+@pytest.mark.parametrize("effect_id", SIZES)
+def test_columns_are_derivatives(effect_id, problem, rows, gathered):
+    """Central differences of the vehicle with the effect, at the shapes of the first and of the last candidate."""
+    every = of(gathered, effect_id)
+    gears = int(np.max(problem.segments.channels["gear"]))
+    for c in {id(c): c for c in (every[0], every[-1])}.values():
+        assert c.kind == "size"
+        for name, group, at in zip(c.sizes, c.groups, c.columns, strict=True):
+            h = 1e-3 * abs(c.parameter(name).scale)
+            up, down = (
+                predicted(problem, rows, problem.vehicle.plus(
+                    with_values(c.effect, gears, **dict(c.shapes), **{name: x if group is None else (group, x)})
+                ))
+                for x in (h, -h)
+            )  # fmt: skip
+            slope, column = (up - down) / (2 * h), gathered[1][:, at]
+            assert np.any(column != 0)
+            # rows within h of the efficiency's switch have a kink between the two
+            off = np.abs(column - slope) > 1e-5 * np.max(np.abs(slope))
+            assert np.mean(off) < 0.01
+
+
+@pytest.mark.parametrize("effect_id", LIMITS)
+def test_columns_of_switches_are_differences(effect_id, problem, rows, gathered):
+    """Of the vehicle with the switch at its place and without it; other limits of the effect are out."""
+    base = predicted(problem, rows, problem.vehicle)
+    every = of(gathered, effect_id)
+    for c in (every[0], every[len(every) // 2], every[-1]):
+        assert c.kind == "limit"
+        with_ = problem.vehicle.plus(realised(c, np.ones(1)))
+        np.testing.assert_allclose(
+            gathered[1][:, c.columns[0]], predicted(problem, rows, with_) - base, rtol=1e-9, atol=1e-9 * np.std(base)
+        )
+        at = dict(c.shapes)[c.sizes[0]]
+        assert at != c.parameter(c.sizes[0]).null
+    assert {dict(c.shapes)[c.sizes[0]] for c in every} == {dict(c.shapes)[c.sizes[0]] for c in set(every)}
+
+
+@pytest.mark.parametrize("effect_id", SIZES)
+def test_a_realised_candidate_has_its_coefficients(effect_id, problem, gathered):
+    c = of(gathered, effect_id)[-1]
+    gears = int(np.max(problem.segments.channels["gear"]))
+    beta = np.arange(1.0, 1.0 + len(c.sizes))
+    effect = realised(c, beta, gears=gears)
+    for name, group, b in zip(c.sizes, c.groups, beta, strict=True):
+        leaf = getattr(effect, name)
+        assert float(leaf if group is None else leaf.values[group]) == b
+    for name, value in c.shapes:
+        assert float(getattr(effect, name)) == value
+
+
+def test_the_null_of_everything_is_the_vehicle(problem, rows, gathered):
+    """What the derivatives are taken at predicts what the declared vehicle does."""
+    base = predicted(problem, rows, problem.vehicle)
+    gears = int(np.max(problem.segments.channels["gear"]))
+    for effect_id in SIZES:
+        null = problem.vehicle.plus(at_null(LIBRARY[effect_id], gears=gears))
+        np.testing.assert_allclose(predicted(problem, rows, null), base, rtol=1e-12, err_msg=effect_id)
+
+
+def test_what_the_log_cannot_show_is_left_out_with_a_reason(gathered):
+    assert "drafting" in gathered[2]
+    assert "gap_m" in gathered[2]["drafting"]
+    assert not any(c.id == "drafting" for c in gathered[0])
+    assert set(gathered[2]) == {"drafting"}
+
+
+def test_an_effect_that_the_vehicle_has_is_no_candidate(problem, rows):
+    car = problem.vehicle.plus(with_values(LIBRARY["headwind"], 1, scale=0.9))
+    found, matrix, left_out = columns(
+        car, [LIBRARY[k] for k in ("headwind", "auxiliary_power")], rows.segments, rows.rows, problem.target
+    )
+    assert {c.id for c in found} == {"auxiliary_power"}
+    assert matrix.shape == (rows.rows, 1)
+    assert left_out == {}
+
+
+def test_none_at_all(problem, rows):
+    found, matrix, _ = columns(problem.vehicle, [], rows.segments, rows.rows, problem.target)
+    assert found == []
+    assert matrix.shape == (rows.rows, 0)
+
+
+@pytest.mark.parametrize("effect_id", ["tyre_warmup", "hvac_power", "regen_cutoff", "grade_lag"])
+def test_finer_grids(effect_id, problem, gathered):
+    """About where the candidate stands, inside the plausible range; what goes in proportion stays where it is."""
+    row_s = float(np.median(problem.segments.duration_s))
+    for c in of(gathered, effect_id):
+        grids = finer(c, row_s)
+        assert set(grids) == {n for n, _ in c.shapes}
+        for name, at in c.shapes:
+            p = c.parameter(name)
+            assert min(abs(np.array(grids[name]) - at)) < 1e-9 * max(abs(at), 1.0)
+            assert all(p.lower <= x <= p.upper for x in grids[name])
+            if p.smooth:
+                assert grids[name] == (at,)
+
+
+# --- a step as plain values ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def state(problem, rows, gathered) -> Search:
+    """A vehicle with a size, a shape, a group and a switch, fitted together."""
+    gears = int(np.max(problem.segments.channels["gear"]))
+    found, vehicle, table = [], problem.vehicle, problem.table
+    for effect_id, start in (("tyre_warmup", 0.1), ("gear_efficiency", 0.01), ("regen_cutoff", 1.0)):
+        c = of(gathered, effect_id)[0]
+        beta = np.full(len(c.columns), start)
+        effect = realised(c, beta, gears=gears)
+        vehicle = vehicle.plus(effect)
+        table = table.plus(*effect_coefficients(effect, c.sizes, groups=[str(g) for g in c.groups if g is not None]))
+        score = Score(c, beta, 12.0, 1e-9, 1e-6, 8.0, 0.7, plain=effect_id == "tyre_warmup")
+        found.append(Found(effect_id, score, 1e-5, 0.97, ("headwind",), 11.0))
+    fit = calibrate(vehicle, table, rows, problem.target, cluster_rows(problem.segments))
+    return Search(
+        fit.vehicle, table, fit, found, [Verdict("drafting", None, 1.0, "no gap")], {"road.c_rr": ["mass_scale"]},
+        ("headwind",), ("air_density",), {"tyre_warmup": [1.0, 2.0]}, True,
+    )  # fmt: skip
+
+
+def same(one: Any, other: Any) -> None:
+    """What the state says, but for the vehicles: plain values compared leaf by leaf."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for k in one:
+            same(one[k], other[k])
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other)
+        for a, b in zip(one, other, strict=True):
+            same(a, b)
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("through", ["memory", "disk"])
+def test_a_step_is_kept_and_comes_back(through, state, problem, rows, tmp_path):
+    """The state again, and a vehicle that predicts the very same numbers."""
+    plain = to_plain(state)
+    if through == "disk":
+        with open_run(tmp_path / "result", {"verb": "test"}) as run:
+            plain = run.checkpoint("step-1", lambda: to_plain(state))
+            assert run.checkpoint("step-1", lambda: pytest.fail("computed again")) is not None
+    gears = int(np.max(problem.segments.channels["gear"]))
+    again = from_plain(plain, problem.vehicle, LIBRARY, gears)
+    np.testing.assert_array_equal(
+        predicted(problem, rows, again.fit.vehicle), predicted(problem, rows, state.fit.vehicle)
+    )
+    np.testing.assert_array_equal(predicted(problem, rows, again.vehicle), predicted(problem, rows, state.vehicle))
+    same(to_plain(again), to_plain(state))
+    assert again.finished
+    assert again.table == state.table
+    assert [replace(f.score.candidate) for f in again.found] == [f.score.candidate for f in state.found]
+    assert again.fit.table.structure == state.fit.table.structure
+    np.testing.assert_array_equal(again.fit.table.values(again.fit.vehicle), jnp.asarray(state.fit.values))

@@ -1,0 +1,250 @@
+"""Scores from Gram matrices against the same numbers from the rows themselves."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hdev_jax.diagnosis.candidates import Candidate
+from hdev_jax.diagnosis.evidence import LEVELS, Evidence, adjusted, gather, gather_plain, wald
+from hdev_jax.diagnosis.whiten import Noise
+from hdev_jax.inference import Clusters
+from hdev_jax.physics import LIBRARY
+
+BASE, CANDIDATES = 2, 3
+PRIOR_SD, MOVED = np.array([0.5, 2.0]), np.array([0.3, -1.0])
+
+
+def candidate(*at: int) -> Candidate:
+    """A candidate with these columns; which effect it is plays no part."""
+    n = len(at)
+    return Candidate(LIBRARY["auxiliary_power"], ("power_w",) * n, (None,) * n, (), "size", at)
+
+
+class Rows:
+    """Whitened rows of a few trips, with a level of their own and a part that follows the first candidate."""
+
+    def __init__(self, trips: int = 9, rows: int = 30, *, level: float = 0.8, seed: int = 0, effect: float = 0.15):
+        rng = np.random.default_rng(seed)
+        self.ids = np.repeat(np.arange(trips), rows)
+        n = trips * rows
+        self.jacobian, self.columns = rng.normal(size=(n, BASE)), rng.normal(size=(n, CANDIDATES))
+        self.columns[:, 1] += 0.7 * self.jacobian[:, 0]  # partly absorbed by the coefficients
+        self.level = rng.uniform(0.5, 1.5, n)
+        noise = rng.normal(size=n) + level * rng.normal(size=trips)[self.ids] * self.level
+        self.residual = effect * self.columns[:, 0] + noise
+        self.clusters = Clusters(self.ids, trips, "trip")
+        self.level_sd = level
+
+    @property
+    def white(self) -> np.ndarray:
+        return np.c_[self.jacobian, self.columns, self.residual, self.level]
+
+    def evidence(self) -> Evidence:
+        noise = Noise(np.zeros((2, 1)), np.ones(2), self.level_sd, np.ones(1), 0.0)
+        return gather(self.white, BASE, self.clusters, noise, moved=MOVED, prior_sd=PRIOR_SD)
+
+    def variances(self) -> list[float]:
+        return [x * self.level_sd**2 for x in (LEVELS if self.level_sd > 0 else LEVELS[:1])]
+
+    def gls(
+        self, at: tuple[int, ...], variance: float, keep: np.ndarray | None = None
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Generalised least squares on rows with the prior: log-likelihood up to a constant, coefficients, and half
+        the sum of squares of each cluster (as the covariance of its rows weighs them)."""
+        x = np.c_[self.jacobian, self.columns[:, list(at)]]
+        wx, wr, log_determinant = x.copy(), self.residual.copy(), 0.0
+        for g in range(self.clusters.count):  # clusters do not mix
+            at_g = self.ids == g
+            covariance = np.eye(at_g.sum()) + variance * np.outer(self.level[at_g], self.level[at_g])
+            root = np.linalg.inv(np.linalg.cholesky(covariance))
+            wx[at_g], wr[at_g] = root @ x[at_g], root @ self.residual[at_g]
+            log_determinant += np.linalg.slogdet(covariance)[1]
+        use = np.ones(len(x), bool) if keep is None else keep
+        # the prior as more rows: coefficient + moved ~ N(0, sd²)
+        more_x = np.c_[np.diag(1 / PRIOR_SD), np.zeros((BASE, len(at)))]
+        stacked, right = np.r_[wx[use], more_x], np.r_[wr[use], -MOVED / PRIOR_SD]
+        beta = np.linalg.lstsq(stacked, right, rcond=None)[0]
+        fit = -0.5 * np.sum((right - stacked @ beta) ** 2) - 0.5 * log_determinant
+        each = np.array([0.5 * np.sum((wr - wx @ beta)[self.ids == g] ** 2) for g in range(self.clusters.count)])
+        return float(fit), beta, each
+
+
+@pytest.mark.parametrize("level", [0.0, 0.8])
+@pytest.mark.parametrize("at", [(0,), (1,), (0, 2)])
+def test_gain_is_that_of_generalised_least_squares(at, level):
+    """On the rows, with dense covariances and the best variance of the levels for each model."""
+    rows = Rows(level=level)
+    evidence = rows.evidence()
+    with_, beta, _ = max((rows.gls(at, v) for v in rows.variances()), key=lambda f: f[0])
+    without = max(rows.gls((), v)[0] for v in rows.variances())
+    gain, found = evidence.gain(evidence.totals(), at)
+    assert gain == pytest.approx(with_ - without, rel=1e-6, abs=1e-8)
+    np.testing.assert_allclose(found, beta[BASE:], rtol=1e-6)
+    before = evidence.base_likelihood(evidence.totals())
+    assert evidence.gain(evidence.totals(), at, before)[0] == gain
+
+
+@pytest.mark.parametrize("level", [0.0, 0.8])
+@pytest.mark.parametrize("at", [(0,), (0, 2)])
+def test_the_jackknife_leaves_clusters_out(at, level):
+    """Explicit refits without each cluster in turn: what each left-out cluster loses, and the clustered test."""
+    rows = Rows(level=level)
+    score = rows.evidence().score(candidate(*at))
+    v = max(rows.variances(), key=lambda v: rows.gls(at, v)[0])
+    g, k = rows.clusters.count, len(at)
+    beta = rows.gls(at, v)[1][BASE:]
+    left_out, better = [], 0.0
+    for cluster in range(g):
+        keep = rows.ids != cluster
+        _, x, loss = rows.gls(at, v, keep)
+        left_out.append(x[BASE:])
+        better += rows.gls((), v, keep)[2][cluster] - loss[cluster]
+    spread = np.array(left_out) - beta
+    covariance = (g - 1) / g * spread.T @ spread
+    f = beta @ np.linalg.solve(covariance, beta) * (g - k) / (k * (g - 1))
+    np.testing.assert_allclose(score.beta, beta, rtol=1e-6)
+    assert score.p_cluster == pytest.approx(stats.f.sf(f, k, g - k), rel=1e-5)
+    assert score.left_out_gain == pytest.approx(better, rel=1e-5, abs=1e-7)
+    assert score.p_model == pytest.approx(stats.chi2.sf(2 * score.gain, k), rel=1e-6)
+
+
+def test_what_is_left_of_a_column():
+    """1 − R² of a column on the Jacobian; nothing where it lies in it, all where there is no Jacobian."""
+    rows = Rows(level=0.0)
+    rows.columns[:, 2] = rows.jacobian @ np.array([2.0, -1.0])
+    evidence = rows.evidence()
+    totals = evidence.totals()
+    for k in range(CANDIDATES):
+        c = rows.columns[:, k]
+        rest = c - rows.jacobian @ np.linalg.lstsq(rows.jacobian, c, rcond=None)[0]
+        assert evidence.left(totals, (k,)) == pytest.approx(rest @ rest / (c @ c), rel=1e-8, abs=1e-10)
+    assert evidence.left(totals, (0, 2)) == pytest.approx(0.0, abs=1e-10)  # the smallest of its columns
+
+
+def test_absorbed_columns_gain_nothing():
+    """A column in the span of the Jacobian gains what the prior holds back, and nothing under a wide one."""
+    rows = Rows(level=0.0)
+    rows.columns[:, 2] = rows.jacobian[:, 0]
+    noise = Noise(np.zeros((2, 1)), np.ones(2), 0.0, np.ones(1), 0.0)
+    wide = gather(rows.white, BASE, rows.clusters, noise, moved=np.zeros(BASE), prior_sd=np.full(BASE, 1e6))
+    assert wide.gain(wide.totals(), (2,))[0] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_weights_count_clusters():
+    """Resampling by weights is the same as gathering the drawn clusters again."""
+    rows = Rows(level=0.0)
+    weight = np.array([2.0, 0, 1, 1, 3, 0, 1, 1, 0])
+    drawn = np.repeat(np.arange(9), weight.astype(int))
+    again = Rows(level=0.0)
+    at = np.concatenate([np.flatnonzero(rows.ids == g) for g in drawn])
+    for name in ("jacobian", "columns", "residual", "level"):
+        setattr(again, name, getattr(rows, name)[at])
+    again.ids = np.repeat(np.arange(len(drawn)), 30)
+    again.clusters = Clusters(again.ids, len(drawn), "trip")
+    evidence, other = rows.evidence(), again.evidence()
+    np.testing.assert_allclose(
+        evidence.gain(evidence.totals(weight), (0,))[0], other.gain(other.totals(), (0,))[0], rtol=1e-9
+    )
+
+
+def test_signs_flip_columns_by_cluster():
+    """Gram matrices of flipped columns are those of rows whose columns were flipped; one sign for all is no change."""
+    rows = Rows()
+    sign = np.random.default_rng(1).choice([-1.0, 1.0], 9)
+    flipped = rows.evidence().flipped(candidate(0, 2), sign)
+    rows.columns[:, [0, 2]] *= sign[rows.ids][:, None]
+    np.testing.assert_allclose(flipped.grams, rows.evidence().grams, rtol=1e-9, atol=1e-9)
+    evidence = rows.evidence()
+    for one in (-1.0, 1.0):
+        same = evidence.flipped(candidate(0), np.full(9, one))
+        assert same.gain(same.totals(), (0,))[0] == pytest.approx(evidence.gain(evidence.totals(), (0,))[0])
+
+
+def test_sign_placebos_of_a_consistent_effect():
+    """Hardly any gains what the effect itself does; without an effect about half do."""
+    found = Rows(effect=0.4).evidence()
+    score = found.score(candidate(0))
+    gains = found.sign_placebos(score, np.random.default_rng(0), 60)
+    # one draw in 2⁸ gives nine clusters one sign, which is the effect itself
+    assert np.max(gains) <= score.gain * (1 + 1e-9)
+    assert np.quantile(gains, 0.9) < 0.6 * score.gain
+    ranks = []
+    for seed in range(12):
+        nothing = Rows(effect=0.0, seed=seed).evidence()
+        s = nothing.score(candidate(0))
+        ranks.append(np.mean(nothing.sign_placebos(s, np.random.default_rng(seed), 30) < s.gain))
+    # uniform ranks of twelve logs: their mean has a standard error of 0.08
+    assert abs(np.mean(ranks) - 0.5) < 0.3
+
+
+def test_one_candidate_alone():
+    rows = Rows()
+    evidence = rows.evidence()
+    small, alone = evidence.only(candidate(2, 0))
+    assert alone.columns == (0, 1)
+    one, other = evidence.gain(evidence.totals(), (2, 0)), small.gain(small.totals(), alone.columns)
+    assert one[0] == pytest.approx(other[0])
+    np.testing.assert_allclose(one[1], other[1])
+
+
+def test_plain_rows_count_clusters_alone():
+    """The rows' variance scales the prior, nothing else: p does not change with it when there is hardly any prior."""
+    rows = Rows(level=0.0)
+    every = np.c_[rows.jacobian, rows.columns, rows.residual]
+    wide = {"moved": np.zeros(BASE), "prior_sd": np.full(BASE, 1e6)}
+    one, other = (
+        gather_plain(every, BASE, rows.clusters, variance=v, **wide).plain_score(candidate(0)) for v in (1.0, 50.0)
+    )
+    assert one.plain
+    assert one.p_cluster == pytest.approx(other.p_cluster, rel=1e-5)
+    np.testing.assert_allclose(one.beta, other.beta, rtol=1e-6)
+    g = rows.clusters.count
+    f = stats.f.isf(one.p_cluster, 1, g - 1)
+    # the likelihood ratio of g observations whose F is this
+    assert one.gain == pytest.approx(0.5 * g * np.log1p(f / (g - 1)), rel=1e-6)
+
+
+# --- tests and their correction --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_wald_holds_its_level(k):
+    """Means of nine independent clusters with no effect: jackknifed Hotelling p-values are uniform.
+
+    For a mean the jackknife is exact, so the only error is that of 400 draws: 0.025 at a level of one half.
+    """
+    rng = np.random.default_rng(0)
+    p = []
+    for _ in range(400):
+        x = rng.normal(size=(9, k)) @ (np.eye(k) + 0.5)
+        p.append(wald(x.mean(axis=0), np.stack([np.delete(x, i, axis=0).mean(axis=0) for i in range(9)])))
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_wald_of_few_clusters_says_nothing():
+    assert wald(np.ones(2), np.ones((3, 2))) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_adjusted_is_benjamini_and_hochberg(seed):
+    rng = np.random.default_rng(seed)
+    p = np.r_[rng.uniform(size=30), rng.uniform(size=5) * 1e-4, 1.0, 0.0]
+    p = np.r_[p, p[:3]]  # ties
+    np.testing.assert_allclose(adjusted(p.tolist()), stats.false_discovery_control(p, method="bh"), rtol=1e-12)
+
+
+@pytest.mark.parametrize("p", [[], [0.03], [1.0, 1.0]])
+def test_adjusted_edges(p):
+    np.testing.assert_array_equal(adjusted(p), p)
+
+
+def test_adjusted_keeps_the_order():
+    p = np.random.default_rng(1).uniform(size=40)
+    q = adjusted(p.tolist())
+    assert np.all(q >= p * (1 - 1e-12))
+    assert np.all(q <= 1)
+    for (p1, q1), (p2, q2) in itertools.pairwise(sorted(zip(p, q, strict=True))):
+        assert p1 <= p2
+        assert q1 <= q2
