@@ -90,6 +90,7 @@ def calibrate(
     target: str | None = None,
     train_trips: Sequence[str] | None = None,
     test_trips: Sequence[str] | None = None,
+    effects: str | Path | None = None,
     method: str = "map",
     noise: str = "normal",
     *,
@@ -107,13 +108,18 @@ def calibrate(
     if noise not in ("normal", "student_t"):
         raise InputError(f"--noise {noise!r}: accepted are normal, student_t")
     started = time.time()
-    sheet = read_sheet(vehicle)
+    sheet = read_sheet(vehicle, library=_known(effects))
     log = read_log(list(logs), adapter)
     split = split_trips(log, train_trips, test_trips)
     problem = prepare(split.log, sheet, target)
     if not problem.table.free:
         raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")
-    config = {**_config("calibrate", logs, vehicle, adapter, problem, split, seed), "method": method, "noise": noise}
+    config = {
+        **_config("calibrate", logs, vehicle, adapter, problem, split, seed),
+        "method": method,
+        "noise": noise,
+        "effects_sha256": None if effects is None else _digest(Path(effects)),
+    }
     with open_run(out, config, seed=seed) as run:
         if run.done:
             return (run.work / "answer.txt").read_text()
@@ -166,6 +172,7 @@ def predict(
     vehicle: str | Path,
     adapter: str | Path | None = None,
     target: str | None = None,
+    effects: str | Path | None = None,
     level: float = 0.9,
     *,
     out: str | Path,
@@ -183,7 +190,7 @@ def predict(
     if not 0 < level < 1:
         raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
     log = read_log(list(logs), adapter)
-    sheet = read_sheet(vehicle)
+    sheet = read_sheet(vehicle, library=_known(effects))
     measures = target in log.targets if target else bool(log.targets)
     name = target or (log.default_target if measures else "energy_wh")
     derived = name == "traction_force_n" and log.segments.has("motor_torque_nm")
@@ -216,7 +223,11 @@ def predict(
 
 
 def check(
-    logs: Paths, vehicle: str | Path | None = None, adapter: str | Path | None = None, skeleton: bool = False
+    logs: Paths,
+    vehicle: str | Path | None = None,
+    adapter: str | Path | None = None,
+    effects: str | Path | None = None,
+    skeleton: bool = False,
 ) -> str:
     """What was read: columns, units, trips, kWh/km by trip, what was dropped, filled or clipped. Nothing is fitted.
 
@@ -241,7 +252,7 @@ def check(
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
     if vehicle is not None:
-        sheet = read_sheet(vehicle)
+        sheet = read_sheet(vehicle, library=_known(effects))
         problem = prepare(log, sheet, None, need_measured=bool(log.targets))
         free = ", ".join(c.name for c in problem.table.free) or "none"
         lines += ["", f"vehicle: {sheet.name}; chain entered at the {problem.vehicle.entry}; estimated: {free}"]

@@ -74,6 +74,7 @@ def parser() -> argparse.ArgumentParser:
         "  hdev check other.mat --skeleton > adapter.toml",
     )
     _logs(check, vehicle_required=False)
+    _effects(check)
     check.add_argument(
         "--skeleton", action="store_true", help="print an adapter for these files, to be filled in, and stop"
     )
@@ -90,9 +91,7 @@ def parser() -> argparse.ArgumentParser:
     )
     _logs(diagnose)
     _split(diagnose)
-    diagnose.add_argument(
-        "--effects", type=Path, metavar="FILE.py", help="effects of your own, searched besides the library's"
-    )
+    _effects(diagnose)
     diagnose.add_argument("--only", type=_names, metavar="ID,ID", help="search these effects and no others")
     diagnose.add_argument("--exclude", type=_names, metavar="ID,ID", help="leave these effects out of the search")
     diagnose.add_argument(
@@ -109,6 +108,7 @@ def parser() -> argparse.ArgumentParser:
     )
     _logs(calibrate)
     _split(calibrate)
+    _effects(calibrate)
     calibrate.add_argument(
         "--method", choices=["map"], default="map", help="map: Levenberg-Marquardt with the priors (default: map)"
     )
@@ -128,6 +128,7 @@ def parser() -> argparse.ArgumentParser:
     )
     _logs(predict)
     _target(predict)
+    _effects(predict)
     predict.add_argument(
         "--out",
         type=Path,
@@ -175,6 +176,12 @@ def _split(verb: argparse.ArgumentParser) -> None:
         type=_names,
         metavar="C,D",
         help="trips to test on; alone: all others train; with neither, every third trip is the test",
+    )
+
+
+def _effects(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--effects", type=Path, metavar="FILE.py", help="effects of your own: a diagnosis tries them, a sheet has them"
     )
 
 

@@ -1,3 +1,6 @@
 """The loop: residual, candidates, evidence, selection, and what is left."""
 
-__all__: list[str] = []
+from hdev_jax.diagnosis.diagnose import Diagnosis, Problem, prepare
+from hdev_jax.diagnosis.split import Split, split_trips
+
+__all__ = ["Diagnosis", "Problem", "Split", "prepare", "split_trips"]

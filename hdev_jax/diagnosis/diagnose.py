@@ -316,6 +316,12 @@ def _summary(
     }[bool(effects), left.significant]
     clusters = cluster_rows(problem.segments.take(train))
     candidates = [{"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts]
+    considered = {c["id"] for c in candidates}
+    for e in state.fit.vehicle.effects:  # in the vehicle: nothing to turn down, but considered all the same
+        if e.parameters and e.id not in considered:
+            f = next((f for f in state.found if f.id == e.id), None)
+            here = (f.gain, f.q_value, "found") if f else (None, 1.0, "declared in the sheet")
+            candidates.append(dict(zip(("id", "score", "q_value", "why_not"), (e.id, *here), strict=True)))
     return {
         "schema": "hdev-diagnosis/1",
         "target": problem.target,

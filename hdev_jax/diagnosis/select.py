@@ -30,7 +30,7 @@ LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
 TRIES = 4  # rounds of refits in one step before the loop ends
-STABLE = 0.5  # least share of resampled sets of clusters in which it comes first
+STABLE = 0.25  # least share of resampled sets of clusters in which it comes first
 LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
 

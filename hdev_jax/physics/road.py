@@ -200,9 +200,9 @@ class Crosswind(Effect):
     def force(self, row, car):
         delta = row.channels["wind_from_rad"] - row.channels["heading_rad"]
         side = row.channels["wind_speed_mps"] * jnp.sin(delta)
-        along = row.speed_mps + row.channels["wind_speed_mps"] * jnp.cos(delta)
-        # still air at standstill has no direction: a breath along keeps the angle and its slope finite
-        yaw = jnp.arctan2(jnp.abs(side), along + jnp.where(along == 0.0, 1e-6, 0.0))
+        # the speed that the drag has; the breath of 1 µm/s keeps the angle and its slope finite in still air
+        speed = jnp.sqrt(mean_square_speed(row) + 1e-12)
+        yaw = jnp.arctan2(jnp.abs(side), speed + row.channels["wind_speed_mps"] * jnp.cos(delta))
         return self.drag_per_rad2 * yaw**2 * car.drag() * mean_square_speed(row)
 
 
