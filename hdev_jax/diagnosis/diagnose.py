@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hdev_jax.diagnosis.look import Found, Search, Verdict
 from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.metrics import metrics, sum_weight
-from hdev_jax.diagnosis.select import Found, Search, Verdict, search
+from hdev_jax.diagnosis.select import search
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
 from hdev_jax.errors import InputError

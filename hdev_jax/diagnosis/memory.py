@@ -9,7 +9,7 @@ import numpy as np
 
 from hdev_jax.diagnosis.candidates import Candidate, realised
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.select import Found, Search, Verdict
+from hdev_jax.diagnosis.look import Found, Search, Verdict
 from hdev_jax.inference import Calibration, Coefficient, ParameterTable
 from hdev_jax.physics import Effect, Vehicle
 

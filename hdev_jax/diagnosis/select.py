@@ -1,29 +1,34 @@
 """The loop: calibrate, score every candidate, let the leaders compete, add what clears the bar, repeat."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
-from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, gather, gather_plain
-from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
-from hdev_jax.inference import (
-    Calibration,
-    Clusters,
-    Fit,
-    ParameterTable,
-    calibrate,
-    cluster_rows,
-    effect_coefficients,
-    jacobian,
+from hdev_jax.diagnosis.evidence import Score, gather
+from hdev_jax.diagnosis.look import (
+    LEFT_OUT,
+    Found,
+    Problem,
+    Search,
+    View,
+    best_of,
+    both_looks,
+    distance_from_table,
+    evidence_of,
+    look,
+    plausible,
+    slow,
+    worth,
 )
-from hdev_jax.inference.calibrate import WEAK
+from hdev_jax.diagnosis.whiten import estimate_noise, whiten
+from hdev_jax.inference import Calibration, Fit, ParameterTable, calibrate, cluster_rows, effect_coefficients
 from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.physics.vehicle import Target
 
-__all__ = ["Found", "Search", "Verdict", "search"]
+__all__ = ["search"]
 
 MOST_EFFECTS = 10
 LEADERS = 3  # candidates that are refitted jointly before one is taken
@@ -31,70 +36,6 @@ PLACEBOS = 199
 RESAMPLES = 100
 TRIES = 4  # rounds of refits in one step before the loop ends
 STABLE = 0.25  # least share of resampled sets of clusters in which it comes first
-LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
-
-
-@dataclass(frozen=True)
-class Found:
-    """An effect that was added, and on what evidence."""
-
-    id: str
-    score: Score
-    q_value: float
-    stability: float
-    twins: tuple[str, ...]
-    gain: float
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A candidate that was not chosen, and why."""
-
-    id: str
-    score: float | None
-    q_value: float
-    why_not: str
-
-
-@dataclass
-class Search:
-    """Where the loop stands: the vehicle so far, its fit, and what was found and turned down."""
-
-    vehicle: Vehicle
-    table: ParameterTable
-    fit: Calibration
-    found: list[Found] = field(default_factory=list)
-    verdicts: list[Verdict] = field(default_factory=list)
-    absorbs: dict[str, list[str]] = field(default_factory=dict)
-    taken_out: tuple[str, ...] = ()  # added once, superfluous later: not tried again
-    refused: tuple[str, ...] = ()  # cleared the tests but not the joint refit: tried again only before the end
-    trail: dict[str, list[float]] = field(default_factory=dict)  # values of the fit, by the effects it had
-    finished: bool = False
-
-
-@dataclass(frozen=True)
-class _Problem:
-    """What stays the same through the loop."""
-
-    rows: Fit
-    target: Target
-    clusters: Clusters
-    effects: Sequence[type[Effect]]
-    fdr: float
-    rng: np.random.Generator
-    gears: int
-
-    @property
-    def trip(self) -> np.ndarray:
-        return np.asarray(self.rows.segments.trip)[: self.rows.rows]
-
-    @property
-    def seconds(self) -> np.ndarray:
-        return np.asarray(self.rows.segments.duration_s)[: self.rows.rows]
-
-    @property
-    def measured(self) -> np.ndarray:
-        return np.asarray(self.rows.measured)[: self.rows.rows]
 
 
 def search(
@@ -127,17 +68,17 @@ def search(
 
     state = remember(0, declared)
     for step in range(1, MOST_EFFECTS + 2):
-        problem = _Problem(rows, target, clusters, effects, fdr, np.random.default_rng([seed, step]), gears)
+        problem = Problem(rows, target, clusters, effects, fdr, np.random.default_rng([seed, step]), gears)
         state = remember(step, lambda p=problem, s=state, k=step: _step(p, s, k, tell))
         if state.finished:
             break
     return state
 
 
-def _step(problem: _Problem, state: Search, step: int, tell: Callable[[str], None]) -> Search:
+def _step(problem: Problem, state: Search, step: int, tell: Callable[[str], None]) -> Search:
     """One look at all candidates, and the vehicle with the one that is taken; `finished` where none is."""
     tell(f"scoring candidates, step {step}")
-    view = _look(problem, state)
+    view = look(problem, state)
     if step == 1:
         state = replace(state, absorbs=view.absorbs)
     choice = _choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
@@ -152,177 +93,8 @@ def _step(problem: _Problem, state: Search, step: int, tell: Callable[[str], Non
     return replace(state, verdicts=view.verdicts(state), trail=trail)
 
 
-@dataclass
-class _View:
-    """One look at all candidates from where the vehicle stands."""
-
-    evidence: Evidence
-    plain: Evidence
-    noise: Noise
-    best: dict[str, Score]
-    ways: dict[str, int]
-    q: dict[str, float]
-    left_out: dict[str, str]
-    absorbs: dict[str, list[str]]
-    absorbed_by: dict[str, str]
-    fit: Calibration
-    residual: np.ndarray
-    jacobian: np.ndarray
-    matrix: np.ndarray
-    reasons: dict[str, str] = field(default_factory=dict)
-
-    def verdicts(self, state: Search) -> list[Verdict]:
-        """Why each candidate that the vehicle still lacks was not chosen."""
-        out = []
-        for id_, s in sorted(self.best.items(), key=lambda kv: -kv[1].gain):
-            if state.vehicle.has(id_):
-                continue
-            why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
-            out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why))
-        out += [Verdict(id_, None, 1.0, f"not tried: {why}") for id_, why in self.left_out.items()]
-        return out
-
-
-def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
-    if absorbed_by:
-        return f"absorbed: this log cannot tell it from {absorbed_by}"
-    if not _plausible(s):
-        return "its best size has the wrong sign or is out of range"
-    if s.left_out_gain <= LEFT_OUT:
-        return "does not lower the error on trips left out of the fit"
-    if s.p_cluster > s.p_model and q > 0.05:
-        return f"not the same in every trip (q = {q:.2g} with errors clustered)"
-    if q > 0.05:
-        return f"not significant over the whole library (q = {q:.2g})"
-    return "explains less than what was chosen, or too little for the numbers it fits"
-
-
-def _plausible(s: Score) -> bool:
-    """Signs, ranges and least sizes; a switch has to make about the whole of its difference."""
-    c = s.candidate
-    if c.kind == "limit":
-        first = c.parameter(c.sizes[0])
-        size = abs(dict(c.shapes)[first.name] * s.beta[0])
-        return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5 and size >= first.least)
-    parameters = [c.parameter(n) for n in c.sizes]
-    within = all(p.lower <= p.null + b <= p.upper for p, b in zip(parameters, s.beta, strict=True))
-    return within and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
-
-
-def _worth(gain: float, c: Candidate) -> float:
-    """Gain less what its numbers cost: as BIC would for 400 independent rows a size, 20 a shape.
-
-    Rows of a log are not independent, and what differs only between trips has no more of them than trips.
-    """
-    return gain - 3.0 * len(c.columns) - 1.5 * (c.freedoms - len(c.columns))
-
-
-def _moved(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    prior = np.array([c.value for c in fit.table.free])
-    sd = np.array([c.sd if c.sd is not None else WEAK * c.scale for c in fit.table.free])
-    return fit.values - prior, sd
-
-
-def _look(problem: _Problem, state: Search) -> _View:
-    """Whiten, gather and score everything once."""
-    rows, n = problem.rows, problem.rows.rows
-    residual = problem.measured - state.fit.predicted
-    noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
-    car = state.fit.vehicle
-    jac = jacobian(car, state.table, rows.segments, problem.target)[:n]
-    candidates, matrix, left_out = columns(car, problem.effects, rows.segments, n, problem.target)
-    evidence, plain = _both(problem, state.fit, noise, jac, matrix, residual)
-    best, ways = _best(evidence, plain, candidates, _slow(matrix, problem.trip))
-    for id_ in {c.id for c in candidates} - set(best):
-        left_out[id_] = "does nothing on this log"
-    absorbs, absorbed_by = _absorption(evidence, state, best)
-    ids = list(best)
-    ps = [min(1.0, best[i].p * ways[i]) if i not in absorbed_by else 1.0 for i in ids]
-    q = dict(zip(ids, adjusted(ps), strict=True))
-    return _View(
-        evidence, plain, noise, best, ways, q, left_out, absorbs, absorbed_by, state.fit, residual, jac, matrix
-    )
-
-
-def _slow(matrix: np.ndarray, trip: np.ndarray) -> np.ndarray:
-    """Which columns hardly change inside a trip: those that only trips can tell."""
-    edges = np.r_[0, np.flatnonzero(np.diff(trip)) + 1]
-    rows = np.diff(np.r_[edges, len(trip)])
-    means = np.add.reduceat(matrix, edges, axis=0)
-    return np.sum(means**2 / rows[:, None], axis=0) > 0.5 * np.sum(matrix**2, axis=0)
-
-
-def _best(
-    evidence: Evidence, plain: Evidence, candidates: list[Candidate], slow: np.ndarray
-) -> tuple[dict[str, Score], dict[str, int]]:
-    """The best plausible way to have each effect, and how many ways were tried."""
-    totals = evidence.totals()
-    before = evidence.base_likelihood(totals)
-    ways: dict[str, int] = {}
-    ranked: dict[str, list[tuple[float, Candidate]]] = {}
-    for c in candidates:
-        if min(totals[0, evidence.base + k, evidence.base + k] for k in c.columns) <= 1e-20:
-            continue
-        gain, _ = evidence.gain(totals, c.columns, before)
-        ways[c.id] = ways.get(c.id, 0) + 1
-        ranked.setdefault(c.id, []).append((_worth(gain, c), c))
-    best = {}
-    for id_, entries in ranked.items():
-        looks = [_first_plausible([evidence.score(c) for _, c in _leading(entries)])]
-        scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
-        if scores:
-            looks.append(_first_plausible(sorted(scores, key=lambda s: -_worth(s.gain, s.candidate))))
-        # what both looks see is told by the whitened rows, which see it better
-        able = [s for s in looks if _plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
-        best[id_] = min(able, key=lambda s: (s.p > 1e-6, s.p if s.p > 1e-6 else 0.0))
-    return best, ways
-
-
-def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
-    return sorted(entries, key=lambda e: -e[0])[:6]
-
-
-def _first_plausible(scores: list[Score]) -> Score:
-    return next((s for s in scores if _plausible(s)), scores[0])
-
-
-def _both(
-    problem: _Problem, fit: Calibration, noise: Noise, jac: np.ndarray, matrix: np.ndarray, residual: np.ndarray
-) -> tuple[Evidence, Evidence]:
-    """Evidence from whitened rows, and from rows as they are, each worth 1/inflation of its own variance."""
-    rows = np.concatenate([jac, matrix, residual[:, None]], axis=1)
-    moved, sd = _moved(fit)
-    white = whiten(rows, noise, problem.trip, problem.seconds)
-    variance = float(np.mean(residual**2)) * fit.inflation
-    return (
-        gather(white, jac.shape[1], problem.clusters, noise, moved=moved, prior_sd=sd),
-        gather_plain(rows, jac.shape[1], problem.clusters, variance=variance, moved=moved, prior_sd=sd),
-    )
-
-
-def _absorption(
-    evidence: Evidence, state: Search, best: dict[str, Score]
-) -> tuple[dict[str, list[str]], dict[str, str]]:
-    """Which candidates lie in the span of the fitted coefficients, and of which one mostly."""
-    names = [c.name for c in state.table.free]
-    absorbs: dict[str, list[str]] = {n: [] for n in names}
-    by: dict[str, str] = {}
-    total = evidence.totals()[0]
-    for id_, s in best.items():
-        if s.left > ABSORBED or not names:
-            continue
-        column = total[: evidence.base, evidence.base + s.candidate.columns[0]]
-        a = total[: evidence.base, : evidence.base]
-        d = np.sqrt(np.maximum(np.diag(a), 1e-300))
-        x = np.linalg.lstsq(a / np.outer(d, d), column / d, rcond=1e-10)[0]
-        k = int(np.argmax(np.abs(x)))
-        absorbs[names[k]].append(id_)
-        by[id_] = names[k]
-    return absorbs, by
-
-
 def _choose(
-    problem: _Problem, state: Search, view: _View, tell: Callable[[str], None], *, skip: Sequence[str]
+    problem: Problem, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str]
 ) -> Search | None:
     """The candidate that clears every bar, refitted; None where none does. Keeps going past one that fails."""
     able = [
@@ -332,25 +104,25 @@ def _choose(
         and id_ not in skip
         and view.q[id_] <= problem.fdr
         and s.left_out_gain > LEFT_OUT
-        and _plausible(s)
-        and _worth(s.gain, s.candidate) > 0
+        and plausible(s)
+        and worth(s.gain, s.candidate) > 0
     ]
     # what rows tell comes first; what only the clusters tell, when nothing else is left
-    able.sort(key=lambda s: (s.plain, -_worth(s.gain, s.candidate)))
+    able.sort(key=lambda s: (s.plain, -worth(s.gain, s.candidate)))
     for _ in range(TRIES):
         if not able:
             break
         first = able[0]
-        bar = 0.85 * _worth(first.gain, first.candidate)
+        bar = 0.85 * worth(first.gain, first.candidate)
         close = [
-            s for s in able[:LEADERS] if s is first or (s.plain == first.plain and _worth(s.gain, s.candidate) >= bar)
+            s for s in able[:LEADERS] if s is first or (s.plain == first.plain and worth(s.gain, s.candidate) >= bar)
         ]
         fits = []
         for s in close:
             tell(f"refitting with {s.candidate.id}")
             if (tried := _refit(problem, state, s, view)) is not None:
                 gain = max(tried[1], s.gain) if s.plain else tried[1]
-                fits.append((_worth(gain, s.candidate), s, tried[0], gain))
+                fits.append((worth(gain, s.candidate), s, tried[0], gain))
             else:
                 view.reasons[s.candidate.id] = "in the joint refit it is out of range or not told from nothing"
         able = [s for s in able if s not in close]
@@ -372,7 +144,7 @@ def _choose(
     return None
 
 
-def _refit(problem: _Problem, state: Search, s: Score, view: _View) -> tuple[Search, float] | None:
+def _refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
     """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
     s = _refined(problem, s, view)
     effect = realised(s.candidate, s.beta, gears=problem.gears)
@@ -391,7 +163,7 @@ def _refit(problem: _Problem, state: Search, s: Score, view: _View) -> tuple[Sea
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit), gain
 
 
-def _refined(problem: _Problem, s: Score, view: _View) -> Score:
+def _refined(problem: Problem, s: Score, view: View) -> Score:
     """The same way to have the effect with its shapes on a finer grid: switches have many small optima."""
     row_s = float(np.median(np.asarray(problem.rows.segments.duration_s)[: problem.rows.rows]))
     grids = finer(s.candidate, row_s)
@@ -401,8 +173,8 @@ def _refined(problem: _Problem, s: Score, view: _View) -> Score:
     effects = [s.candidate.effect]
     found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
     same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
-    evidence, plain = _both(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
-    best, _ = _best(evidence, plain, same, _slow(matrix, problem.trip))
+    evidence, plain = both_looks(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
+    best, _ = best_of(evidence, plain, same, slow(matrix, problem.trip))
     finest = best.get(s.candidate.id)
     return finest if finest is not None and finest.gain > s.gain and finest.plain == s.plain else s
 
@@ -432,23 +204,15 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
     return True
 
 
-def _whitened_gain(problem: _Problem, state: Search, fit: Calibration, view: _View) -> float:
+def _whitened_gain(problem: Problem, state: Search, fit: Calibration, view: View) -> float:
     """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
-    after = _evidence(problem, fit, view.noise)
-    prior = [0.5 * float(np.sum(np.square(np.divide(*_moved(f))))) for f in (state.fit, fit)]
+    after = evidence_of(problem, fit, view.noise)
+    prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (state.fit, fit)]
     before = view.evidence.base_likelihood(view.evidence.totals()) - prior[0]
     return after.base_likelihood(after.totals()) - prior[1] - before
 
 
-def _evidence(problem: _Problem, fit: Calibration, noise: Noise) -> Evidence:
-    """A fitted vehicle's own Jacobian and residual, whitened; no candidates."""
-    jac = jacobian(fit.vehicle, fit.table, problem.rows.segments, problem.target)[: problem.rows.rows]
-    white = whiten(np.c_[jac, problem.measured - fit.predicted], noise, problem.trip, problem.seconds)
-    moved, sd = _moved(fit)
-    return gather(white, jac.shape[1], problem.clusters, noise, moved=moved, prior_sd=sd)
-
-
-def _placebo(problem: _Problem, s: Score, view: _View, draws: int = 19) -> str | None:
+def _placebo(problem: Problem, s: Score, view: View, draws: int = 19) -> str | None:
     """Why a placebo does as well, or None.
 
     A column that changes inside trips is moved in time by a random amount in each; one that hardly does is given a
@@ -470,7 +234,7 @@ def _placebo(problem: _Problem, s: Score, view: _View, draws: int = 19) -> str |
         moved = [np.roll(p, int(problem.rng.integers(len(p) // 8, max(len(p) - len(p) // 8, 2)))) for p in parts]
         shifted.append(column[np.concatenate(moved)])
     rows = np.concatenate([view.jacobian, *shifted, view.residual[:, None]], axis=1)
-    moved_by, sd = _moved(view.fit)
+    moved_by, sd = distance_from_table(view.fit)
     base = view.jacobian.shape[1]
     white = whiten(rows, view.noise, problem.trip, problem.seconds)
     evidence = gather(white, base, problem.clusters, view.noise, moved=moved_by, prior_sd=sd)
@@ -480,13 +244,13 @@ def _placebo(problem: _Problem, s: Score, view: _View, draws: int = 19) -> str |
     return "a placebo (its column shifted in time) does as well" if max(gains) >= s.gain else None
 
 
-def _twins(view: _View, s: Score, problem: _Problem) -> tuple[str, ...]:
+def _twins(view: View, s: Score, problem: Problem) -> tuple[str, ...]:
     """At most two other effects that, put in its place, leave the chosen one insignificant and explain as much."""
     total = view.evidence.totals()
     before = view.evidence.base_likelihood(total)
     out: list[tuple[float, str]] = []
     for id_, other in view.best.items():
-        if id_ == s.candidate.id or id_ in view.absorbed_by or not _plausible(other):
+        if id_ == s.candidate.id or id_ in view.absorbed_by or not plausible(other):
             continue
         both = tuple(dict.fromkeys((*other.candidate.columns, *s.candidate.columns)))
         if s.plain:
@@ -501,7 +265,7 @@ def _twins(view: _View, s: Score, problem: _Problem) -> tuple[str, ...]:
     return tuple(id_ for _, id_ in sorted(out)[:2])
 
 
-def _stability(problem: _Problem, view: _View, chosen: Score, names: set[str]) -> float:
+def _stability(problem: Problem, view: View, chosen: Score, names: set[str]) -> float:
     """Share of resampled sets of clusters in which the same effect (or its class) comes first of its kind.
 
     Its rivals are those that clusters could be speaking for at all (p at most 0.01 before any correction).
@@ -510,7 +274,7 @@ def _stability(problem: _Problem, view: _View, chosen: Score, names: set[str]) -
     rivals = [
         s
         for s in view.best.values()
-        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in view.absorbed_by and _plausible(s)
+        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in view.absorbed_by and plausible(s)
     ]
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
     small = [(view.plain if s.plain else view.evidence).only(s.candidate) for s in rivals]
@@ -518,23 +282,23 @@ def _stability(problem: _Problem, view: _View, chosen: Score, names: set[str]) -
     for _ in range(RESAMPLES):
         drawn = problem.rng.integers(0, g, g)
         weight = np.bincount(drawn, minlength=g).astype(float)
-        worth = []
+        gains = []
         for s, (evidence, candidate) in zip(rivals, small, strict=True):
             if s.plain:
                 gain = replace(evidence, grams=evidence.grams[:, drawn]).plain_score(candidate).gain
             else:
                 gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
-            worth.append(_worth(gain, candidate))
-        hits += rivals[int(np.argmax(worth))].candidate.id in names and max(worth) > 0
+            gains.append(worth(gain, candidate))
+        hits += rivals[int(np.argmax(gains))].candidate.id in names and max(gains) > 0
     return hits / RESAMPLES
 
 
-def _prune(problem: _Problem, state: Search, tell: Callable[[str], None]) -> Search:
+def _prune(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search:
     """Backward: an effect that the later ones made superfluous goes, the weakest first."""
     while len(state.found) > 1:
         residual = problem.measured - state.fit.predicted
         noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
-        evidence = _evidence(problem, state.fit, noise)
+        evidence = evidence_of(problem, state.fit, noise)
         worst: tuple[float, Found] | None = None
         for f in state.found[:-1]:
             if f.score.candidate.kind == "limit":
