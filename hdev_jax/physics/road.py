@@ -45,8 +45,8 @@ def _slope(row: Segments) -> Any:
 
 
 def _weight_on_road(row: Segments, car: Vehicle) -> Any:
-    """m·g·cosθ [N]."""
-    return car.mass(row) * GRAVITY_MPS2 * jnp.cos(_slope(row))
+    """m·g·cosθ [N]. A road is never upright, so cosθ = √(1 − sin²θ): the sine is there already."""
+    return car.mass(row) * GRAVITY_MPS2 * jnp.sqrt(1.0 - jnp.sin(_slope(row)) ** 2)
 
 
 # --- declared: equations 3 and 4 of paper 1, equation 2 of paper 2 ---------------------------------------------------
