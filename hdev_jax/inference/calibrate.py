@@ -115,7 +115,7 @@ def _solve(
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
     z0 = jnp.zeros_like(start)
-    sol = optx.least_squares(residuals, solver, z0, args=(vehicle, fit), max_steps=100, throw=False)
+    sol = optx.least_squares(residuals, solver, z0, args=(vehicle, fit), max_steps=50, throw=False)
     theta = _to_support(sol.value, start, scale, structure)
     predicted = insert(vehicle, structure, theta).predict(fit.segments, target)
     return theta, predicted, sol.result, sol.stats["num_steps"]
