@@ -122,8 +122,8 @@ def effect_coefficients(
 ) -> tuple[Coefficient, ...]:
     """Rows for an effect's parameters: those in `sizes` and, where `shapes`, its shapes free, the others held.
 
-    A found effect has no tabular prior; shapes keep a wide one around their start (their `scale` times 3), without
-    which a flat direction would run off.
+    A found effect's sizes have no tabular prior; shapes have the usual value of such an effect, give or take its
+    `scale` (a heating threshold of 18 ± 4 °C): few trips say little about them.
     """
     rows = []
     for p in effect.parameters:
@@ -138,8 +138,8 @@ def effect_coefficients(
                 Coefficient(
                     path=f"effects.{effect.id}.{p.name}",
                     unit=p.unit,
-                    value=float(value),
-                    sd=3 * abs(p.scale) if p.kind == "shape" else None,
+                    value=p.null if p.kind == "shape" else float(value),
+                    sd=abs(p.scale) if p.kind == "shape" else None,
                     scale=abs(p.scale),
                     lower=p.lower if p.kind != "size" else -np.inf,
                     upper=p.upper if p.kind != "size" else np.inf,
