@@ -1,34 +1,32 @@
 """The verbs: what `hdev VERB` does, as functions of the same names and arguments."""
 
 import json
-import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from hdev_jax import progress
-from hdev_jax.diagnosis.diagnose import Diagnosis, Problem, baseline_block, prepare
+from hdev_jax.diagnosis.diagnose import Diagnosis
 from hdev_jax.diagnosis.diagnose import diagnose as run_loop
 from hdev_jax.diagnosis.metrics import metrics
-from hdev_jax.diagnosis.split import Split, split_trips
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.summary import baseline_block
 from hdev_jax.errors import InputError
 from hdev_jax.inference import calibrate as fit_map
 from hdev_jax.inference import cluster_rows, padded
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.inference.sheet_text import augmented_sheet
 from hdev_jax.logs import read_log, write_adapter_skeleton
-from hdev_jax.physics import LIBRARY, Effect, library
-from hdev_jax.report.data import ReportData
+from hdev_jax.opening import Paths, chosen_effects, command_line, known_effects, opened
+from hdev_jax.physics import LIBRARY
+from hdev_jax.report.build import answer_text, of_diagnosis, report_data
 from hdev_jax.report.page import write_calibration_report, write_report
-from hdev_jax.rundir import Run, atomic_file, open_run
+from hdev_jax.rundir import atomic_file, open_run
 
 __all__ = ["calibrate", "check", "diagnose", "effects", "predict"]
-
-Paths = Sequence[str | Path]
 
 
 def diagnose(
@@ -52,18 +50,11 @@ def diagnose(
     `diagnosis.json`, `report.html`, `augmented_vehicle.toml`, figures. Raises `InputError` for what the user can mend.
     """
     started = time.time()
-    candidates = _candidates(effects, only, exclude)
-    sheet = read_sheet(vehicle, library=_known(effects))
-    progress.step("reading the logs")
-    log = read_log(list(logs), adapter)
-    problem = prepare(log, sheet, target)
-    split = split_trips(log, train_trips, test_trips)
-    if split.log is not log:
-        problem = prepare(split.log, sheet, target)
+    candidates = chosen_effects(effects, only, exclude)
+    start = opened("diagnose", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed)
+    problem, split = start.problem, start.split
     config = {
-        **_config("diagnose", logs, vehicle, adapter, problem, split, seed),
-        "effects_file": None if effects is None else str(effects),
-        "effects_sha256": None if effects is None else _digest(Path(effects)),
+        **start.config,
         "only": None if only is None else list(only),
         "exclude": None if exclude is None else list(exclude),
         "fdr": fdr,
@@ -73,12 +64,12 @@ def diagnose(
             return (run.work / "answer.txt").read_text()
         result = run_loop(problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
         progress.step("writing the report")
-        data = _report(result, _command("diagnose", run), started)
-        text = _augmented(result, sheet)
+        data = of_diagnosis(result, command_line("diagnose", run), started)
+        text = _augmented(result, start.sheet)
         run.path("diagnosis.json").write_text(json.dumps(result.summary, indent=1, allow_nan=False) + "\n")
         run.path("augmented_vehicle.toml").write_text(text)
         write_report(data, run.work)
-        answer = _answer(data, Path(out))
+        answer = answer_text(data, Path(out))
         run.path("answer.txt").write_text(answer)
     return answer
 
@@ -108,18 +99,11 @@ def calibrate(
     if noise not in ("normal", "student_t"):
         raise InputError(f"--noise {noise!r}: accepted are normal, student_t")
     started = time.time()
-    sheet = read_sheet(vehicle, library=_known(effects))
-    log = read_log(list(logs), adapter)
-    split = split_trips(log, train_trips, test_trips)
-    problem = prepare(split.log, sheet, target)
+    start = opened("calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed)
+    problem, split = start.problem, start.split
     if not problem.table.free:
         raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")
-    config = {
-        **_config("calibrate", logs, vehicle, adapter, problem, split, seed),
-        "method": method,
-        "noise": noise,
-        "effects_sha256": None if effects is None else _digest(Path(effects)),
-    }
+    config = {**start.config, "method": method, "noise": noise}
     with open_run(out, config, seed=seed) as run:
         if run.done:
             return (run.work / "answer.txt").read_text()
@@ -130,7 +114,7 @@ def calibrate(
             problem.vehicle, problem.table, rows, problem.target, cluster_rows(problem.segments.take(train)),
             noise=noise,  # pyright: ignore[reportArgumentType]
         )  # fmt: skip
-        predicted = _predicted(problem, fit.vehicle)
+        predicted = problem.predict(fit.vehicle)
         y, w = problem.measured, problem.weight()
         summary = {
             "schema": "hdev-calibration/1",
@@ -157,8 +141,8 @@ def calibrate(
         }
         values = {c.name: (float(v), float(s)) for c, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)}
         run.path("calibration.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
-        run.path("calibrated_vehicle.toml").write_text(augmented_sheet(sheet, values, {}))
-        data = _data(problem, split, summary, predicted, predicted, _command("calibrate", run), started)
+        run.path("calibrated_vehicle.toml").write_text(augmented_sheet(start.sheet, values, {}))
+        data = report_data(problem, split, summary, predicted, predicted, command_line("calibrate", run), started)
         write_calibration_report(data, run.work)
         lines = [f"{name:32s} {v:12.6g} ± {s:.3g}" for name, (v, s) in values.items()]
         test_rmse = summary["before"]["test"]["rmse"]
@@ -190,12 +174,12 @@ def predict(
     if not 0 < level < 1:
         raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
     log = read_log(list(logs), adapter)
-    sheet = read_sheet(vehicle, library=_known(effects))
+    sheet = read_sheet(vehicle, library=known_effects(effects))
     measures = target in log.targets if target else bool(log.targets)
     name = target or (log.default_target if measures else "energy_wh")
     derived = name == "traction_force_n" and log.segments.has("motor_torque_nm")
     problem = prepare(log, sheet, name, need_measured=measures or derived)
-    predicted = _predicted(problem, problem.vehicle)
+    predicted = problem.predict(problem.vehicle)
     sd = np.array([c.sd or 0.0 for c in problem.table.free])
     rows = padded(problem.segments, problem.measured)
     jac = jacobian(problem.vehicle, problem.table, rows.segments, problem.target)[: len(log)]
@@ -252,7 +236,7 @@ def check(
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
     if vehicle is not None:
-        sheet = read_sheet(vehicle, library=_known(effects))
+        sheet = read_sheet(vehicle, library=known_effects(effects))
         problem = prepare(log, sheet, None, need_measured=bool(log.targets))
         free = ", ".join(c.name for c in problem.table.free) or "none"
         lines += ["", f"vehicle: {sheet.name}; chain entered at the {problem.vehicle.entry}; estimated: {free}"]
@@ -275,135 +259,6 @@ def effects() -> list[dict[str, str]]:
     ]
 
 
-# --- what the verbs share ------------------------------------------------------------------------------------------
-
-
-def _known(file: str | Path | None) -> dict[str, type[Effect]]:
-    """The library with a user's own effects: every `Effect` class that the Python file defines."""
-    if file is None:
-        return dict(LIBRARY)
-    import importlib.util
-
-    path = Path(file)
-    spec = importlib.util.spec_from_file_location("hdev_user_effects", path)
-    if not path.is_file() or spec is None or spec.loader is None:
-        raise InputError(f"--effects {file}: no such Python file")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as e:
-        raise InputError(f"--effects {file}: does not run: {type(e).__name__}: {e}") from e
-    own = [
-        c for c in vars(module).values()
-        if isinstance(c, type) and issubclass(c, Effect) and c.__module__ == module.__name__ and hasattr(c, "id")
-    ]  # fmt: skip
-    if not own:
-        raise InputError(f"--effects {file}: defines no subclass of hdev_jax.physics.Effect with an id")
-    try:
-        return library(own)
-    except ValueError as e:
-        raise InputError(f"--effects {file}: {e}") from e
-
-
-def _candidates(
-    file: str | Path | None, only: Sequence[str] | None, exclude: Sequence[str] | None
-) -> dict[str, type[Effect]]:
-    import difflib
-
-    known = _known(file)
-    for name in (*(only or ()), *(exclude or ())):
-        if name not in known:
-            near = difflib.get_close_matches(name, list(known), 1)
-            hint = f"; did you mean {near[0]!r}?" if near else "; `hdev effects` lists them"
-            raise InputError(f"no effect {name!r} in the library{hint}")
-    chosen = {k: c for k, c in known.items() if (only is None or k in only) and k not in (exclude or ())}
-    if not chosen:
-        raise InputError("--only and --exclude leave no candidate")
-    return chosen
-
-
-def _digest(path: Path) -> str:
-    import hashlib
-
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-
-
-def _config(
-    verb: str, logs: Paths, vehicle: str | Path, adapter: str | Path | None, problem: Problem, split: Split, seed: int
-) -> dict[str, Any]:
-    """What decides the result, as the run's folder keeps it."""
-    return {
-        "verb": verb,
-        "logs": [str(p) for p in logs],
-        "log_sha256": problem.log.fingerprint(),
-        "vehicle": str(vehicle),
-        "vehicle_sha256": _digest(Path(vehicle)),
-        "adapter": None if adapter is None else str(adapter),
-        "target": problem.target,
-        "train_trips": split.names(split.train),
-        "test_trips": split.names(split.test),
-        "seed": seed,
-        "x64": bool(jax.config.read("jax_enable_x64")),
-    }
-
-
-def _command(verb: str, run: Run) -> str:
-    c = run.config
-    parts = ["hdev", verb, *c["logs"], "--vehicle", c["vehicle"], "--target", c["target"]]
-    if c.get("adapter"):
-        parts += ["--adapter", c["adapter"]]
-    parts += ["--train-trips", ",".join(c["train_trips"]), "--test-trips", ",".join(c["test_trips"])]
-    return shlex.join([*parts, "--seed", str(c["seed"]), "--out", str(run.out)])
-
-
-def _predicted(problem: Problem, vehicle: Any) -> np.ndarray:
-    from hdev_jax.diagnosis.diagnose import _predict
-
-    return _predict(problem, vehicle)
-
-
-def _data(
-    problem: Problem, split: Split, summary: dict[str, Any], before: np.ndarray, after: np.ndarray, command: str,
-    started: float, breakdown: dict[str, dict[str, float]] | None = None,
-) -> ReportData:  # fmt: skip
-    s = problem.segments
-    used = problem.rows((*split.train, *split.test))
-    return ReportData(
-        summary=summary,
-        vehicle=problem.sheet.name,
-        synthetic="synthetic" in f"{problem.sheet.name} {' '.join(problem.log.files)}".lower(),
-        unit=problem.unit,
-        rows={
-            "trip": np.asarray(s.trip),
-            "time_s": np.asarray(s.time_s),
-            "duration_s": np.asarray(s.duration_s),
-            "distance_m": np.asarray(s.distance_m),
-            "measured": problem.measured, "before": before, "after": after,
-            "test": problem.rows(split.test), "used": used,
-        },
-        channels={"speed_mps": np.asarray(s.speed_mps), **{k: np.asarray(v) for k, v in s.channels.items()}},
-        trip_names=problem.log.trip_names,
-        breakdown=breakdown or {},
-        ledger=problem.log.ledger.to_dicts(),
-        command=command,
-        seconds=time.time() - started,
-    )  # fmt: skip
-
-
-def _report(result: Diagnosis, command: str, started: float) -> ReportData:
-    problem, split = result.problem, result.split
-    breakdown = {}
-    if problem.target in ("energy_wh", "battery_power_kw"):
-        test = padded(problem.segments.take(problem.rows(split.test)), problem.measured[problem.rows(split.test)])
-        n = test.rows
-        for when, car in (("before", result.before), ("after", result.after)):
-            parts = car.breakdown(test.segments)
-            breakdown[when] = {k: float(np.sum(np.asarray(v)[:n])) / 1e3 for k, v in parts.items()}
-    return _data(
-        problem, split, result.summary, result.predicted_before, result.predicted_after, command, started, breakdown
-    )
-
-
 def _augmented(result: Diagnosis, sheet: Sheet) -> str:
     fit = result.fit
     values = {
@@ -412,20 +267,3 @@ def _augmented(result: Diagnosis, sheet: Sheet) -> str:
         if c.path.rpartition(".")[0].removeprefix("effects.") not in result.found
     }
     return augmented_sheet(sheet, values, result.found)
-
-
-def _answer(data: ReportData, out: Path) -> str:
-    from hdev_jax.report.words import answer
-
-    s = data.summary
-    lines = [answer(data), "", f"{'':10s}{'test RMSE':>12s}{'energy/work error':>20s}   [{data.unit}]"]
-    for when in ("before", "after"):
-        m = s[when]["test"]
-        pe = "-" if m["pe_percent"] is None else f"{m['pe_percent']:+.2f} %"
-        lines.append(f"{when:10s}{m['rmse']:12.4g}{pe:>20s}")
-    for e in s["effects"]:
-        sizes = ", ".join(f"{k} {p['value']:.4g} ± {p['sd']:.2g} {p['unit']}" for k, p in e["parameters"].items())
-        twins = f"; not told from {', '.join(e['indistinguishable_from'])}" if e["indistinguishable_from"] else ""
-        lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")
-    lines += [s["unexplained"]["signature"], str(out / "report.html")]
-    return "\n".join(lines)

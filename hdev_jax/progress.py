@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TypeVar
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["shown", "step", "track"]
+__all__ = ["busy", "shown", "step", "track"]
 
 T = TypeVar("T")
 
@@ -41,6 +41,20 @@ def step(message: str) -> None:
     if (state := _console.get()) is not None:
         console, start = state
         console.print(f"{time.monotonic() - start:6.1f} s  {message}", markup=False)
+
+
+@contextlib.contextmanager
+def busy(message: str) -> Iterator[None]:
+    """A sign of life on a terminal that goes when the block ends; elsewhere nothing.
+
+    For what may still refuse the input: a refusal is one line and no other.
+    """
+    state = _console.get()
+    if state is not None and state[0].is_terminal:
+        with state[0].status(message):
+            yield
+    else:
+        yield
 
 
 def track(items: Iterable[T], message: str, total: int | None = None) -> Iterator[T]:

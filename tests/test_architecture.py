@@ -23,6 +23,7 @@ LAYERS = [
     {"inference", "learn", "fleet"},
     {"diagnosis"},
     {"report"},
+    {"opening"},
     {"api"},
     {"demo", "cli", "experiments"},
 ]

@@ -97,7 +97,7 @@ def fake(verdict="effects_found", trips=6, rows=120, names=None, synthetic=True,
         },
         "effects": [effect] if found else [],
         "candidates": [
-            {"id": f"idea_{k}", "score": 9.0 - k, "q_value": 0.5, "why_not": "no better than its placebos"}
+            {"id": f"idea_{k}", "score": 6.0 - 0.3 * k, "q_value": 0.5, "why_not": "no better than its placebos"}
             for k in range(20)
         ]
         + [
@@ -194,6 +194,19 @@ def plain(text) -> str:
     """What a reader sees, without tags, on one line."""
     text = re.sub(r"<style>.*?</style>", "", text, flags=re.S)
     return " ".join(html.unescape(re.sub(r"<[^>]+>", "", text)).split())
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_a_strong_suspect_is_named_as_one(verdict):
+    data = fake(verdict)
+    strong = {"id": "regen_cutoff", "score": 30.0, "q_value": 0.2, "why_not": "not the same in every trip"}
+    absorbed = {"id": "grade_bias", "score": 90.0, "q_value": 1.0, "why_not": "absorbed: this log cannot tell it"}
+    data.summary["candidates"] += [strong, absorbed]
+    said = answer(data)
+    assert ("Not decidable on this log: cut-off of regeneration" in said) == (verdict == "nothing_missing")
+    assert ("could not be named with confidence (the nearest is cut-off of" in said) == ("unexplained" in verdict)
+    assert "slope bias" not in said
+    assert "Nothing is missing" not in said
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

@@ -16,7 +16,7 @@ from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unava
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["Candidate", "Column", "columns", "finer", "realised"]
+__all__ = ["FIXED", "Candidate", "Column", "columns", "finer", "realised"]
 
 FIXED = ("shape", "choice")  # what has no column of its own
 
@@ -113,8 +113,8 @@ def _of_effect(effect: type[Effect], segments: Segments, row_s: float, grids: Gr
                 yield variant, (None,) * len(variant), at, "size"
 
 
-def finer(candidate: Candidate, row_s: float, points: int = 7) -> dict[str, tuple[float, ...]]:
-    """Grids for the candidate's shapes and limits, half a step to either side of where it stands."""
+def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int = 7) -> dict[str, tuple[float, ...]]:
+    """Grids for the candidate's shapes and limits, `reach` of a step to either side of where it stands."""
     grids: dict[str, tuple[float, ...]] = {}
     for name, at in candidate.shapes:
         p = candidate.parameter(name)
@@ -126,7 +126,8 @@ def finer(candidate: Candidate, row_s: float, points: int = 7) -> dict[str, tupl
         below = grid[k - 1] if k > 0 else at - (grid[k + 1] - at)
         above = grid[k + 1] if k + 1 < len(grid) else at + (at - grid[k - 1])
         near = np.r_[
-            np.linspace((at + below) / 2, at, points // 2 + 1), np.linspace(at, (at + above) / 2, points // 2 + 1)
+            np.linspace(at + reach * (below - at), at, points // 2 + 1),
+            np.linspace(at, at + reach * (above - at), points // 2 + 1),
         ]
         grids[name] = tuple(float(x) for x in np.unique(np.clip(near, p.lower, p.upper)))
     return grids

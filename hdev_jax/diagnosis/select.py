@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
 from hdev_jax.diagnosis.evidence import Score, gather
 from hdev_jax.diagnosis.look import (
     LEFT_OUT,
@@ -14,17 +13,15 @@ from hdev_jax.diagnosis.look import (
     Problem,
     Search,
     View,
-    best_of,
-    both_looks,
     distance_from_table,
     evidence_of,
     look,
     plausible,
-    slow,
     worth,
 )
+from hdev_jax.diagnosis.refit import grow, is_size, refit
 from hdev_jax.diagnosis.whiten import estimate_noise, whiten
-from hdev_jax.inference import Calibration, Fit, ParameterTable, calibrate, cluster_rows, effect_coefficients
+from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.physics.vehicle import Target
 
@@ -83,9 +80,10 @@ def _step(problem: Problem, state: Search, step: int, tell: Callable[[str], None
         state = replace(state, absorbs=view.absorbs)
     choice = _choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
     if choice is None and state.refused and step <= MOST_EFFECTS:
-        choice = _choose(problem, state, view, tell, skip=())
+        choice = _choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
     if choice is None:
-        return replace(state, verdicts=view.verdicts(state), finished=True)
+        grown = grow(problem, state, tell)
+        return replace(grown or state, verdicts=view.verdicts(state), finished=grown is None)
     choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
     state = _prune(problem, choice, tell)
@@ -120,7 +118,7 @@ def _choose(
         fits = []
         for s in close:
             tell(f"refitting with {s.candidate.id}")
-            if (tried := _refit(problem, state, s, view)) is not None:
+            if (tried := refit(problem, state, s, view)) is not None:
                 gain = max(tried[1], s.gain) if s.plain else tried[1]
                 fits.append((worth(gain, s.candidate), s, tried[0], gain))
             else:
@@ -134,7 +132,7 @@ def _choose(
                 tell(f"turned down {c.id}: {why}")
                 continue
             twins = _twins(view, s, problem)
-            stability = _stability(problem, view, s, {c.id, *twins})
+            stability = _stability(problem, view, s, {c.id, *twins}, state.refused)
             if stability < STABLE:
                 view.reasons[c.id] = f"comes first in only {100 * stability:.0f} % of resampled sets of trips"
                 tell(f"turned down {c.id}: {view.reasons[c.id]}")
@@ -142,74 +140,6 @@ def _choose(
             found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain))
             return replace(new, found=[*state.found, found])
     return None
-
-
-def _refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
-    """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
-    s = _refined(problem, s, view)
-    effect = realised(s.candidate, s.beta, gears=problem.gears)
-    sizes = s.candidate.sizes
-    groups = [str(g) for g in s.candidate.groups if g is not None]
-    vehicle = state.fit.vehicle.plus(effect)
-    rows = effect_coefficients(effect, sizes, groups=groups)
-    rows = tuple(replace(r, free=False) if _idle(s.candidate, r.path) else r for r in rows)
-    table = state.table.plus(*rows)
-    fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
-    if not fit.converged and fit.steps < 5:
-        return None
-    if not _in_range(fit, s.candidate) or not _present(fit, s.candidate):
-        return None
-    gain = _whitened_gain(problem, state, fit, view)
-    return replace(state, vehicle=fit.vehicle, table=table, fit=fit), gain
-
-
-def _refined(problem: Problem, s: Score, view: View) -> Score:
-    """The same way to have the effect with its shapes on a finer grid: switches have many small optima."""
-    row_s = float(np.median(np.asarray(problem.rows.segments.duration_s)[: problem.rows.rows]))
-    grids = finer(s.candidate, row_s)
-    if all(len(g) == 1 for g in grids.values()):
-        return s
-    n = problem.rows.rows
-    effects = [s.candidate.effect]
-    found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
-    same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
-    evidence, plain = both_looks(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
-    best, _ = best_of(evidence, plain, same, slow(matrix, problem.trip))
-    finest = best.get(s.candidate.id)
-    return finest if finest is not None and finest.gain > s.gain and finest.plain == s.plain else s
-
-
-def _present(fit: Calibration, candidate: Candidate) -> bool:
-    """Whether a size stands in the joint refit too, where rows weigh the same, at 1 % with errors clustered."""
-    if candidate.kind == "limit":
-        return True
-    at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes
-          and c.path.startswith(f"effects.{candidate.id}.")]  # fmt: skip
-    return bool(np.any(np.abs(fit.values[at]) > 2.6 * fit.sd[at]))
-
-
-def _idle(candidate: Candidate, path: str) -> bool:
-    """A shape that belongs to a size this candidate does not have."""
-    name = path.rpartition(".")[2]
-    return name not in candidate.sizes and all(name != n for n, _ in candidate.shapes)
-
-
-def _in_range(fit: Calibration, candidate: Candidate) -> bool:
-    prefix = f"effects.{candidate.id}."
-    for c, v in zip(fit.table.free, fit.values, strict=True):
-        if c.path.startswith(prefix):
-            p = candidate.parameter(c.path.removeprefix(prefix))
-            if p.kind == "size" and not p.lower <= v <= p.upper:
-                return False
-    return True
-
-
-def _whitened_gain(problem: Problem, state: Search, fit: Calibration, view: View) -> float:
-    """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
-    after = evidence_of(problem, fit, view.noise)
-    prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (state.fit, fit)]
-    before = view.evidence.base_likelihood(view.evidence.totals()) - prior[0]
-    return after.base_likelihood(after.totals()) - prior[1] - before
 
 
 def _placebo(problem: Problem, s: Score, view: View, draws: int = 19) -> str | None:
@@ -265,16 +195,18 @@ def _twins(view: View, s: Score, problem: Problem) -> tuple[str, ...]:
     return tuple(id_ for _, id_ in sorted(out)[:2])
 
 
-def _stability(problem: Problem, view: View, chosen: Score, names: set[str]) -> float:
+def _stability(problem: Problem, view: View, chosen: Score, names: set[str], refused: Sequence[str]) -> float:
     """Share of resampled sets of clusters in which the same effect (or its class) comes first of its kind.
 
-    Its rivals are those that clusters could be speaking for at all (p at most 0.01 before any correction).
+    Its rivals are those that clusters could be speaking for at all (p at most 0.01 before any correction) and that
+    no joint refit or placebo has turned down.
     """
     g = view.evidence.count
+    down = {*view.reasons, *refused}
     rivals = [
         s
         for s in view.best.values()
-        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in view.absorbed_by and plausible(s)
+        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in {*view.absorbed_by, *down} and plausible(s)
     ]
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
     small = [(view.plain if s.plain else view.evidence).only(s.candidate) for s in rivals]
@@ -303,7 +235,7 @@ def _prune(problem: Problem, state: Search, tell: Callable[[str], None]) -> Sear
         for f in state.found[:-1]:
             if f.score.candidate.kind == "limit":
                 continue  # a switch is either there or not: its size says nothing against zero
-            at = [k for k, c in enumerate(state.table.free) if _is_size(c.path, f)]
+            at = [k for k, c in enumerate(state.table.free) if is_size(c.path, f)]
             p = evidence.present(at, state.fit.values[at])
             if p > 0.05 and (worst is None or p > worst[0]):
                 worst = (p, f)
@@ -319,8 +251,3 @@ def _prune(problem: Problem, state: Search, tell: Callable[[str], None]) -> Sear
             state, vehicle=fit.vehicle, table=table, fit=fit, found=kept, taken_out=(*state.taken_out, drop)
         )
     return state
-
-
-def _is_size(path: str, f: Found) -> bool:
-    """Whether a coefficient is one of the sizes of a found effect."""
-    return any(path == f"effects.{f.id}.{name}" for name in f.score.candidate.sizes)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special, stats
 
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import Clusters
@@ -186,15 +186,21 @@ def _period(rows: Rows) -> tuple[float, float] | None:
     power = total / count
     low, high = 3, len(power) // 4  # three cycles or more in a window; nothing within four samples
     best: tuple[float, int] | None = None
+    bias, spread = float(special.digamma(count) - np.log(count)), float(special.polygamma(1, count))
     for k in range(low, high):
         wide = max(3, k // 3)
-        around = np.r_[power[max(2, k - wide) : max(k - 1, 2)], power[k + 2 : k + 2 + wide]]
-        if len(around) < 4:
+        if min(k - 1, wide) + min(len(power) - k - 2, wide) < 6:
             continue
         # a smooth spectrum, falling as a power of frequency at most: its logarithm is linear in that of frequency
         where = np.r_[np.arange(max(2, k - wide), max(k - 1, 2)), np.arange(k + 2, min(k + 2 + wide, len(power)))]
-        slope, height = np.polyfit(np.log(where), np.log(power[where] + 1e-300), 1)
-        floor = float(np.exp(height + slope * np.log(k)))
+        x = np.log(where)
+        design = np.stack([x - x.mean(), np.ones(len(x))], axis=1)
+        # the logarithm of a mean of `count` exponentials is low by `bias`; the Hann taper makes neighbours alike, so
+        # the line is known less well than its points say: the floor is taken two standard errors up
+        line = np.linalg.lstsq(design, np.log(power[where] + 1e-300) - bias, rcond=None)[0]
+        at = np.array([np.log(k) - x.mean(), 1.0])
+        se = np.sqrt(2.0 * spread * at @ np.linalg.inv(design.T @ design) @ at)
+        floor = float(np.exp(line @ at + 2.0 * se))
         ratio = power[k] / max(floor, 1e-300)
         if best is None or ratio > best[0]:
             best = (ratio, k)

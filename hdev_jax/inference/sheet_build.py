@@ -9,9 +9,9 @@ from hdev_jax.inference.parameters import Coefficient, ParameterTable
 from hdev_jax.inference.sheet import BATTERY_TARGETS, Built, Sheet, most_gear
 from hdev_jax.inference.sheet_schema import KEYS, SECTIONS, Declared, Key, effect_key
 from hdev_jax.physics import Driveline, Effect, Grouped, Machine, Vehicle, at_null, unavailable
-from hdev_jax.physics.battery import Auxiliary
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.effect import STAGES
+from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.physics.vehicle import Entry, Target
 from hdev_jax.segments import Segments

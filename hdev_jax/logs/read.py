@@ -15,7 +15,8 @@ from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import MEASURED, Log
 from hdev_jax.logs.readers import find_files, read_raw
 from hdev_jax.logs.repair import repair
-from hdev_jax.logs.rows import Rows, check_rows, concatenate, split_trips
+from hdev_jax.logs.rows import Rows, check_rows, concatenate
+from hdev_jax.logs.trips import split_trips
 from hdev_jax.segments import Segments
 from hdev_jax.units import accepted
 

@@ -7,13 +7,14 @@ import pandas as pd
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.columns import Piece
-from hdev_jax.logs.intervals import gaps, starts, trip_median
+from hdev_jax.logs.intervals import starts
 from hdev_jax.logs.ledger import Ledger
 
-__all__ = ["BAD_SHARE", "MAX_SPEED_MPS", "REVERSE_MPS", "Rows", "check_rows", "concatenate", "split_trips"]
+__all__ = ["BAD_SHARE", "MAX_POWER_W", "MAX_SPEED_MPS", "REVERSE_MPS", "Rows", "check_rows", "concatenate"]
 
 MAX_SPEED_MPS = 60.0  # contract §1: above, the column is in km/h or broken
 REVERSE_MPS = 0.5  # contract §1: down to −0.5 m/s a sensor's undershoot, set to 0
+MAX_POWER_W = 2e7  # no road vehicle draws it: the largest mining trucks have under 4 MW
 BAD_SHARE = 0.01  # contract §1: bad rows in needed columns, at most
 _SPEEDS = ("speed_mps", "speed_start_mps", "speed_end_mps")
 
@@ -104,15 +105,15 @@ def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
     rows = _one_vehicle(_check_order(rows, bad))
     if bad.any():
         total, count = len(bad), int(bad.sum())
-        told = "; ".join(f"{int(n)} with {why}" for why, n in reasons.items())
+        told = "; ".join(f"{n} with {why}" for why, (n, _) in reasons.items())
         if count > BAD_SHARE * total:
             raise InputError(
                 f"{rows.name}: {count} of {total} rows ({count / total:.1%}) cannot be used: {told}; the first is "
                 f"{rows.where(int(np.argmax(bad)))}; at most {BAD_SHARE:.0%} are dropped, so repair the log"
             )
         ledger = rows.ledger
-        for why, n in reasons.items():
-            ledger = ledger.add("dropped", why, count=n)
+        for why, (n, first) in reasons.items():
+            ledger = ledger.add("dropped", f"{why}; first in {rows.where(first)}", count=n)
         rows = replace(rows, ledger=ledger).take(~bad)
     return _clip_speeds(rows)
 
@@ -157,15 +158,15 @@ def _fill_durations(rows: Rows, sampled: bool) -> Rows:
     return replace(rows, data={**rows.data, "duration_s": x}, ledger=ledger if done else rows.ledger)
 
 
-def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarray, dict[str, int]]:
-    """Rows that lack what is needed, and how many for which reason (each row counts for its first)."""
+def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarray, dict[str, tuple[int, int]]]:
+    """Rows that lack what is needed; by reason how many, and the first (each row counts for its first reason)."""
     bad = np.zeros(len(rows.trip), bool)
-    reasons: dict[str, int] = {}
+    reasons: dict[str, tuple[int, int]] = {}
 
     def rule(out: np.ndarray, why: str) -> None:
         nonlocal bad
         if n := int((out & ~bad).sum()):
-            reasons[why] = n
+            reasons[why] = (n, int(np.argmax(out & ~bad)))
             bad = bad | out
 
     rule(rows.trip < 0, "no trip_id")
@@ -182,14 +183,21 @@ def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarra
     if "time_s" in rows.data:
         same = np.r_[False, (np.diff(rows.data["time_s"]) == 0) & (np.diff(rows.trip) == 0)]
         rule(same, "the same time_s as the row before, other values")
+    length = duration
+    if length is None and "time_s" in rows.data:
+        length = np.r_[np.where(np.diff(rows.trip) == 0, np.diff(rows.data["time_s"]), np.nan), np.nan]
+    if length is not None:
+        length = np.where(length > 0, length, np.nan)
     if "distance_m" in rows.data:
         rule(rows.data["distance_m"] < 0, "distance_m negative")
-        length = duration
-        if length is None:
-            length = np.r_[np.where(np.diff(rows.trip) == 0, np.diff(rows.data["time_s"]), np.nan), np.nan]
-        length = np.where(length > 0, length, np.nan)
-        too_far = rows.data["distance_m"] > 2.0 * MAX_SPEED_MPS * length
-        rule(too_far, "a distance_m that no vehicle covers in its time (is it cumulative, or in another unit?)")
+        if length is not None:
+            too_far = rows.data["distance_m"] > 2.0 * MAX_SPEED_MPS * length
+            rule(too_far, "a distance_m that no vehicle covers in its time (is it cumulative, or in another unit?)")
+    most = f"more than {MAX_POWER_W / 1e6:g} MW (is it in another unit, or a fault of the instrument?)"
+    if "battery_power_w" in rows.data:
+        rule(np.abs(rows.data["battery_power_w"]) > MAX_POWER_W, f"a battery power of {most}")
+    if "energy_wh" in rows.data and length is not None:
+        rule(np.abs(rows.data["energy_wh"]) * 3600.0 > MAX_POWER_W * length, f"an energy_wh that means {most}")
     return bad, reasons
 
 
@@ -238,76 +246,3 @@ def _clip_speeds(rows: Rows) -> Rows:
             why = f"between −{REVERSE_MPS} and 0 m/s, set to 0"
             ledger = ledger.add("clipped", why, count=int(low.sum()), column=c)
     return replace(rows, data=data, ledger=ledger)
-
-
-def split_trips(rows: Rows, edge_trim_s: float, sampled: bool) -> Rows:
-    """Ends of trips cut off, trips split at gaps, trips of one row dropped; ids 0, 1, … in the order of the rows."""
-    if len(rows.trip) == 0:
-        raise InputError(f"{rows.name}: no usable trip: no row is left")
-    if edge_trim_s > 0:
-        time = rows.data["time_s"] if "time_s" in rows.data else np.cumsum(rows.data["duration_s"])
-        edges = np.flatnonzero(starts(rows.trip))
-        sizes = np.diff(np.r_[edges, len(time)])
-        t0, t1 = np.repeat(time[edges], sizes), np.repeat(time[edges + sizes - 1], sizes)
-        out = (time - t0 < edge_trim_s) | (t1 - time < edge_trim_s)
-        ledger = rows.ledger.add("trimmed", f"{edge_trim_s:g} s at both ends of each trip", count=int(out.sum()))
-        rows = replace(rows, ledger=ledger).take(~out)
-        if len(rows.trip) == 0:
-            raise InputError(f"{rows.name}: no usable trip: all are shorter than twice edge_trim_s = {edge_trim_s:g} s")
-    rows = _split_at_gaps(rows)
-    size = np.bincount(rows.trip, minlength=len(rows.trip_names))
-    single = size[rows.trip] == 1
-    if single.all():
-        raise InputError(f"{rows.name}: no usable trip: each has a single row; a trip needs two or more")
-    if single.any():
-        ledger = rows.ledger.add("dropped", "a trip of one row", count=int(single.sum()))
-        rows = replace(rows, ledger=ledger).take(~single)
-    used = rows.trip[starts(rows.trip)]
-    lost = sorted(set(range(len(size))) - set(used.tolist()) - set(np.flatnonzero(size == 1).tolist()))
-    ledger = rows.ledger
-    for t in lost:
-        ledger = ledger.add("dropped", "no row of this trip is left", trip=rows.trip_names[t])
-    new = np.full(len(size), -1, np.int64)
-    new[used] = np.arange(len(used))
-    cars = list(dict.fromkeys(rows.vehicle[starts(rows.vehicle)].tolist()))
-    car = np.full(len(rows.vehicle_names), -1, np.int64)
-    car[cars] = np.arange(len(cars))
-    return replace(
-        rows,
-        trip=new[rows.trip],
-        vehicle=car[rows.vehicle],
-        trip_names=tuple(rows.trip_names[t] for t in used),
-        vehicle_names=tuple(rows.vehicle_names[c] for c in cars),
-        ledger=ledger,
-    )
-
-
-def _split_at_gaps(rows: Rows) -> Rows:
-    """A gap longer than ten samples starts a new trip `name/2` with a clock of its own."""
-    if "time_s" not in rows.data:
-        return rows
-    time = rows.data["time_s"]
-    opens = gaps(rows.trip, time, rows.data.get("duration_s"))
-    if not opens.any():
-        return rows
-    trip, names, ledger, origin = rows.trip.copy(), list(rows.trip_names), rows.ledger, rows.origin_s.copy()
-    step = np.r_[np.nan, np.diff(time)]
-    step[starts(rows.trip)] = np.nan
-    usual = trip_median(step, rows.trip)
-    ends = np.r_[np.flatnonzero(starts(rows.trip))[1:], len(trip)]
-    part: dict[int, int] = {}
-    for i in np.flatnonzero(opens):  # over gaps, of which there are few
-        old = int(rows.trip[i])
-        part[old] = part.get(old, 1) + 1
-        while (name := f"{rows.trip_names[old]}/{part[old]}") in names:
-            part[old] += 1
-        stop = int(ends[np.searchsorted(ends, i, "right")])
-        trip[i:stop], origin[i:stop] = len(names), time[i]
-        names.append(name)
-        ledger = ledger.add(
-            "split",
-            f"a gap of {step[i]:.6g} s, more than ten samples of {usual[i]:.6g} s; the rows after it are trip '{name}'",
-            file=rows.pieces[int(rows.piece[i])].file,
-            trip=rows.trip_names[old],
-        )
-    return replace(rows, trip=trip, origin_s=origin, trip_names=tuple(names), ledger=ledger)

@@ -21,7 +21,10 @@ __all__ = [
 ]
 
 
-FIRST, LAST = "first_row_of_trip", "last_row_of_trip"  # channels, where they have been worked out before
+# Channels that are worked out once; the colon keeps them apart from any column that a log may bring.
+FIRST, LAST = "derived:first_row_of_trip", "derived:last_row_of_trip"
+DISTANCE_SINCE_START = "derived:distance_since_start_m"
+TIME_SINCE_BRAKING = "derived:time_since_braking_s"
 
 
 def trip_bounds(segments: Segments) -> tuple[Int[Array, " row"], Int[Array, " row"]]:

@@ -5,20 +5,20 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.physics import battery, losses, road, sensors
+from hdev_jax.physics import battery, loads, losses, road, sensors, tyres
 from hdev_jax.physics.across import with_bounds
 from hdev_jax.physics.effect import STAGES, Effect
 from hdev_jax.segments import Segments
 
 __all__ = ["DECLARED", "LIBRARY", "at_null", "derived", "library", "unavailable"]
 
-DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, road.Aero, battery.Auxiliary)
+DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, road.Aero, loads.Auxiliary)
 
 
 def _all() -> dict[str, type[Effect]]:
     found = [
         c
-        for module in (sensors, road, losses, battery)
+        for module in (sensors, road, tyres, losses, loads, battery)
         for c in (getattr(module, name) for name in module.__all__)
         if isinstance(c, type) and issubclass(c, Effect) and c.parameters
     ]

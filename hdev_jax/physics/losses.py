@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from hdev_jax.physics.across import time_since_braking
+from hdev_jax.physics.across import TIME_SINCE_BRAKING, time_since_braking
 from hdev_jax.physics.effect import Effect, Parameter
 
 __all__ = ["BrakeDrag", "CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "IronLoss"]
@@ -46,13 +46,13 @@ class BrakeDrag(Effect):
     tau_s: Any
 
     def derive(self, segments):
-        if segments.has("time_since_braking_s"):  # worked out before
+        if segments.has(TIME_SINCE_BRAKING):  # worked out before
             return segments
-        return segments.with_channels(time_since_braking_s=time_since_braking(segments))
+        return segments.with_channels(**{TIME_SINCE_BRAKING: time_since_braking(segments)})
 
     def drive(self, row, car, point):
         moving = row.speed_mps > 0.1
-        since = row.channels["time_since_braking_s"]
+        since = row.channels[TIME_SINCE_BRAKING]
         return self.force_n * jnp.where(moving & (since > 0), jnp.exp(-since / self.tau_s), 0.0)
 
 

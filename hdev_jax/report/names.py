@@ -18,6 +18,7 @@ _EFFECTS = {
     "traction": "traction",
     "auxiliary_power": "constant auxiliary load",
     "hvac_power": "cabin heating and cooling",
+    "passenger_heat": "warmth of the passengers",
     "cabin_warmup": "cabin warm-up",
     "periodic_load": "periodic load",
     "standstill_load": "load at standstill",

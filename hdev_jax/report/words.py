@@ -163,6 +163,28 @@ def remaining(data: ReportData) -> str:
     return text
 
 
+SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
+
+
+def _suspect(summary: dict[str, Any]) -> dict[str, Any] | None:
+    """The candidate that looks best of those that no sign, range or declared coefficient rules out."""
+    ruled_out = ("absorbed", "its best size", "found", "declared", "the mean of")
+    able = [
+        c for c in summary.get("candidates", [])
+        if _finite(c.get("score")) and c["score"] > SUSPICIOUS and not str(c.get("why_not", "")).startswith(ruled_out)
+    ]  # fmt: skip
+    return max(able, key=lambda c: c["score"], default=None)
+
+
+def _unnamed(summary: dict[str, Any]) -> str:
+    """Whether the library has no word for what is left, or has one that did not clear the bar."""
+    if suspect := _suspect(summary):
+        return (
+            f"could not be named with confidence (the nearest is {names.effect(suspect['id'])}: {suspect['why_not']})"
+        )
+    return "the library does not hold"
+
+
 def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     """The answer as (text, bold) pieces, so that a page can mark names without trusting them."""
     s = data.summary
@@ -170,10 +192,10 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     if effects:
         text = f"The declared model misses {_missing(effects)}: {_where(data)} {_errors(data)}."
         if "unexplained" in verdict:
-            text += f" \x02Something more\x03 is missing that the library does not hold: {remaining(data)}."
+            text += f" \x02Something more\x03 is missing that {_unnamed(s)}: {remaining(data)}."
     elif "unexplained" in verdict:
         share = s.get("unexplained", {}).get("share_of_test_variance")
-        text = f"\x02Something is missing that the library does not hold\x03: {remaining(data)}."
+        text = f"\x02Something is missing that {_unnamed(s)}\x03: {remaining(data)}."
         if _finite(share):
             text += (
                 f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left."
@@ -181,7 +203,13 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     else:
         tried = sum(c.get("score") is not None for c in s.get("candidates", []))
         test = s["after"]["test"]
-        text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
+        if suspect := _suspect(s):
+            text = (
+                f"\x02Not decidable on this log\x03: {names.effect(suspect['id'])} would explain part of what is left, "
+                f"but {suspect['why_not']}; more trips would tell; "
+            )
+        else:
+            text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
         text += (
             f"{_where(data)} the error is {pair(test.get('rmse'), test.get('rmse'))[1]}{NBSP}{data.unit} RMSE per row"
         )

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import jax
 
-from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose, prepare
+from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
+from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.inference.sheet import read_sheet

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
-from hdev_jax.diagnosis.diagnose import Problem, prepare
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import Found, Search, Verdict
 from hdev_jax.diagnosis.memory import from_plain, to_plain
+from hdev_jax.diagnosis.problem import Problem, prepare
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet

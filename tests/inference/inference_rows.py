@@ -7,7 +7,7 @@ import numpy as np
 
 from hdev_jax.inference import Coefficient, ParameterTable
 from hdev_jax.physics import Driveline, Grouped, Machine, Vehicle
-from hdev_jax.physics.battery import Auxiliary
+from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.segments import Segments
 

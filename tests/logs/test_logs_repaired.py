@@ -70,6 +70,14 @@ def test_bad_rows_of_an_interval_log(tmp_path, column):
     assert log.ledger.count("dropped") == 1
 
 
+@pytest.mark.parametrize(("frame", "column"), [(samples(), "battery_power_w"), (intervals(), "energy_wh")])
+def test_a_power_that_no_vehicle_has_is_dropped_and_its_row_is_named(tmp_path, frame, column):
+    frame.loc[7, column] = 4e8
+    log = read(tmp_path, frame)
+    assert len(log) == len(frame) - 1
+    assert any("20 MW" in e.reason and "row 8" in e.reason for e in log.ledger)
+
+
 def test_missing_distance_and_duration_are_made_from_the_rest(tmp_path):
     frame = intervals()
     whole = read(tmp_path, frame)

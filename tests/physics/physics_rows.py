@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.physics import LIBRARY, Driveline, Effect, Machine, Vehicle, at_null
-from hdev_jax.physics.battery import Auxiliary
 from hdev_jax.physics.effect import Grouped
+from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.physics.road import Aero, Grade, Inertia, RoadGrade, Rolling
 from hdev_jax.segments import Segments
 
@@ -52,6 +52,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "cooling_power": {"w_per_k": 90.0, "start_c": 24.3},
     "friction_blending": {"share": 0.3},
     "hvac_power": {"below_w_per_k": 150.0, "above_w_per_k": 110.0, "heat_c": 15.3, "cool_c": 21.7},
+    "passenger_heat": {"w_per_passenger": 45.0},
     "periodic_load": {"power_w": 4000.0, "period_s": 11.0, "duty": 0.4, "phase": 0.1},
     "regen_cutoff": {"speed_mps": 4.6},
     "regen_limit": {"power_w": 3.1e4},
@@ -121,6 +122,7 @@ def drives(
         "gap_m": rng.uniform(5.0, 90.0, n),
         "door_open": (within == 1).astype(float),
         "brake_pressure_pa": pressure,
+        "passengers": rng.integers(0, 90, n).astype(float),
         "gear": rng.integers(1, 5, n).astype(float),
         "traction_force_n": np.where(within == 2, 0.0, rng.normal(2e3, 8e3, n)),
         "motor_torque_nm": np.where(within == 2, 0.0, rng.normal(60.0, 200.0, n)),

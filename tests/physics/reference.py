@@ -104,6 +104,11 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
     if p := effects.get("hvac_power"):
         t = r["ambient_temp_c"]
         power += p["below_w_per_k"] * max(p["heat_c"] - t, 0) + p["above_w_per_k"] * max(t - p["cool_c"], 0)
+    if p := effects.get("passenger_heat"):
+        t, hvac = r["ambient_temp_c"], effects.get("hvac_power", {"heat_c": 18.0, "cool_c": 22.0})
+        cooled = 1 / (1 + math.exp(hvac["cool_c"] - t))
+        heated = 1 / (1 + math.exp(t - hvac["heat_c"]))
+        power += p["w_per_passenger"] * r["passengers"] * (cooled - heated)
     if p := effects.get("cabin_warmup"):
         power += p["power_w"] * math.exp(-(r["time_s"] + dt / 2) / p["tau_s"])
     if (p := effects.get("friction_blending")) and r["brake_pressure_pa"] > p["above_pa"] and power < 0:

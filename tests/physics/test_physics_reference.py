@@ -31,7 +31,7 @@ CAR = {
 REFERENCED = (
     "grade_lag", "grade_bias", "mass_scale", "speed_scale", "time_skew", "sampling_filter", "power_gain",
     "headwind", "rolling_temperature", "tyre_warmup", "cornering", "brake_drag", "driveline_drag", "gear_efficiency",
-    "copper_loss", "iron_loss", "auxiliary_power", "hvac_power", "cabin_warmup", "friction_blending",
+    "copper_loss", "iron_loss", "auxiliary_power", "hvac_power", "passenger_heat", "cabin_warmup", "friction_blending",
     "battery_resistance", "regen_limit",
 )  # fmt: skip
 SEEDS = st.integers(0, 10_000)

@@ -1,0 +1,83 @@
+"""A log, a sheet and a target brought together: what the verbs that fit or predict begin with."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from hdev_jax.diagnosis.metrics import sum_weight
+from hdev_jax.inference import ParameterTable, padded
+from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
+from hdev_jax.logs import Log
+from hdev_jax.physics import Vehicle
+from hdev_jax.physics.vehicle import Target
+from hdev_jax.segments import Segments
+
+__all__ = ["UNITS", "Problem", "prepare"]
+
+UNITS = {"energy_wh": "Wh", "battery_power_kw": "kW", "motor_torque_nm": "Nm", "traction_force_n": "N"}
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A log, a sheet and a target brought together."""
+
+    log: Log
+    sheet: Sheet
+    target: Target
+    segments: Segments  # without what the target would leak
+    measured: np.ndarray
+    vehicle: Vehicle
+    table: ParameterTable
+    notes: tuple[str, ...]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the target."""
+        return UNITS[self.target]
+
+    def rows(self, trips: Sequence[int]) -> np.ndarray:
+        """Mask of these trips' rows."""
+        return np.isin(self.segments.trip, trips)
+
+    def weight(self) -> np.ndarray:
+        """What each row weighs in a sum."""
+        return sum_weight(self.target, np.asarray(self.segments.duration_s), np.asarray(self.segments.distance_m))
+
+    def predict(self, vehicle: Vehicle) -> np.ndarray:
+        """The target's column by this vehicle on every row of the log."""
+        rows = padded(self.segments, self.measured)
+        return np.asarray(_column(vehicle, rows.segments, self.target))[: rows.rows]
+
+
+@eqx.filter_jit
+def _column(vehicle: Vehicle, segments: Segments, target: Target) -> jax.Array:
+    return vehicle.predict(segments, target)
+
+
+def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured: bool = True) -> Problem:
+    """The vehicle of a sheet for this log and target, with the chain entered where the log measures it.
+
+    Raises `InputError` where the log does not measure the target, or the sheet lacks what is in use.
+    """
+    derived = target == "traction_force_n" and target not in log.targets and log.segments.has("motor_torque_nm")
+    name: Any = target or log.default_target
+    if derived:
+        measured = np.asarray(traction_force_from_torque(log.segments, sheet))
+    else:
+        measured = log.target(name) if need_measured else np.zeros(len(log))
+    segments = log.segments
+    if name == "traction_force_n":
+        segments = segments.without("traction_force_n", "motor_torque_nm")
+    elif name == "motor_torque_nm":
+        segments = segments.without("motor_torque_nm")
+    built = sheet.build(segments, choose_entry(segments, name), name, vehicle_names=log.vehicle_names)
+    notes = list(built.notes)
+    if derived:
+        notes.append("traction_force_n is not logged: it is motor torque · ratio / wheel radius · η^sign(torque)")
+    if not segments.has("grade_rad") and built.vehicle.entry == "road":
+        notes.append("the log has no slope: the declared model takes the road as flat")
+    return Problem(log, sheet, name, segments, measured, built.vehicle, built.table, tuple(notes))

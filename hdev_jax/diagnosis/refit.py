@@ -1,0 +1,160 @@
+"""Joint refits: the vehicle with a candidate, every free coefficient fitted anew, and whether it stands."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.evidence import ABSORBED, Score
+from hdev_jax.diagnosis.look import (
+    Found,
+    Problem,
+    Search,
+    View,
+    best_of,
+    both_looks,
+    distance_from_table,
+    evidence_of,
+    plausible,
+    slow,
+)
+from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian
+from hdev_jax.physics import Vehicle
+
+__all__ = ["grow", "is_size", "refit"]
+
+GROWN = 1e-3  # p of a size that joins an effect found without it
+
+
+def refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
+    """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
+    s = _refined(problem, s, view)
+    effect = realised(s.candidate, s.beta, gears=problem.gears)
+    sizes = s.candidate.sizes
+    groups = [str(g) for g in s.candidate.groups if g is not None]
+    vehicle = state.fit.vehicle.plus(effect)
+    rows = effect_coefficients(effect, sizes, groups=groups)
+    rows = tuple(replace(r, free=False) if _idle(s.candidate, r.path) else r for r in rows)
+    table = state.table.plus(*rows)
+    fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
+    if not fit.converged and fit.steps < 5:
+        return None
+    if not _in_range(fit, s.candidate) or not _present(fit, s.candidate):
+        return None
+    gain = _gain(problem, state, fit, view)
+    return replace(state, vehicle=fit.vehicle, table=table, fit=fit), gain
+
+
+def _refined(problem: Problem, s: Score, view: View) -> Score:
+    """The same way to have the effect with its shapes on a finer grid: switches have many small optima.
+
+    Where trips alone tell it, the grid reaches a whole step to either side and least squares chooses on it: thresholds
+    of a few trips have many small optima for the joint refit to end in.
+    """
+    row_s = float(np.median(np.asarray(problem.rows.segments.duration_s)[: problem.rows.rows]))
+    grids = finer(s.candidate, row_s, reach=1.0 if s.plain else 0.5)
+    if all(len(g) == 1 for g in grids.values()):
+        return s
+    n = problem.rows.rows
+    effects = [s.candidate.effect]
+    found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
+    same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
+    evidence, plain = both_looks(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
+    if s.plain:
+        totals = plain.totals()
+        fits = [(*plain.gain(totals, c.columns), c) for c in same]
+        inside = [(gain, beta, c) for gain, beta, c in fits if plausible(replace(s, candidate=c, beta=beta))]
+        if not inside:
+            return s
+        _, beta, c = max(inside, key=lambda f: f[0])
+        return replace(s, candidate=c, beta=beta)
+    best, _ = best_of(evidence, plain, same, slow(matrix, problem.trip))
+    finest = best.get(s.candidate.id)
+    return finest if finest is not None and finest.gain > s.gain and not finest.plain else s
+
+
+def _present(fit: Calibration, candidate: Candidate) -> bool:
+    """Whether a size stands in the joint refit too, where rows weigh the same, at 1 % with errors clustered."""
+    if candidate.kind == "limit":
+        return True
+    at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes
+          and c.path.startswith(f"effects.{candidate.id}.")]  # fmt: skip
+    return bool(np.any(np.abs(fit.values[at]) > 2.6 * fit.sd[at]))
+
+
+def _idle(candidate: Candidate, path: str) -> bool:
+    """A shape that belongs to a size this candidate does not have."""
+    name = path.rpartition(".")[2]
+    return name not in candidate.sizes and all(name != n for n, _ in candidate.shapes)
+
+
+def _in_range(fit: Calibration, candidate: Candidate) -> bool:
+    prefix = f"effects.{candidate.id}."
+    for c, v in zip(fit.table.free, fit.values, strict=True):
+        if c.path.startswith(prefix):
+            p = candidate.parameter(c.path.removeprefix(prefix))
+            if p.kind == "size" and not p.lower <= v <= p.upper:
+                return False
+    return True
+
+
+def _gain(problem: Problem, state: Search, fit: Calibration, view: View) -> float:
+    """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
+    after = evidence_of(problem, fit, view.noise)
+    prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (state.fit, fit)]
+    before = view.evidence.base_likelihood(view.evidence.totals()) - prior[0]
+    return after.base_likelihood(after.totals()) - prior[1] - before
+
+
+def grow(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search | None:
+    """The state with a size more in one found effect, or None: heating was found, cooling may be there too.
+
+    An effect is found in the way that its first step shows best; once it is in, only a joint refit can show the rest.
+    """
+    for f in state.found:
+        c = f.score.candidate
+        for sizes in c.effect.variants:
+            if c.kind != "size" or not set(c.sizes) < set(sizes) or any(g is not None for g in c.groups):
+                continue
+            now = state.fit.vehicle.effect(f.id)
+            values = {p.name: getattr(now, p.name) for p in c.effect.parameters}
+            new = [n for n in sizes if n not in c.sizes]
+            values.update({n: np.asarray(c.parameter(n).scale) for n in new})
+            shapes = tuple(
+                (p.name, float(values[p.name])) for p in c.effect.parameters if p.kind in ("shape", "choice")
+            )
+            wider = replace(c, sizes=sizes, groups=(None,) * len(sizes), shapes=shapes)
+            effect = c.effect(**values)
+            rows = tuple(
+                replace(r, free=False) if _idle(wider, r.path) else r for r in effect_coefficients(effect, sizes)
+            )
+            vehicle, table = state.fit.vehicle.minus(f.id).plus(effect), state.table.minus(f.id).plus(*rows)
+            paths = {f"effects.{f.id}.{n}" for n in new}
+            if _left(problem, vehicle, table, paths) < ABSORBED:
+                continue
+            tell(f"refitting {f.id} with {', '.join(new)}")
+            fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
+            at = [k for k, r in enumerate(fit.table.free) if r.path in paths]
+            p = 2 * stats.t.sf(np.abs(fit.values[at] / fit.sd[at]), max(problem.clusters.count - 1, 1))
+            if fit.converged and _in_range(fit, wider) and np.all(p < GROWN):
+                found = [replace(g, score=replace(g.score, candidate=wider)) if g is f else g for g in state.found]
+                return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found)
+    return None
+
+
+def _left(problem: Problem, vehicle: Vehicle, table: ParameterTable, paths: set[str]) -> float:
+    """Smallest share of these coefficients' columns that the other coefficients do not hold."""
+    jac = jacobian(vehicle, table, problem.rows.segments, problem.target)[: problem.rows.rows]
+    new = np.array([r.path in paths for r in table.free])
+    own, others = jac[:, new], jac[:, ~new]
+    others = others / np.maximum(np.linalg.norm(others, axis=0), 1e-300)
+    x = np.linalg.lstsq(others.T @ others, others.T @ own, rcond=1e-10)[0]
+    rest = np.sum((own - others @ x) ** 2, axis=0)
+    return float(np.min(rest / np.maximum(np.sum(own**2, axis=0), 1e-300)))
+
+
+def is_size(path: str, f: Found) -> bool:
+    """Whether a coefficient is one of the sizes of a found effect."""
+    return any(path == f"effects.{f.id}.{name}" for name in f.score.candidate.sizes)

@@ -1,0 +1,174 @@
+"""The plain values of diagnosis.json, from where the loop ended."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hdev_jax.diagnosis.look import Found, Search
+from hdev_jax.diagnosis.metrics import metrics
+from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.split import Split
+from hdev_jax.diagnosis.unexplained import Remainder
+from hdev_jax.inference import Calibration, cluster_rows
+
+__all__ = ["baseline_block", "summarise"]
+
+ODD_SHARE = 0.2
+FAR = 2.0  # tabular standard deviations beyond which a coefficient has moved suspiciously far
+
+
+def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """The contract's `baseline.parameters`: value, sd, the table's, how far it moved, what it may have absorbed."""
+    block = {}
+    for c, value, sd, z in zip(fit.table.free, fit.values, fit.sd, fit.prior_z(), strict=True):
+        prior = {} if c.sd is None else {"prior_value": c.value, "prior_sd": c.sd, "prior_z": float(z)}
+        block[c.name] = {
+            "value": float(value), "sd": float(sd), "unit": c.unit, **prior, "absorbs": list(absorbs.get(c.name, ())),
+        }  # fmt: skip
+    return block
+
+
+def _effect_block(f: Found, fit: Calibration, before: float, after: float) -> dict[str, Any]:
+    c = f.score.candidate
+    prefix = f"effects.{f.id}."
+    parameters = {
+        row.name.removeprefix(prefix): {"value": float(v), "sd": float(s), "unit": row.unit}
+        for row, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
+        if row.path.startswith(prefix)
+    }
+    chosen = {p.name: p for p in c.effect.parameters if p.kind == "choice"}
+    for name, value in c.shapes:
+        if name in chosen:
+            parameters[name] = {"value": float(value), "sd": 0.0, "unit": chosen[name].unit}
+    return {
+        "id": f.id,
+        "stage": c.effect.stage,
+        "verdict": "one_of_class" if f.twins else "found",
+        "parameters": parameters,
+        "equation": c.effect.equation,
+        "separated_by": c.effect.separated_by,
+        "q_value": f.q_value,
+        "stability": f.stability,
+        "test_rmse_before": before,
+        "test_rmse_after": after,
+        "indistinguishable_from": list(f.twins),
+    }
+
+
+def summarise(
+    problem: Problem,
+    split: Split,
+    state: Search,
+    steps: list[Calibration],
+    predicted: list[np.ndarray],
+    left: Remainder,
+) -> dict[str, Any]:
+    weight, y = problem.weight(), problem.measured
+    train, test = problem.rows(split.train), problem.rows(split.test)
+
+    def block(p: np.ndarray) -> dict[str, Any]:
+        at = {problem.log.trip_names[i]: problem.rows([i]) for i in split.test}
+        return {
+            "train": metrics(y[train], p[train], weight[train]),
+            "test": metrics(y[test], p[test], weight[test]),
+            "test_by_trip": {k: metrics(y[m], p[m], weight[m]) for k, m in at.items()},
+        }
+
+    rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
+    effects = [{**_effect_block(f, steps[-1], rmse[k], rmse[k + 1]), "order": k + 1} for k, f in enumerate(state.found)]
+    verdict = {
+        (False, False): "nothing_missing",
+        (True, False): "effects_found",
+        (False, True): "unexplained_structure",
+        (True, True): "effects_found_and_unexplained_structure",
+    }[bool(effects), left.significant]
+    clusters = cluster_rows(problem.segments.take(train))
+    candidates = [{"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts]
+    considered = {c["id"] for c in candidates}
+    for e in state.fit.vehicle.effects:  # in the vehicle: nothing to turn down, but considered all the same
+        if e.parameters and e.id not in considered:
+            f = next((f for f in state.found if f.id == e.id), None)
+            here = (f.gain, f.q_value, "found") if f else (None, 1.0, "declared in the sheet")
+            candidates.append(dict(zip(("id", "score", "q_value", "why_not"), (e.id, *here), strict=True)))
+    return {
+        "schema": "hdev-diagnosis/1",
+        "target": problem.target,
+        "split": {
+            "train_trips": split.names(split.train),
+            "test_trips": split.names(split.test),
+            "unused_trips": split.names(split.unused),
+        },
+        "before": block(predicted[0]),
+        "after": block(predicted[-1]),
+        "baseline": {"parameters": baseline_block(steps[0], state.absorbs)},
+        "effects": effects,
+        "candidates": candidates,
+        "unexplained": {
+            "significant": left.significant,
+            "share_of_test_variance": left.share,
+            "noise_floor_rmse": left.noise_floor_rmse,
+            "depends_on": list(left.depends_on),
+            "signature": left.signature,
+        },
+        "verdict": verdict,
+        "parameters_fitted": _fitted(state),
+        "clusters": {"kind": clusters.kind, "count": clusters.count},
+        "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
+        "notes": [*problem.notes, *_warnings(steps, state), *_odd_rows(problem, predicted[0])],
+    }
+
+
+def _fitted(state: Search) -> int:
+    """Every fitted or grid-chosen number: free coefficients, and choices among more than one value."""
+    choices = sum(
+        len(p.grid) != 1
+        for f in state.found
+        for p in f.score.candidate.effect.parameters
+        if p.kind == "choice" and any(p.name == n for n, _ in f.score.candidate.shapes)
+    )
+    return len(state.table.free) + choices
+
+
+def _subsets(problem: Problem, test: np.ndarray, before: np.ndarray, after: np.ndarray) -> dict[str, Any]:
+    """Errors on parts of the test rows that mean something of their own."""
+    s, weight = problem.segments, problem.weight()
+    moving = np.asarray(s.speed_mps) > 2.0
+    parts = {"standing still": np.asarray(s.speed_mps) < 0.1, "above 2 m/s": moving}
+    if s.has("brake_pressure_pa") or s.has("brake_pedal_pct"):
+        brake = np.asarray(s.get("brake_pressure_pa", s.get("brake_pedal_pct", 0.0)))
+        off = brake < 0.005 * np.max(np.abs(brake))
+        parts["above 2 m/s, friction brake off"] = moving & off
+    y = problem.measured
+    return {
+        name: {k: metrics(y[m], p[m], weight[m]) for k, p in (("before", before), ("after", after))}
+        for name, rows in parts.items()
+        if (m := rows & test).sum() > 50
+    }
+
+
+def _warnings(steps: list[Calibration], state: Search) -> list[str]:
+    out = []
+    for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
+        if not fit.converged:
+            out.append(f"the fit of the {when} stopped early: {fit.message}")
+    for name, p in baseline_block(steps[0], state.absorbs).items():
+        if abs(p.get("prior_z", 0.0)) > FAR:
+            held = f"; on this log it cannot be told from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
+            out.append(f"{name} moved {p['prior_z']:+.1f} tabular sd to fit the declared model{held}")
+    return out
+
+
+def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
+    """A row that holds much of the whole log's squared error by itself, where there are many."""
+    square = (problem.measured - declared) ** 2
+    worst = int(np.argmax(square))
+    share = square[worst] / max(float(np.sum(square)), 1e-300)
+    if len(square) < 100 or share < ODD_SHARE:
+        return []
+    trip = problem.log.trip_names[int(np.asarray(problem.segments.trip)[worst])]
+    at = float(np.asarray(problem.segments.time_s)[worst])
+    return [
+        f"one row alone holds {100 * share:.0f} % of the declared model's squared error: trip {trip} at {at:.6g} s, "
+        f"{problem.target} = {problem.measured[worst]:.6g}; a faulty instrument there would ruin every fit"
+    ]

@@ -1,0 +1,124 @@
+"""How the verbs begin: the library with a user's effects, the logs read, the trips split, the run's configuration."""
+
+import difflib
+import hashlib
+import importlib.util
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from hdev_jax import progress
+from hdev_jax.diagnosis.problem import Problem, prepare
+from hdev_jax.diagnosis.split import Split, split_trips
+from hdev_jax.errors import InputError
+from hdev_jax.inference.sheet import Sheet, read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY, Effect, library
+from hdev_jax.rundir import Run
+
+__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "known_effects", "opened"]
+
+Paths = Sequence[str | Path]
+
+
+def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
+    """The library with a user's own effects: every `Effect` class that the Python file defines."""
+    if file is None:
+        return dict(LIBRARY)
+    path = Path(file)
+    spec = importlib.util.spec_from_file_location("hdev_user_effects", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise InputError(f"--effects {file}: no such Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as e:
+        raise InputError(f"--effects {file}: does not run: {type(e).__name__}: {e}") from e
+    own = [
+        c for c in vars(module).values()
+        if isinstance(c, type) and issubclass(c, Effect) and c.__module__ == module.__name__ and hasattr(c, "id")
+    ]  # fmt: skip
+    if not own:
+        raise InputError(f"--effects {file}: defines no subclass of hdev_jax.physics.Effect with an id")
+    try:
+        return library(own)
+    except ValueError as e:
+        raise InputError(f"--effects {file}: {e}") from e
+
+
+def chosen_effects(
+    file: str | Path | None, only: Sequence[str] | None, exclude: Sequence[str] | None
+) -> dict[str, type[Effect]]:
+    known = known_effects(file)
+    for name in (*(only or ()), *(exclude or ())):
+        if name not in known:
+            near = difflib.get_close_matches(name, list(known), 1)
+            hint = f"; did you mean {near[0]!r}?" if near else "; `hdev effects` lists them"
+            raise InputError(f"no effect {name!r} in the library{hint}")
+    chosen = {k: c for k, c in known.items() if (only is None or k in only) and k not in (exclude or ())}
+    if not chosen:
+        raise InputError("--only and --exclude leave no candidate")
+    return chosen
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What `diagnose` and `calibrate` start from: the log in its trips, the vehicle, what decides the result."""
+
+    sheet: Sheet
+    problem: Problem
+    split: Split
+    config: dict[str, Any]
+
+
+def opened(
+    verb: str,
+    logs: Paths,
+    vehicle: str | Path,
+    adapter: str | Path | None,
+    target: str | None,
+    train_trips: Sequence[str] | None,
+    test_trips: Sequence[str] | None,
+    effects: str | Path | None,
+    seed: int,
+) -> Opening:
+    """Read the logs and the sheet, bring them together and split the trips. Raises `InputError`."""
+    sheet = read_sheet(vehicle, library=known_effects(effects))
+    with progress.busy("reading the logs"):
+        log = read_log(list(logs), adapter)
+        split = split_trips(log, train_trips, test_trips)
+        problem = prepare(split.log, sheet, target)
+    progress.step(f"read {len(log)} rows of {len(log.trip_names)} trips")
+    config = {
+        "verb": verb,
+        "logs": [str(p) for p in logs],
+        "log_sha256": problem.log.fingerprint(),
+        "vehicle": str(vehicle),
+        "vehicle_sha256": digest(Path(vehicle)),
+        "adapter": None if adapter is None else str(adapter),
+        "target": problem.target,
+        "train_trips": split.names(split.train),
+        "test_trips": split.names(split.test),
+        "effects_file": None if effects is None else str(effects),
+        "effects_sha256": None if effects is None else digest(Path(effects)),
+        "seed": seed,
+        "x64": bool(jax.config.read("jax_enable_x64")),
+    }
+    return Opening(sheet, problem, split, config)
+
+
+def command_line(verb: str, run: Run) -> str:
+    c = run.config
+    parts = ["hdev", verb, *c["logs"], "--vehicle", c["vehicle"], "--target", c["target"]]
+    if c.get("adapter"):
+        parts += ["--adapter", c["adapter"]]
+    parts += ["--train-trips", ",".join(c["train_trips"]), "--test-trips", ",".join(c["test_trips"])]
+    return shlex.join([*parts, "--seed", str(c["seed"]), "--out", str(run.out)])

@@ -1,0 +1,75 @@
+"""From a run's results to what the page, the figures and the terminal show."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdev_jax.diagnosis.diagnose import Diagnosis
+from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.split import Split
+from hdev_jax.inference import padded
+from hdev_jax.report.data import ReportData
+from hdev_jax.report.words import answer
+
+__all__ = ["answer_text", "of_diagnosis", "report_data"]
+
+
+def report_data(
+    problem: Problem, split: Split, summary: dict[str, Any], before: np.ndarray, after: np.ndarray, command: str,
+    started: float, breakdown: dict[str, dict[str, float]] | None = None,
+) -> ReportData:  # fmt: skip
+    s = problem.segments
+    used = problem.rows((*split.train, *split.test))
+    return ReportData(
+        summary=summary,
+        vehicle=problem.sheet.name,
+        synthetic="synthetic" in f"{problem.sheet.name} {' '.join(problem.log.files)}".lower(),
+        unit=problem.unit,
+        rows={
+            "trip": np.asarray(s.trip),
+            "time_s": np.asarray(s.time_s),
+            "duration_s": np.asarray(s.duration_s),
+            "distance_m": np.asarray(s.distance_m),
+            "measured": problem.measured, "before": before, "after": after,
+            "test": problem.rows(split.test), "used": used,
+        },
+        channels={"speed_mps": np.asarray(s.speed_mps), **{k: np.asarray(v) for k, v in s.channels.items()}},
+        trip_names=problem.log.trip_names,
+        breakdown=breakdown or {},
+        ledger=problem.log.ledger.to_dicts(),
+        command=command,
+        seconds=time.time() - started,
+    )  # fmt: skip
+
+
+def of_diagnosis(result: Diagnosis, command: str, started: float) -> ReportData:
+    problem, split = result.problem, result.split
+    breakdown = {}
+    if problem.target in ("energy_wh", "battery_power_kw"):
+        test = padded(problem.segments.take(problem.rows(split.test)), problem.measured[problem.rows(split.test)])
+        n = test.rows
+        for when, car in (("before", result.before), ("after", result.after)):
+            parts = car.breakdown(test.segments)
+            breakdown[when] = {k: float(np.sum(np.asarray(v)[:n])) / 1e3 for k, v in parts.items()}
+    return report_data(
+        problem, split, result.summary, result.predicted_before, result.predicted_after, command, started, breakdown
+    )
+
+
+def answer_text(data: ReportData, out: Path) -> str:
+    s = data.summary
+    lines = [answer(data), "", f"{'':10s}{'test RMSE':>12s}{'energy/work error':>20s}   [{data.unit}]"]
+    for when in ("before", "after"):
+        m = s[when]["test"]
+        pe = "-" if m["pe_percent"] is None else f"{m['pe_percent']:+.2f} %"
+        lines.append(f"{when:10s}{m['rmse']:12.4g}{pe:>20s}")
+    for e in s["effects"]:
+        sizes = ", ".join(f"{k} {p['value']:.4g} ± {p['sd']:.2g} {p['unit']}" for k, p in e["parameters"].items())
+        twins = f"; not told from {', '.join(e['indistinguishable_from'])}" if e["indistinguishable_from"] else ""
+        lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")
+    lines.append(s["unexplained"]["signature"])
+    lines += [f"note: {note}" for note in s.get("notes", [])]
+    lines.append(str(out / "report.html"))
+    return "\n".join(lines)
