@@ -62,6 +62,7 @@ def diagnose(
     with open_run(out, config, seed=seed) as run:
         if run.done:
             return (run.work / "answer.txt").read_text()
+        progress.step(start.read)
         result = run_loop(problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
         progress.step("writing the report")
         data = of_diagnosis(result, command_line("diagnose", run), started)
@@ -107,7 +108,7 @@ def calibrate(
     with open_run(out, config, seed=seed) as run:
         if run.done:
             return (run.work / "answer.txt").read_text()
-        progress.step("calibrating")
+        progress.step(f"{start.read}; calibrating")
         train, test = problem.rows(split.train), problem.rows(split.test)
         rows = padded(problem.segments.take(train), problem.measured[train])
         fit = fit_map(

@@ -78,6 +78,11 @@ class Opening:
     split: Split
     config: dict[str, Any]
 
+    @property
+    def read(self) -> str:
+        """What was read, for the first line of progress: said once nothing more can be refused."""
+        return f"read {len(self.problem.log)} rows of {len(self.problem.log.trip_names)} trips"
+
 
 def opened(
     verb: str,
@@ -96,7 +101,6 @@ def opened(
         log = read_log(list(logs), adapter)
         split = split_trips(log, train_trips, test_trips)
         problem = prepare(split.log, sheet, target)
-    progress.step(f"read {len(log)} rows of {len(log.trip_names)} trips")
     config = {
         "verb": verb,
         "logs": [str(p) for p in logs],

@@ -54,13 +54,13 @@ def hdev(*argv: object) -> tuple[int, str]:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *argv: object) -> str:
-    """The one line of a command that the input is to blame for; progress lines begin with the seconds."""
+    """The one line, and no other, of a command that the input is to blame for."""
     capsys.readouterr()
     assert cli.main([str(a) for a in argv]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
     lines = [line for line in captured.err.splitlines() if line.startswith("hdev: ")]
-    assert captured.err.splitlines()[-1:] == lines
+    assert captured.err.splitlines() == lines
     assert "Traceback" not in captured.err
     return lines[0]
 

@@ -135,7 +135,7 @@ def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
     if s.left_out_gain <= LEFT_OUT:
         return "does not lower the error on trips left out of the fit"
     if s.p_cluster > s.p_model and q > 0.05:
-        return f"not the same in every trip (q = {q:.2g} with errors clustered)"
+        return f"too few trips or stretches of time bear it out (q = {q:.2g} with errors clustered)"
     if q > 0.05:
         return f"not significant over the whole library (q = {q:.2g})"
     return "explains less than what was chosen, or too little for the numbers it fits"

@@ -25,11 +25,15 @@ from hdev_jax.physics import Vehicle
 
 __all__ = ["grow", "is_size", "refit"]
 
+HOPELESS = 0.05  # p of a size in the linear step, where the refit asks for 0.01
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
 def refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
     """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
+    # one linear step from here says about what a refit of a size will: most that fail need not be fitted to know it
+    if s.candidate.kind == "size" and not s.plain and view.plain.plain_score(s.candidate).p_cluster > HOPELESS:
+        return None
     s = _refined(problem, s, view)
     effect = realised(s.candidate, s.beta, gears=problem.gears)
     sizes = s.candidate.sizes

@@ -160,11 +160,12 @@ def _warnings(steps: list[Calibration], state: Search) -> list[str]:
 
 
 def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
-    """A row that holds much of the whole log's squared error by itself, where there are many."""
+    """A row far beyond all others that holds much of the whole log's squared error by itself."""
     square = (problem.measured - declared) ** 2
     worst = int(np.argmax(square))
     share = square[worst] / max(float(np.sum(square)), 1e-300)
-    if len(square) < 100 or share < ODD_SHARE:
+    size = np.sort(np.abs(problem.measured))
+    if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) < 3.0 * size[-2]:
         return []
     trip = problem.log.trip_names[int(np.asarray(problem.segments.trip)[worst])]
     at = float(np.asarray(problem.segments.time_s)[worst])

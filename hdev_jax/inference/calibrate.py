@@ -113,7 +113,7 @@ def _solve(
         r = fit.weight * (insert(vehicle, structure, theta).predict(fit.segments, target) - fit.measured)
         return jnp.concatenate([r, (theta - prior) / prior_sd])
 
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
+    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
     z0 = jnp.zeros_like(start)
     sol = optx.least_squares(residuals, solver, z0, args=(vehicle, fit), max_steps=50, throw=False)
     theta = _to_support(sol.value, start, scale, structure)

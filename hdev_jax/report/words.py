@@ -164,6 +164,7 @@ def remaining(data: ReportData) -> str:
 
 
 SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
+DOUBTFUL = 0.5  # q from which on the clusters speak against it
 
 
 def _suspect(summary: dict[str, Any]) -> dict[str, Any] | None:
@@ -171,7 +172,8 @@ def _suspect(summary: dict[str, Any]) -> dict[str, Any] | None:
     ruled_out = ("absorbed", "its best size", "found", "declared", "the mean of")
     able = [
         c for c in summary.get("candidates", [])
-        if _finite(c.get("score")) and c["score"] > SUSPICIOUS and not str(c.get("why_not", "")).startswith(ruled_out)
+        if _finite(c.get("score")) and c["score"] > SUSPICIOUS and c["q_value"] < DOUBTFUL
+        and not str(c.get("why_not", "")).startswith(ruled_out)
     ]  # fmt: skip
     return max(able, key=lambda c: c["score"], default=None)
 
