@@ -16,7 +16,7 @@ def switch(output: Any, driving: Any, braking: Any) -> Array:
     zero; the slope there is the braking one ("otherwise" in equation 5). Finite for every output and every positive
     efficiency, forward and reverse, since neither branch divides by the output.
     """
-    return output * jnp.where(jnp.asarray(output) > 0, 1.0 / driving, braking)
+    return jnp.where(jnp.asarray(output) > 0, output / driving, output * braking)
 
 
 class Machine(eqx.Module):
