@@ -143,8 +143,13 @@ def grow(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search
             at = [k for k, r in enumerate(fit.table.free) if r.path in paths]
             p = 2 * stats.t.sf(np.abs(fit.values[at] / fit.sd[at]), max(problem.clusters.count - 1, 1))
             if fit.converged and _in_range(fit, wider) and np.all(p < GROWN):
-                found = [replace(g, score=replace(g.score, candidate=wider)) if g is f else g for g in state.found]
-                return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found)
+                by_path = {r.path: float(v) for r, v in zip(fit.table.free, fit.values, strict=True)}
+                beta = np.array([by_path[f"effects.{f.id}.{n}"] for n in sizes])
+                score = replace(f.score, candidate=wider, beta=beta)
+                found = [replace(g, score=score) if g is f else g for g in state.found]
+                # fits on the way here had the effect without the new size: they are run again where they are asked for
+                trail = {k: v for k, v in state.trail.items() if f.id not in k.split(",")}
+                return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found, trail=trail)
     return None
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "RoadGrade",
     "Rolling",
     "RotatingMass",
+    "StandstillHold",
     "air_density",
     "mean_square_speed",
 ]
@@ -278,3 +279,26 @@ class FrictionBrake(Effect):
     def force(self, row, car):
         brake = row.get("brake_pressure_pa", row.get("brake_pedal_pct", 0.0))
         return self.n_per_unit * jnp.where(row.speed_mps > 0.1, jnp.maximum(brake, 0.0), 0.0)
+
+
+class StandstillHold(Effect):
+    """At rest the brakes hold the vehicle: of the forces that the road asks for, the drive gives only what is left.
+
+    Only a measured force or torque can show it: at rest the drive's power is zero anyway.
+    """
+
+    id: ClassVar = "standstill_hold"
+    stage: ClassVar = "road"
+    equation: ClassVar = "−s·ΣF·[v < 0.1 m/s]"
+    source: ClassVar = "statics: a force that does not move is carried by the brakes"
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("share", "1", 0.0, 0.5, 0.0, 1.2, least=0.05),)
+    mistaken_for: ClassVar = ("rolling_speed",)
+    separated_by: ClassVar = "standing on a slope, with and without the brake"
+    order: ClassVar = 90
+    share: Any
+
+    def force(self, row, car):
+        others = (e for e in car.effects if e.overrides("force") and not isinstance(e, StandstillHold))
+        total = sum(e.force(row, car) for e in others)
+        return -self.share * jnp.where(row.speed_mps < 0.1, total, 0.0)

@@ -38,6 +38,7 @@ _EFFECTS = {
     "grade_lag": "lag of the slope",
     "road_grade": "road slope",
     "rotating_mass": "rotating mass",
+    "standstill_hold": "brakes that hold at rest",
     "driveline_drag": "drag torque of the driveline",
     "gear_efficiency": "efficiency by gear",
     "brake_drag": "brake drag",

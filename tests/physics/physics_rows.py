@@ -38,6 +38,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "rolling_speed": {"per_mps2": 3e-6},
     "rolling_temperature": {"per_k": -5e-5},
     "rotating_mass": {"factor": 0.06},
+    "standstill_hold": {"share": 0.9},
     "tyre_warmup": {"excess": 0.4, "distance_m": 300.0},
     "wet_road": {"excess": 0.3, "spray": 0.2},
     "brake_drag": {"force_n": 300.0, "tau_s": 20.0},

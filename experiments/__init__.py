@@ -1,0 +1,3 @@
+"""Thin runs: each is a config away from a table or a figure. `python -m experiments CONFIG --out DIR`."""
+
+__all__ = []

@@ -1,0 +1,129 @@
+"""Running an experiment: its tasks on all cores, each once for all time, and what it makes of their results.
+
+An experiment is a module with a `Config`, `tasks(config)` (plain dicts, each decides its result by itself),
+`run(task)` (plain values) and `collect(config, results, run)` (metrics, tables, figures). A task's result is kept
+under the fingerprint of the task and of the sources: what is done is not done again, what was killed resumes, and two
+runs share what they share.
+"""
+
+import hashlib
+import importlib
+import json
+import multiprocessing
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from experiments.config import expanded, resolve, typed
+from hdev_jax import progress
+from hdev_jax.errors import InputError
+from hdev_jax.rundir import atomic_file, config_digest, open_run
+
+__all__ = ["run_config", "run_tasks"]
+
+ROOT = Path(__file__).parents[1]
+EXPERIMENTS = ("planted",)
+TASKS_PER_PROCESS = 40  # a process that compiles for ever runs out of memory maps
+Result = tuple[dict[str, Any], dict[str, Any]]
+
+
+def run_config(
+    path: str | Path, sets: Sequence[str] = (), *, out: str | Path, workers: int = 1, kept: str | Path = "out/tasks"
+) -> list[dict[str, Any]]:
+    """Run a config, or each point of its sweep in a folder of its own under `out`. **Returns** their metrics."""
+    table = resolve(path, sets)
+    points = list(expanded(table, path))
+    found = []
+    for delta, config in points:
+        folder = Path(out) if len(points) == 1 else Path(out) / config_digest(config, "")[:12]
+        found.append({"sweep": delta, "folder": str(folder), **_run_one(config, path, folder, workers, Path(kept))})
+    if len(points) > 1:
+        with atomic_file(Path(out) / "sweep.json") as temporary:
+            Path(temporary).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
+    return found
+
+
+def _run_one(config: dict[str, Any], path: str | Path, out: Path, workers: int, kept: Path) -> dict[str, Any]:
+    module = _module(config, path)
+    parsed = typed(module.Config, config, path)
+    started = time.monotonic()
+    with open_run(out, {"config": parsed.model_dump(mode="json"), "sources": sources()}) as run:
+        if not run.done:
+            tasks = list(module.tasks(parsed))
+            results = list(run_tasks(module, tasks, workers=workers, kept=kept))
+            progress.step("tables and figures")
+            metrics = {**module.collect(parsed, results, run), "seconds": round(time.monotonic() - started, 1)}
+            run.path("metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+        return json.loads((run.work / "metrics.json").read_text())
+
+
+def _module(config: Mapping[str, Any], path: str | Path) -> ModuleType:
+    name = config.get("experiment")
+    if name not in EXPERIMENTS:
+        raise InputError(f"{path}, key experiment: one of {', '.join(EXPERIMENTS)} is expected, found {name!r}")
+    return importlib.import_module(f"experiments.{name}")
+
+
+def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: int, kept: Path) -> Iterator[Result]:
+    """`(task, result)` in the order of the tasks; those that are kept are read, the others run, `workers` at once."""
+    places = [_place(module, task, kept) for task in tasks]
+    todo = [i for i, p in enumerate(places) if not p.exists()]
+    progress.step(f"{len(tasks)} tasks, {len(tasks) - len(todo)} done before")
+    if workers > 1 and len(todo) > 1:
+        pool = ProcessPoolExecutor(
+            workers, multiprocessing.get_context("spawn"), _prepare_worker, max_tasks_per_child=TASKS_PER_PROCESS
+        )
+        try:
+            futures = {pool.submit(_call, module.__name__, tasks[i]): i for i in todo}
+            for future in progress.track(as_completed(futures), "running", total=len(todo)):
+                _keep(places[futures[future]], future.result())
+        finally:  # an interrupt keeps what is done and waits for nothing else
+            pool.shutdown(wait=False, cancel_futures=True)
+    else:
+        for n, i in enumerate(progress.track(todo, "running")):
+            if n % TASKS_PER_PROCESS == TASKS_PER_PROCESS - 1:
+                _forget_compiled()
+            _keep(places[i], module.run(tasks[i]))
+    for task, place in zip(tasks, places, strict=True):
+        yield task, json.loads(place.read_text())
+
+
+def _place(module: ModuleType, task: dict[str, Any], kept: Path) -> Path:
+    text = json.dumps([task, sources()], sort_keys=True)
+    return kept / module.__name__.rpartition(".")[2] / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
+
+
+def _keep(place: Path, result: dict[str, Any]) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(place) as temporary:
+        Path(temporary).write_text(json.dumps(result, allow_nan=False))
+
+
+def _call(module: str, task: dict[str, Any]) -> dict[str, Any]:
+    return importlib.import_module(module).run(task)
+
+
+def _prepare_worker() -> None:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+
+def _forget_compiled() -> None:
+    import jax
+
+    jax.clear_caches()
+
+
+@cache
+def sources() -> str:
+    """Fingerprint of every source file that a result may depend on."""
+    digest = hashlib.sha256()
+    for folder in ("hdev_jax", "experiments"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

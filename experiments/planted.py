@@ -1,0 +1,219 @@
+"""Does the diagnosis name what was planted, and nothing else? Synthetic logs with known truth, rivals on the same logs.
+
+One task is one log: made by the generator (which shares no code with the kernel), written and read as a customer's
+would be, diagnosed, and given to the rivals. *Size* is the RMS of what is planted after projecting off the declared
+coefficients, over the noise's. *Exactly it* is one entry: the planted id, or a class of at most three that holds it.
+"""
+
+import tempfile
+import time
+from collections.abc import Iterator
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from experiments.config import Strict
+from experiments.planted_figures import confusion_figure, false_figure, power_figure
+from experiments.rivals import run_rivals
+from experiments.tables import wilson, write_tables
+from hdev_jax.diagnosis.diagnose import diagnose
+from hdev_jax.diagnosis.problem import Problem, prepare
+from hdev_jax.diagnosis.split import Split, split_trips
+from hdev_jax.fleet import PLANTABLE, SyntheticLog, synthetic_log
+from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY, at_null
+from hdev_jax.rundir import Run
+
+__all__ = ["Case", "Config", "collect", "exact", "run", "tasks"]
+
+Noise = Literal["white", "ar1", "ar1_white", "trip_levels", "student_t", "trip_variance"]
+Rival = Literal["stlsq", "lasso_cv", "forward_bic", "lightgbm"]
+
+
+class Case(Strict):
+    """A block of logs: every effect set × size × number of trips × noise, `logs` of each."""
+
+    name: str
+    effects: list[list[str]] = Field(default_factory=lambda: [[]])
+    sizes: list[float] = Field(default_factory=lambda: [1.0])
+    trips: list[int] = Field(default_factory=lambda: [24])
+    noises: list[Noise] = Field(default_factory=lambda: ["ar1"])
+    logs: int = 10
+    rows_per_trip: int = 250
+    entry: Literal["road", "shaft", "wheel"] = "road"
+    mode: Literal["segments", "samples"] = "segments"
+    wanted: float | None = None  # least share named exactly (nothing planted: most share with something named)
+
+
+class Config(Strict):
+    """The study: cases, and what is shared by all of them. `seed` is the first log's; every log has its own."""
+
+    experiment: Literal["planted"]
+    cases: dict[str, Case]
+    seed: int = 1000
+    fdr: float = 0.05
+    ar_coefficient: float = 0.97
+    rivals: list[Rival] = Field(default_factory=list)
+
+
+def tasks(config: Config) -> Iterator[dict[str, Any]]:
+    """One for each log. A log's seed counts on through the whole study, so that no two share their noise."""
+    seed = config.seed
+    for case in config.cases.values():
+        for effects, size, trips, noise in product(case.effects, case.sizes, case.trips, case.noises):
+            for _ in range(case.logs):
+                yield {
+                    "case": case.name, "effects": effects, "size": size, "trips": trips, "noise": noise, "seed": seed,
+                    "rows_per_trip": case.rows_per_trip, "entry": case.entry, "mode": case.mode,
+                    "ar_coefficient": config.ar_coefficient, "fdr": config.fdr, "rivals": config.rivals,
+                }  # fmt: skip
+                seed += 1
+
+
+def run(task: dict[str, Any]) -> dict[str, Any]:
+    """One log through the whole loop."""
+    wanted = {k: {} for k in task["effects"]}
+    try:
+        synthetic = synthetic_log(
+            seed=task["seed"], trips=task["trips"], rows_per_trip=task["rows_per_trip"], effects=wanted,
+            ratio=task["size"] if wanted else None, noise=task["noise"], ar_coefficient=task["ar_coefficient"],
+            entry=task["entry"], mode=task["mode"],
+        )  # fmt: skip
+    except ValueError as e:
+        return {"skipped": str(e)}
+    with tempfile.TemporaryDirectory() as folder:
+        files = synthetic.write(folder, truth=False)
+        log, sheet = read_log([files["log"]]), read_sheet(files["sheet"])
+    problem, split = prepare(log, sheet), split_trips(log)
+    started = time.perf_counter()
+    result = diagnose(problem, split, LIBRARY, fdr=task["fdr"], seed=0)
+    seconds = time.perf_counter() - started
+    summary = result.summary
+    named = [{"id": e["id"], "class": [e["id"], *e["indistinguishable_from"]]} for e in summary["effects"]]
+    return {
+        "named": named,
+        "exact": exact(task["effects"], [n["class"] for n in named]),
+        "verdict": summary["verdict"],
+        "unexplained": summary["unexplained"]["significant"],
+        "absorbed": sorted({a for p in summary["baseline"]["parameters"].values() for a in p["absorbs"]}),
+        "why_not": {c["id"]: c["why_not"] for c in summary["candidates"] if c["id"] in task["effects"]},
+        "sizes": sizes(synthetic, summary["effects"]),
+        "test_rmse": {k: summary[k]["test"]["rmse"] for k in ("before", "after")},
+        "oracle_rmse": oracle(synthetic, problem, split),
+        "ratio": synthetic.ratio if wanted else 0.0,
+        "seconds": seconds,
+        "rivals": run_rivals(list(task["rivals"]), problem, split),
+    }
+
+
+def exact(planted: list[str], classes: list[list[str]]) -> bool:
+    """Every planted effect has one entry that holds it, and there is no other entry."""
+    left = list(planted)
+    for names in classes:
+        hit = next((p for p in left if p in names), None)
+        if hit is None or len(names) > 3:
+            return False
+        left.remove(hit)
+    return not left
+
+
+def sizes(synthetic: SyntheticLog, found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Planted and found sizes of what was named itself."""
+    out = []
+    for e in found:
+        planted = synthetic.vehicle.effects.get(e["id"], {})
+        size = PLANTABLE[e["id"]].size if planted else ()
+        for name, p in e["parameters"].items():
+            if name in size and planted.get(name) and p["sd"] > 0:
+                out.append({"id": e["id"], "name": name, "true": planted[name], "found": p["value"], "sd": p["sd"]})
+    return out
+
+
+def oracle(synthetic: SyntheticLog, problem: Problem, split: Split) -> float | None:
+    """Test error of the declared model with what was planted, its sizes refitted on the same training trips.
+
+    Where the library does not hold it in the same form, the noise of the test trips: no model does better.
+    """
+    test, train = problem.rows(split.test), problem.rows(split.train)
+    planted = synthetic.vehicle.effects
+    vehicle, table = problem.vehicle, problem.table
+    for id_, values in planted.items():
+        names = {p.name for p in LIBRARY[id_].parameters} if id_ in LIBRARY else set()
+        if not set(values) <= names:
+            return float(np.sqrt(np.mean(synthetic.truth["noise"].to_numpy()[test] ** 2)))
+        null = at_null(LIBRARY[id_])
+        leaves = {p.name: getattr(null, p.name) for p in LIBRARY[id_].parameters}
+        limits = {p.name for p in LIBRARY[id_].parameters if p.kind == "limit" and p.name not in values}
+        leaves |= {k: np.asarray(float(v)) for k, v in values.items()} | dict.fromkeys(limits)
+        effect = LIBRARY[id_](**leaves)
+        vehicle = vehicle.plus(effect)
+        fitted = [p.name for p in LIBRARY[id_].parameters if p.kind in ("size", "limit") and values.get(p.name)]
+        table = table.plus(*effect_coefficients(effect, fitted, shapes=False))
+    rows = padded(problem.segments.take(train), problem.measured[train])
+    fit = calibrate(vehicle, table, rows, problem.target, cluster_rows(problem.segments.take(train)))
+    return float(np.sqrt(np.mean((problem.measured - problem.predict(fit.vehicle))[test] ** 2)))
+
+
+def collect(config: Config, results: list[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:
+    """Tables and figures of the study; `metrics.json`."""
+    done = [(t, r) for t, r in results if "skipped" not in r]
+    skipped = [{"seed": t["seed"], "effects": t["effects"], "why": r["skipped"]} for t, r in results if "skipped" in r]
+    rows = [_row(config, name, group) for name, group in grouped(done)]
+    write_tables(run, "planted", rows, f"Planted effects, synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
+    power_figure(run, done, config.rivals)
+    false_figure(run, done, config.rivals)
+    confusion_figure(run, done)
+    missed = [r["setting"] for r in rows if r["wanted"] is not None and not r["met"]]
+    return {
+        "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "rows": rows, "logs": len(done),
+        "skipped": skipped, "missed": missed,
+    }  # fmt: skip
+
+
+def grouped(done: list[tuple[dict[str, Any], dict[str, Any]]]) -> list[tuple[str, list]]:
+    """Logs by setting: the case, the size, the number of trips and the noise."""
+    groups: dict[str, list] = {}
+    for task, result in done:
+        size = f", size {task['size']:g}" if task["effects"] else ""
+        key = f"{task['case']}{size}, {task['trips']} trips, {task['noise']}"
+        groups.setdefault(key, []).append((task, result))
+    return list(groups.items())
+
+
+def _row(config: Config, setting: str, group: list) -> dict[str, Any]:
+    """What the table says of one setting, ours first."""
+    first = group[0][0]
+    n, planted = len(group), bool(first["effects"])
+    in_library = all(k in LIBRARY for t, _ in group for k in t["effects"])
+    exactly = sum(r["exact"] for _, r in group)
+    false = sum(any(not set(x["class"]) & set(t["effects"]) for x in r["named"]) for t, r in group)
+    pairs = [s for _, r in group for s in r["sizes"]]
+    z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
+    ratio = np.array([r["test_rmse"]["after"] / r["oracle_rmse"] for _, r in group if r["oracle_rmse"]])
+    wanted = next((c.wanted for c in config.cases.values() if c.name == first["case"]), None)
+    share = exactly / n if planted and in_library else false / n
+    row = {
+        "setting": setting, "n": n,
+        "named_exactly": exactly / n if planted and in_library else None,
+        "something_false": false / n,
+        "interval_95": list(wilson(exactly if planted and in_library else false, n)),
+        "called_unexplained": sum(r["unexplained"] for _, r in group) / n,
+        "mean_class": float(np.mean([len(x["class"]) for _, r in group for x in r["named"]] or [0.0])),
+        "size_within_3_sd": float(np.mean(z < 3)) if len(z) else None,
+        "size_covered_90": float(np.mean(z < 1.645)) if len(z) else None,
+        "within_5_percent_of_oracle": float(np.mean(ratio < 1.05)) if len(ratio) else None,
+        "seconds": float(np.median([r["seconds"] for _, r in group])),
+        "wanted": wanted,
+        "met": None if wanted is None else bool(share >= wanted if planted and in_library else share <= wanted),
+    }  # fmt: skip
+    for name in config.rivals:
+        named = [(set(t["effects"]), set(r["rivals"][name]["named"])) for t, r in group]
+        row[f"{name}_exactly"] = float(np.mean([a == b for a, b in named])) if planted and in_library else None
+        row[f"{name}_false"] = float(np.mean([bool(b - a) for a, b in named]))
+        error = [r["rivals"][name]["test_rmse"] / r["oracle_rmse"] for _, r in group if r["oracle_rmse"]]
+        row[f"{name}_test_over_oracle"] = float(np.median(error)) if error else None
+    return row

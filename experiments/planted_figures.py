@@ -1,0 +1,132 @@
+"""Figures of the planted study: power against size, false discoveries against noise, confusion between causes."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.tables import wilson
+from hdev_jax.physics import LIBRARY
+from hdev_jax.report.canvas import figure, png, style, tidy
+from hdev_jax.rundir import Run
+
+__all__ = ["confusion_figure", "false_figure", "power_figure"]
+
+Done = Sequence[tuple[dict[str, Any], dict[str, Any]]]
+COLOURS = {"ours": "#1b4f8a", "stlsq": "#c26a1f", "lasso_cv": "#3d8a5f", "forward_bic": "#8a3d6f"}
+LABELS = {"ours": "hdev_jax", "stlsq": "STLSQ (PySINDy)", "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}
+
+
+def _named(result: dict[str, Any], method: str, planted: list[str]) -> tuple[bool, bool]:
+    """Whether exactly what was planted was named, and whether anything else was."""
+    if method == "ours":
+        return result["exact"], any(not set(n["class"]) & set(planted) for n in result["named"])
+    named = set(result["rivals"][method]["named"])
+    return named == set(planted), bool(named - set(planted))
+
+
+def _methods(rivals: Sequence[str]) -> list[str]:
+    return ["ours", *(r for r in rivals if r in COLOURS)]
+
+
+def styled(draw: Callable[..., None]) -> Callable[..., None]:
+    """The project's look while a figure is drawn and saved."""
+
+    @functools.wraps(draw)
+    def inside(*args: Any, **kwargs: Any) -> None:
+        with style():
+            draw(*args, **kwargs)
+
+    return inside
+
+
+def _save(run: Run, fig: Any, name: str) -> None:
+    run.path("figures", f"{name}.png").write_bytes(png(fig))
+    fig.savefig(run.path("figures", f"{name}.pdf"), metadata={"CreationDate": None, "Creator": None, "Producer": None})
+
+
+@styled
+def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
+    """Share named exactly, against the size of what was planted; single effects that the library holds."""
+    single = [(t, r) for t, r in done if len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
+    if not single:
+        return
+    fig = figure(6.4, 3.8)
+    axes = fig.add_subplot()
+    for method in _methods(rivals):
+        for trips, dashes in zip(sorted({t["trips"] for t, _ in single}), ("--", "-", ":", "-."), strict=False):
+            points = []
+            for size in sorted({t["size"] for t, _ in single}):
+                hits = [
+                    _named(r, method, t["effects"])[0] for t, r in single if (t["size"], t["trips"]) == (size, trips)
+                ]
+                if hits:
+                    points.append((size, np.mean(hits), *wilson(sum(hits), len(hits))))
+            if points:
+                x, y, low, high = np.array(points).T
+                axes.plot(x, 100 * y, dashes, color=COLOURS[method], marker="o", ms=4,
+                          label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
+                axes.fill_between(x, 100 * low, 100 * high, color=COLOURS[method], alpha=0.12, lw=0)
+    axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(0, 102),
+             ylabel="named exactly [%]", title="Synthetic logs with one planted effect")  # fmt: skip
+    sizes = sorted({t["size"] for t, _ in single})
+    axes.set_xticks(sizes, [f"{s:g}" for s in sizes])
+    axes.minorticks_off()
+    tidy(axes)
+    fig.legend(fontsize=7, loc="outside right center")
+    _save(run, fig, "power")
+
+
+@styled
+def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
+    """Share of logs with nothing planted in which something was named, by colour of the noise."""
+    empty = [(t, r) for t, r in done if not t["effects"]]
+    if not empty:
+        return
+    noises = list(dict.fromkeys(t["noise"] for t, _ in empty))
+    methods = _methods(rivals)
+    fig = figure(6.8, 3.6)
+    axes = fig.add_subplot()
+    for i, method in enumerate(methods):
+        for k, noise in enumerate(noises):
+            hits = [_named(r, method, [])[1] for t, r in empty if t["noise"] == noise]
+            low, high = wilson(sum(hits), len(hits))
+            x, y = k + 0.8 * (i + 0.5) / len(methods) - 0.4, float(np.mean(hits))
+            axes.bar(x, 100 * y, 0.75 / len(methods), color=COLOURS[method], label=LABELS[method] if k == 0 else None)
+            axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
+    axes.axhline(5, color="#333", lw=0.8, ls=":")
+    axes.set_xticks(range(len(noises)), [n.replace("_", " ") for n in noises], fontsize=8)
+    axes.set(ylabel="something named [%]", ylim=(0, 102), title="Synthetic logs with nothing missing")
+    tidy(axes)
+    fig.legend(fontsize=7, loc="outside right center")
+    _save(run, fig, "false_discoveries")
+
+
+@styled
+def confusion_figure(run: Run, done: Done) -> None:
+    """What was named (columns) where one effect was planted (rows), in per cent of its logs."""
+    single = [(t, r) for t, r in done if len(t["effects"]) == 1]
+    if not single:
+        return
+    planted = list(dict.fromkeys(t["effects"][0] for t, _ in single))
+    others = {n["id"] for t, r in single for n in r["named"]} - set(planted)
+    columns = [p for p in planted if p in LIBRARY] + sorted(others) + ["nothing"]
+    share = np.zeros((len(planted), len(columns)))
+    for i, p in enumerate(planted):
+        logs = [r for t, r in single if t["effects"][0] == p]
+        for r in logs:
+            hit = [p if p in n["class"] else n["id"] for n in r["named"]] or ["nothing"]
+            for name in hit:
+                share[i, columns.index(name)] += 100 / len(logs)
+    fig = figure(0.32 * len(columns) + 2.2, 0.3 * len(planted) + 1.8)
+    axes = fig.add_subplot()
+    image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
+    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(planted)), planted, fontsize=7)
+    for i, k in zip(*np.nonzero(share >= 0.5), strict=True):
+        axes.text(k, i, f"{share[i, k]:.0f}", ha="center", va="center", fontsize=6,
+                  color="white" if share[i, k] > 55 else "#222")  # fmt: skip
+    axes.set(xlabel="named", ylabel="planted", title="Synthetic logs: what was named [%]")
+    fig.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
+    _save(run, fig, "confusion")

@@ -1,0 +1,68 @@
+"""A second size joins an effect that was found with one; and a state that has grown is kept like any other."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from hdev_jax.diagnosis import look as looks
+from hdev_jax.diagnosis.candidates import columns
+from hdev_jax.diagnosis.memory import from_plain, to_plain
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.refit import grow, refit
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import calibrate, cluster_rows, padded
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
+
+HVAC = {"below_w_per_k": 900.0, "heat_c": 14.0, "cool_c": 20.0}
+
+
+def silent(_: str) -> None:
+    return None
+
+
+def heating_found(folder, above_w_per_k: float):
+    """A log with heating and so much cooling, and the state of a loop that has found the heating alone."""
+    effects = {"hvac_power": {**HVAC, "above_w_per_k": above_w_per_k}}
+    files = synthetic_log(seed=4, trips=20, rows_per_trip=80, effects=effects, noise_level=0.02).write(folder)
+    problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
+    rows = padded(problem.segments, problem.measured)
+    clusters = cluster_rows(problem.segments)
+    library = [LIBRARY["hvac_power"]]
+    loop = looks.Problem(rows, problem.target, clusters, library, 0.05, np.random.default_rng(0), 4)
+    declared = looks.Search(
+        problem.vehicle, problem.table, calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    )
+    view = looks.look(loop, declared)
+    found, _, _ = columns(problem.vehicle, library, rows.segments, rows.rows, problem.target)
+    heating = [c for c in found if c.sizes == ("below_w_per_k",)]
+    total = view.evidence.totals()
+    best = max(heating, key=lambda c: view.evidence.gain(total, c.columns)[0])
+    score = view.evidence.score(best)
+    tried = refit(loop, declared, score, view)
+    assert tried is not None
+    state, gain = tried
+    state.found = [looks.Found("hvac_power", score, 1e-9, 1.0, (), gain)]
+    return problem, loop, state
+
+
+def test_cooling_joins_the_heating_that_was_found(tmp_path):
+    problem, loop, state = heating_found(tmp_path, 700.0)
+    grown = grow(loop, state, silent)
+    assert grown is not None
+    candidate = grown.found[0].score.candidate
+    assert candidate.sizes == ("below_w_per_k", "above_w_per_k")
+    size = {c.name: (v, s) for c, v, s in zip(grown.table.free, grown.fit.values, grown.fit.sd, strict=True)}
+    for name, true in (("below_w_per_k", 900.0), ("above_w_per_k", 700.0), ("heat_c", 14.0), ("cool_c", 20.0)):
+        value, sd = size[f"effects.hvac_power.{name}"]
+        assert abs(value - true) < 3 * sd, f"{name}: {value:.3g} ± {sd:.2g}, planted {true}"
+    assert grown.fit.sigma < state.fit.sigma
+    assert grow(loop, grown, silent) is None
+    again = from_plain(to_plain(grown), problem.vehicle, LIBRARY, 4)
+    np.testing.assert_array_equal(problem.predict(again.fit.vehicle), problem.predict(grown.fit.vehicle))
+    np.testing.assert_array_equal(again.table.values(again.fit.vehicle), jnp.asarray(grown.fit.values))
+
+
+def test_nothing_joins_where_nothing_is(tmp_path):
+    _, loop, state = heating_found(tmp_path, 0.0)
+    assert grow(loop, state, silent) is None

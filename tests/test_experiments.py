@@ -1,0 +1,111 @@
+"""The experiment engine: configs that extend and sweep, one line for a fault, tasks done once, a tiny study."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.config import expanded, resolve, typed
+from experiments.engine import run_config
+from experiments.planted import Config, exact, tasks
+from experiments.tables import wilson
+from hdev_jax.errors import InputError
+
+STUDIES = Path(__file__).parents[1] / "configs" / "studies"
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_delta_changes_the_keys_it_names_and_no_other(tmp_path):
+    write(tmp_path, "base.toml", "a = 1\n[t]\nb = 2\nc = [1, 2]\n")
+    delta = write(tmp_path, "delta.toml", 'extends = "base.toml"\n[t]\nc = [3]\n')
+    assert resolve(delta) == {"a": 1, "t": {"b": 2, "c": [3]}}
+    assert resolve(delta, ["t.b=5", "name=plain text"]) == {"a": 1, "t": {"b": 5, "c": [3]}, "name": "plain text"}
+
+
+def test_a_sweep_is_a_grid_whose_points_share_nothing(tmp_path):
+    path = write(tmp_path, "s.toml", 'a = 1\n[t]\nb = 2\n[sweep]\n"t.b" = [3, 4]\na = [5, 6]\n')
+    points = list(expanded(resolve(path), path))
+    assert [d for d, _ in points] == [{"t.b": b, "a": a} for b in (3, 4) for a in (5, 6)]
+    assert [(c["t"]["b"], c["a"]) for _, c in points] == [(3, 5), (3, 6), (4, 5), (4, 6)]
+
+
+@pytest.mark.parametrize(
+    ("text", "sets", "words"),
+    [
+        ('experiment = "planted"\nsed = 1\n[cases]\n', [], ["key sed", "known keys", "seed"]),
+        ('experiment = "planted"\nseed = "one"\n[cases]\n', [], ["key seed", "integer", "'one'"]),
+        ('experiment = "planted"\n[cases.a]\nname = "x"\nnoises = ["pink"]\n', [], ["cases.a.noises.0", "'pink'"]),
+        ('experiment = "unheard"\n', [], ["key experiment", "planted", "'unheard'"]),
+        ("experiment = planted\n", [], ["is not TOML"]),
+        ('extends = "none.toml"\n', [], ["none.toml", "no such config"]),
+        ('experiment = "planted"\n[cases]\n', ["seed"], ["--set 'seed'", "key=value"]),
+        ('experiment = "planted"\nsweep = 3\n[cases]\n', [], ["sweep", "list of values"]),
+    ],
+)
+def test_a_config_at_fault_is_one_line_with_its_place(tmp_path, text, sets, words):
+    path = write(tmp_path, "c.toml", text)
+    with pytest.raises(InputError) as caught:
+        run_config(path, sets, out=tmp_path / "out", kept=tmp_path / "kept")
+    line = str(caught.value)
+    assert "\n" not in line
+    assert all(w in line for w in words), line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("path", sorted(STUDIES.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_study_is_a_config(path):
+    config = typed(Config, resolve(path), path)
+    every = list(tasks(config))
+    assert every
+    assert len({t["seed"] for t in every}) == len(every), "each log has its own noise"
+
+
+@pytest.mark.parametrize(
+    ("planted", "classes", "is_exact"),
+    [
+        (["a"], [["a"]], True),
+        (["a"], [["b", "a"]], True),
+        (["a"], [["a"], ["b"]], False),
+        (["a"], [["b"]], False),
+        (["a"], [["a", "b", "c", "d"]], False),
+        (["a", "b"], [["b"], ["a"]], True),
+        (["a", "b"], [["b", "a"]], False),
+        ([], [], True),
+        ([], [["a"]], False),
+    ],
+)
+def test_what_counts_as_exactly_it(planted, classes, is_exact):
+    assert exact(planted, classes) == is_exact
+
+
+def test_intervals_of_shares():
+    low, high = wilson(5, 100)
+    assert low == pytest.approx(0.0215, abs=1e-3)  # R: prop.test(5, 100, correct = FALSE)
+    assert high == pytest.approx(0.1118, abs=1e-3)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+@pytest.mark.slow
+def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
+    def once(out: str) -> dict:
+        (metrics,) = run_config(STUDIES / "planted_quick.toml", out=tmp_path / out, kept=tmp_path / "kept")
+        return metrics
+
+    first = once("a")
+    assert first["logs"] == 4
+    assert first["synthetic"] is True
+    assert first["skipped"] == []
+    rows = {r["setting"]: r for r in first["rows"]}
+    assert rows["one effect, size 1, 12 trips, ar1"]["named_exactly"] == 1.0
+    assert rows["nothing planted, 12 trips, ar1"]["something_false"] == 0.0
+    for name in ("tables/planted.md", "tables/planted.tex", "figures/power.png", "figures/confusion.pdf"):
+        assert (tmp_path / "a" / name).stat().st_size > 200
+    monkeypatch.setattr("experiments.planted.run", lambda task: pytest.fail(f"run again: {task}"))
+    again = once("b")
+    assert again["rows"] == first["rows"]
+    assert json.loads((tmp_path / "b" / "metrics.json").read_text())["rows"] == first["rows"]
