@@ -18,7 +18,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a key (repeatable)")
     parser.add_argument("--out", type=Path, required=True, help="the run's folder")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (0: one for each core)")
-    parser.add_argument("--tasks", type=Path, default=Path("out/tasks"), help="where results of tasks are kept")
+    parser.add_argument("--tasks", type=Path, help="a folder for results of tasks that runs share")
     options = parser.parse_args(argv)
     import jax
 

@@ -8,8 +8,10 @@ runs share what they share.
 
 import hashlib
 import importlib
+import itertools
 import json
 import multiprocessing
+import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -19,6 +21,7 @@ from types import ModuleType
 from typing import Any
 
 from experiments.config import expanded, resolve, typed
+from experiments.page import write_page
 from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import atomic_file, config_digest, open_run
@@ -27,36 +30,45 @@ __all__ = ["run_config", "run_tasks"]
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ("planted",)
-TASKS_PER_PROCESS = 40  # a process that compiles for ever runs out of memory maps
+FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
 Result = tuple[dict[str, Any], dict[str, Any]]
 
 
 def run_config(
-    path: str | Path, sets: Sequence[str] = (), *, out: str | Path, workers: int = 1, kept: str | Path = "out/tasks"
+    path: str | Path, sets: Sequence[str] = (), *, out: str | Path, workers: int = 1, kept: str | Path | None = None
 ) -> list[dict[str, Any]]:
-    """Run a config, or each point of its sweep in a folder of its own under `out`. **Returns** their metrics."""
+    """Run a config, or each point of its sweep in a folder of its own under `out`. **Returns** their metrics.
+
+    **Arguments:** `kept`, a folder for the results of tasks that other runs may share; without it a run keeps them in
+    its own folder until it is complete, and the points of a sweep share one under `out`.
+    """
     table = resolve(path, sets)
     points = list(expanded(table, path))
     found = []
     for delta, config in points:
         folder = Path(out) if len(points) == 1 else Path(out) / config_digest(config, "")[:12]
-        found.append({"sweep": delta, "folder": str(folder), **_run_one(config, path, folder, workers, Path(kept))})
+        shared = Path(kept) if kept is not None else None if len(points) == 1 else Path(out) / "tasks"
+        found.append({"sweep": delta, "folder": str(folder), **_run_one(config, path, folder, workers, shared)})
     if len(points) > 1:
         with atomic_file(Path(out) / "sweep.json") as temporary:
             Path(temporary).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
     return found
 
 
-def _run_one(config: dict[str, Any], path: str | Path, out: Path, workers: int, kept: Path) -> dict[str, Any]:
+def _run_one(config: dict[str, Any], path: str | Path, out: Path, workers: int, kept: Path | None) -> dict[str, Any]:
     module = _module(config, path)
     parsed = typed(module.Config, config, path)
     started = time.monotonic()
-    with open_run(out, {"config": parsed.model_dump(mode="json"), "sources": sources()}) as run:
+    resolved = {"config": parsed.model_dump(mode="json"), "sources": sources()}
+    with open_run(out, resolved, seed=config.get("seed")) as run:
         if not run.done:
             tasks = list(module.tasks(parsed))
-            results = list(run_tasks(module, tasks, workers=workers, kept=kept))
+            own = run.path(".tasks")
+            results = list(run_tasks(module, tasks, workers=workers, kept=kept or own))
             progress.step("tables and figures")
             metrics = {**module.collect(parsed, results, run), "seconds": round(time.monotonic() - started, 1)}
+            write_page(run, metrics)
+            shutil.rmtree(own, ignore_errors=True)
             run.path("metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
         return json.loads((run.work / "metrics.json").read_text())
 
@@ -74,20 +86,21 @@ def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: i
     todo = [i for i, p in enumerate(places) if not p.exists()]
     progress.step(f"{len(tasks)} tasks, {len(tasks) - len(todo)} done before")
     if workers > 1 and len(todo) > 1:
-        pool = ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), _prepare_worker, max_tasks_per_child=TASKS_PER_PROCESS
-        )
+        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare_worker)
         try:
             futures = {pool.submit(_call, module.__name__, tasks[i]): i for i in todo}
             for future in progress.track(as_completed(futures), "running", total=len(todo)):
                 _keep(places[futures[future]], future.result())
-        finally:  # an interrupt keeps what is done and waits for nothing else
+            pool.shutdown()
+        except BaseException:  # an interrupt keeps what is done and waits for nothing else
+            workers_now = list((getattr(pool, "_processes", None) or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in workers_now:
+                process.terminate()
+            raise
     else:
-        for n, i in enumerate(progress.track(todo, "running")):
-            if n % TASKS_PER_PROCESS == TASKS_PER_PROCESS - 1:
-                _forget_compiled()
-            _keep(places[i], module.run(tasks[i]))
+        for i in progress.track(todo, "running"):
+            _keep(places[i], _call(module.__name__, tasks[i]))
     for task, place in zip(tasks, places, strict=True):
         yield task, json.loads(place.read_text())
 
@@ -103,7 +116,14 @@ def _keep(place: Path, result: dict[str, Any]) -> None:
         Path(temporary).write_text(json.dumps(result, allow_nan=False))
 
 
+_calls = itertools.count(1)
+
+
 def _call(module: str, task: dict[str, Any]) -> dict[str, Any]:
+    if next(_calls) % FORGET_EVERY == 0:
+        import jax
+
+        jax.clear_caches()
     return importlib.import_module(module).run(task)
 
 
@@ -111,12 +131,6 @@ def _prepare_worker() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-
-
-def _forget_compiled() -> None:
-    import jax
-
-    jax.clear_caches()
 
 
 @cache

@@ -88,7 +88,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         files = synthetic.write(folder, truth=False)
         log, sheet = read_log([files["log"]]), read_sheet(files["sheet"])
-    problem, split = prepare(log, sheet), split_trips(log)
+    split = split_trips(log)
+    problem = prepare(split.log, sheet)
     started = time.perf_counter()
     result = diagnose(problem, split, LIBRARY, fdr=task["fdr"], seed=0)
     seconds = time.perf_counter() - started
@@ -167,9 +168,12 @@ def collect(config: Config, results: list[tuple[dict[str, Any], dict[str, Any]]]
     power_figure(run, done, config.rivals)
     false_figure(run, done, config.rivals)
     confusion_figure(run, done)
-    missed = [r["setting"] for r in rows if r["wanted"] is not None and not r["met"]]
+    missed = [r["name"] for r in rows if r["wanted"] is not None and not r["met"]]
     return {
-        "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "rows": rows, "logs": len(done),
+        "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "logs": len(done),
+        "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k not in ("name", "paper")}}
+                 for r in rows],
+        "better_than_paper": 0, "of": 0,
         "skipped": skipped, "missed": missed,
     }  # fmt: skip
 
@@ -180,6 +184,7 @@ def grouped(done: list[tuple[dict[str, Any], dict[str, Any]]]) -> list[tuple[str
     for task, result in done:
         size = f", size {task['size']:g}" if task["effects"] else ""
         key = f"{task['case']}{size}, {task['trips']} trips, {task['noise']}"
+        key += "" if task["entry"] == "road" else f", {task['entry']}"
         groups.setdefault(key, []).append((task, result))
     return list(groups.items())
 
@@ -190,6 +195,7 @@ def _row(config: Config, setting: str, group: list) -> dict[str, Any]:
     n, planted = len(group), bool(first["effects"])
     in_library = all(k in LIBRARY for t, _ in group for k in t["effects"])
     exactly = sum(r["exact"] for _, r in group)
+    alone = sum(r["exact"] and all(len(x["class"]) == 1 for x in r["named"]) for _, r in group)
     false = sum(any(not set(x["class"]) & set(t["effects"]) for x in r["named"]) for t, r in group)
     pairs = [s for _, r in group for s in r["sizes"]]
     z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
@@ -197,8 +203,9 @@ def _row(config: Config, setting: str, group: list) -> dict[str, Any]:
     wanted = next((c.wanted for c in config.cases.values() if c.name == first["case"]), None)
     share = exactly / n if planted and in_library else false / n
     row = {
-        "setting": setting, "n": n,
+        "name": setting, "n": n, "paper": None,
         "named_exactly": exactly / n if planted and in_library else None,
+        "named_exactly_no_class": alone / n if planted and in_library else None,
         "something_false": false / n,
         "interval_95": list(wilson(exactly if planted and in_library else false, n)),
         "called_unexplained": sum(r["unexplained"] for _, r in group) / n,
@@ -212,7 +219,8 @@ def _row(config: Config, setting: str, group: list) -> dict[str, Any]:
     }  # fmt: skip
     for name in config.rivals:
         named = [(set(t["effects"]), set(r["rivals"][name]["named"])) for t, r in group]
-        row[f"{name}_exactly"] = float(np.mean([a == b for a, b in named])) if planted and in_library else None
+        names_effects = name != "lightgbm" and planted and in_library
+        row[f"{name}_exactly"] = float(np.mean([a == b for a, b in named])) if names_effects else None
         row[f"{name}_false"] = float(np.mean([bool(b - a) for a, b in named]))
         error = [r["rivals"][name]["test_rmse"] / r["oracle_rmse"] for _, r in group if r["oracle_rmse"]]
         row[f"{name}_test_over_oracle"] = float(np.median(error)) if error else None

@@ -111,6 +111,8 @@ def opened(
         "target": problem.target,
         "train_trips": split.names(split.train),
         "test_trips": split.names(split.test),
+        "asked_train": None if train_trips is None else list(train_trips),
+        "asked_test": None if test_trips is None else list(test_trips),
         "effects_file": None if effects is None else str(effects),
         "effects_sha256": None if effects is None else digest(Path(effects)),
         "seed": seed,
@@ -120,9 +122,16 @@ def opened(
 
 
 def command_line(verb: str, run: Run) -> str:
+    """The command that makes this run again: the split as the user gave it, and options off their defaults."""
     c = run.config
     parts = ["hdev", verb, *c["logs"], "--vehicle", c["vehicle"], "--target", c["target"]]
-    if c.get("adapter"):
-        parts += ["--adapter", c["adapter"]]
-    parts += ["--train-trips", ",".join(c["train_trips"]), "--test-trips", ",".join(c["test_trips"])]
+    lists = {"train-trips": "asked_train", "test-trips": "asked_test", "only": "only", "exclude": "exclude"}
+    for option, key in lists.items():
+        if c.get(key):
+            parts += [f"--{option}", ",".join(c[key])]
+    single = {"adapter": "adapter", "effects": "effects_file", "fdr": "fdr", "method": "method", "noise": "noise"}
+    usual = {"fdr": 0.05, "method": "map", "noise": "normal"}
+    for option, key in single.items():
+        if c.get(key) is not None and c[key] != usual.get(key):
+            parts += [f"--{option}", str(c[key])]
     return shlex.join([*parts, "--seed", str(c["seed"]), "--out", str(run.out)])

@@ -30,6 +30,7 @@ __all__ = [
     "canonical_name",
     "conversion",
     "parse_column",
+    "registry",
     "to_si",
     "unit_of",
 ]
@@ -183,7 +184,7 @@ COLUMNS: dict[str, str] = {_canonical(stem): stem for stem in _STEMS}
 
 
 @cache
-def _registry() -> Any:
+def registry() -> Any:
     """The one pint registry, built at the first conversion; pint's application registry is left alone."""
     import pint
 
@@ -193,7 +194,7 @@ def _registry() -> Any:
 @cache
 def _affine(unit: str, to: str) -> tuple[float, float]:
     """`(offset, factor)` from `unit` to `to`. Raises pint's errors where there is no such conversion."""
-    reg = _registry()
+    reg = registry()
     zero = float(reg.Quantity(0.0, unit).to(to).magnitude)
     factor = 1.0 if unit == to else float(reg.Quantity(1.0, unit).to(to).magnitude) - zero
     if "degree_" in to or "degree_" in unit:  # with an offset the difference of two readings loses digits: round it off
@@ -223,7 +224,7 @@ def _is_unit(word: str) -> bool:
     if any(word in kind for kind in _SUFFIXES.values() if word):
         return True
     try:
-        return word in _registry()
+        return word in registry()
     except Exception:  # pint parses what it is asked: `in` fails in many ways on words that are no unit
         return False
 

@@ -100,10 +100,16 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     assert first["logs"] == 4
     assert first["synthetic"] is True
     assert first["skipped"] == []
-    rows = {r["setting"]: r for r in first["rows"]}
+    rows = {r["name"]: r["ours"] for r in first["rows"]}
     assert rows["one effect, size 1, 12 trips, ar1"]["named_exactly"] == 1.0
     assert rows["nothing planted, 12 trips, ar1"]["something_false"] == 0.0
-    for name in ("tables/planted.md", "tables/planted.tex", "figures/power.png", "figures/confusion.pdf"):
+    for name in (
+        "tables/planted.md",
+        "tables/planted.tex",
+        "figures/power.png",
+        "figures/confusion.pdf",
+        "report.html",
+    ):
         assert (tmp_path / "a" / name).stat().st_size > 200
     monkeypatch.setattr("experiments.planted.run", lambda task: pytest.fail(f"run again: {task}"))
     again = once("b")

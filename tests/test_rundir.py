@@ -26,9 +26,10 @@ CONFIG = {
 
 # Computes stage one, then waits in stage two to be killed.
 VICTIM = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from hdev_jax.rundir import open_run
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
 with open_run(sys.argv[1], {"verb": "demo"}) as run:
     run.checkpoint("one", lambda: {"value": 1})
     run.path("figures", "half.png").write_bytes(b"half")

@@ -1,15 +1,18 @@
 """The loop end to end on one log: from a sheet to what it misses, with the error before and after."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hdev_jax.diagnosis.expression import find_expression
+from hdev_jax.diagnosis.look import Problem as LoopProblem
 from hdev_jax.diagnosis.look import Search, Verdict
 from hdev_jax.diagnosis.memory import from_plain, to_plain
+from hdev_jax.diagnosis.next_drive import advise
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.select import search
 from hdev_jax.diagnosis.split import Split
@@ -85,19 +88,55 @@ def diagnose(
             lambda p=predicted: _remainder(problem, split, p[-1], p[0], seed, tell).__dict__,
         )
         left = Remainder(**plain)
-        shadow = _shadow(problem, state, predicted, train, left)
+        found_formula = checkpoint(
+            f"formula-{round_}", lambda s=state, p=predicted[-1]: _formula(problem, s, rows, p, fdr, seed, gears, tell)
+        )
+        if found_formula:
+            left = _described(problem, split, left, found_formula, predicted[-1])
+        stand_ins = found_formula["superfluous"] if found_formula else []
+        shadow = stand_ins[0] if stand_ins else _shadow(problem, state, predicted, train, left)
         if shadow is None or round_ == MOST_SHADOWS:
             break
         tell(f"taking {shadow} out: what is left is larger than what it explains")
         state = _without(problem, state, shadow, rows)
     base = steps[0]
     summary = summarise(problem, split, state, steps, predicted, left)
+    rivals = [(f.id, library[t]) for f in state.found for t in f.twins if t in library]
+    if rivals:
+        tell("what to measure next: drives that would tell the rest apart")
+        drives = checkpoint("next", lambda: [asdict(a) for a in advise(problem, state, rows, rivals)])
+        summary["next_drives"] = drives
     found = {
         e["id"]: {k: (p["value"], p["sd"], p["unit"]) for k, p in e["parameters"].items()} for e in summary["effects"]
     }
     return Diagnosis(
         problem, split, summary, base.vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
     )
+
+
+def _formula(
+    problem: Problem, state: Search, rows: Fit, predicted: np.ndarray, fdr: float, seed: int, gears: int, tell: Tell
+) -> dict[str, Any]:
+    """A formula for what is left, as plain values; empty where none clears the bar."""
+    tell("what is left: a formula from the log's own channels")
+    clusters = cluster_rows(rows.segments.take(np.arange(rows.rows)))
+    loop = LoopProblem(rows, problem.target, clusters, (), fdr, np.random.default_rng([seed, 999]), gears)
+    found = find_expression(state, loop, problem.segments, predict=problem.predict)
+    if found is None:
+        return {}
+    rms = float(np.sqrt(np.mean((found.predicted - predicted) ** 2)))
+    return {
+        "formula": found.formula, "channels": list(found.channels), "rms": rms, "predicted": found.predicted,
+        "superfluous": list(found.superfluous),
+    }  # fmt: skip
+
+
+def _described(
+    problem: Problem, split: Split, left: Remainder, found: Mapping[str, Any], predicted: np.ndarray
+) -> Remainder:
+    test = problem.rows(split.test)
+    error = [float(np.sqrt(np.mean((problem.measured - p)[test] ** 2))) for p in (predicted, found["predicted"])]
+    return left.described(found["formula"], found["channels"], found["rms"], problem.unit, (error[0], error[1]))
 
 
 def _shadow(

@@ -133,6 +133,15 @@ class Evidence:
             self.left(totals, candidate.columns),
         )  # fmt: skip
 
+    def estimate(self, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+        """A candidate's coefficients and their standard errors from clusters left out in turn."""
+        at = self.base + np.asarray(candidate.columns)
+        likelihood, x = self._fit(self.totals(), at)
+        v = int(np.argmax(likelihood))
+        beta, g = x[v, self.base :], self.count
+        spread = self._jackknife(at, v)[:, self.base :] - beta
+        return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
+
     def plain_score(self, candidate: Candidate) -> Score:
         """A candidate's tests where rows are as they were measured and only clusters count as independent.
 

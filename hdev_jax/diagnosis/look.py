@@ -167,14 +167,17 @@ def distance_from_table(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
     return fit.values - prior, sd
 
 
-def look(problem: Problem, state: Search) -> View:
-    """Whiten, gather and score everything once."""
+Made = tuple[list[Candidate], np.ndarray, dict[str, str]]
+
+
+def look(problem: Problem, state: Search, made: Made | None = None) -> View:
+    """Whiten, gather and score everything once: the problem's effects, or candidates `made` elsewhere."""
     rows, n = problem.rows, problem.rows.rows
     residual = problem.measured - state.fit.predicted
     noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
     car = state.fit.vehicle
     jac = jacobian(car, state.table, rows.segments, problem.target)[:n]
-    candidates, matrix, left_out = columns(car, problem.effects, rows.segments, n, problem.target)
+    candidates, matrix, left_out = made or columns(car, problem.effects, rows.segments, n, problem.target)
     evidence, plain = both_looks(problem, state.fit, noise, jac, matrix, residual)
     best, ways = best_of(evidence, plain, candidates, slow(matrix, problem.trip))
     for id_ in {c.id for c in candidates} - set(best):

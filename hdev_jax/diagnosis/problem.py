@@ -47,9 +47,9 @@ class Problem:
         """What each row weighs in a sum."""
         return sum_weight(self.target, np.asarray(self.segments.duration_s), np.asarray(self.segments.distance_m))
 
-    def predict(self, vehicle: Vehicle) -> np.ndarray:
-        """The target's column by this vehicle on every row of the log."""
-        rows = padded(self.segments, self.measured)
+    def predict(self, vehicle: Vehicle, segments: Segments | None = None) -> np.ndarray:
+        """The target's column by this vehicle on every row of the log, or of `segments` in its place."""
+        rows = padded(self.segments if segments is None else segments, self.measured)
         return np.asarray(_column(vehicle, rows.segments, self.target))[: rows.rows]
 
 

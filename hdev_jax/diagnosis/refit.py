@@ -1,6 +1,6 @@
 """Joint refits: the vehicle with a candidate, every free coefficient fitted anew, and whether it stands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -25,30 +25,49 @@ from hdev_jax.physics import Vehicle
 
 __all__ = ["grow", "is_size", "refit"]
 
-HOPELESS = 0.05  # p of a size in the linear step, where the refit asks for 0.01
+BORNE_OUT = 2.6  # standard errors: 1 %
+AGREES = 2.5  # standard errors between what plain rows say of a size and what whitened ones do
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
 def refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
     """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
-    # one linear step from here says about what a refit of a size will: most that fail need not be fitted to know it
-    if s.candidate.kind == "size" and not s.plain and view.plain.plain_score(s.candidate).p_cluster > HOPELESS:
+    c = s.candidate
+    shaped = any(c.parameter(n).kind != "choice" for n, _ in c.shapes)
+    plain, plain_sd = view.plain.estimate(c)
+    borne_out = bool(np.any(np.abs(plain) > BORNE_OUT * plain_sd))
+    # one linear step says about what a refit will, unless thresholds and time constants are free to move
+    try_plain = borne_out or shaped or s.plain or c.kind == "limit"
+    new = _tried(problem, state, _refined(problem, s, view), {}) if try_plain else None
+    if new is None and c.kind == "size" and not s.plain and not borne_out:
+        white, white_sd = view.evidence.estimate(c)
+        if np.all(np.abs(plain - white) <= AGREES * plain_sd):
+            # rows of equal weight do not bear it out, but leave room for what the whitened rows say: that is then what
+            # is known of it beforehand
+            known = {n: (float(w), float(e)) for n, w, e in zip(c.sizes, white, white_sd, strict=True)}
+            new = _tried(problem, state, s, known)
+    return None if new is None else (new, _gain(problem, state, new.fit, view))
+
+
+def _tried(problem: Problem, state: Search, s: Score, known: Mapping[str, tuple[float, float]]) -> Search | None:
+    """The state with the candidate in a joint fit, its sizes with what is known of them; None where it fails."""
+    c = s.candidate
+    effect = realised(c, s.beta, gears=problem.gears)
+    groups = [str(g) for g in c.groups if g is not None]
+    if known and groups:
         return None
-    s = _refined(problem, s, view)
-    effect = realised(s.candidate, s.beta, gears=problem.gears)
-    sizes = s.candidate.sizes
-    groups = [str(g) for g in s.candidate.groups if g is not None]
-    vehicle = state.fit.vehicle.plus(effect)
-    rows = effect_coefficients(effect, sizes, groups=groups)
-    rows = tuple(replace(r, free=False) if _idle(s.candidate, r.path) else r for r in rows)
+    rows = effect_coefficients(effect, c.sizes, groups=groups, shapes=not known)
+    rows = tuple(replace(r, free=False) if _idle(c, r.path) else r for r in rows)
+    rows = tuple(replace(r, **_prior(known.get(r.path.rpartition(".")[2]))) for r in rows)
     table = state.table.plus(*rows)
-    fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
-    if not fit.converged and fit.steps < 5:
+    fit = calibrate(state.fit.vehicle.plus(effect), table, problem.rows, problem.target, problem.clusters)
+    if (not fit.converged and fit.steps < 5) or not _in_range(fit, c) or not _present(fit, c):
         return None
-    if not _in_range(fit, s.candidate) or not _present(fit, s.candidate):
-        return None
-    gain = _gain(problem, state, fit, view)
-    return replace(state, vehicle=fit.vehicle, table=table, fit=fit), gain
+    return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
+
+
+def _prior(known: tuple[float, float] | None) -> dict[str, float]:
+    return {} if known is None else {"value": known[0], "sd": known[1]}
 
 
 def _refined(problem: Problem, s: Score, view: View) -> Score:
@@ -85,7 +104,7 @@ def _present(fit: Calibration, candidate: Candidate) -> bool:
         return True
     at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes
           and c.path.startswith(f"effects.{candidate.id}.")]  # fmt: skip
-    return bool(np.any(np.abs(fit.values[at]) > 2.6 * fit.sd[at]))
+    return bool(np.any(np.abs(fit.values[at]) > BORNE_OUT * fit.sd[at]))
 
 
 def _idle(candidate: Candidate, path: str) -> bool:
@@ -95,11 +114,15 @@ def _idle(candidate: Candidate, path: str) -> bool:
 
 
 def _in_range(fit: Calibration, candidate: Candidate) -> bool:
+    """Whether sizes and limits are plausible, and nothing but a switch's null lies at the edge of its range."""
     prefix = f"effects.{candidate.id}."
     for c, v in zip(fit.table.free, fit.values, strict=True):
         if c.path.startswith(prefix):
             p = candidate.parameter(c.path.removeprefix(prefix))
-            if p.kind == "size" and not p.lower <= v <= p.upper:
+            if p.kind in ("size", "limit") and not p.lower <= v <= p.upper:
+                return False
+            width = p.upper - p.lower
+            if p.kind == "limit" and width < 1e9 and min(v - p.lower, p.upper - v) < 0.01 * width and v != p.null:
                 return False
     return True
 

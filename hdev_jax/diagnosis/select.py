@@ -25,7 +25,7 @@ from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.physics.vehicle import Target
 
-__all__ = ["search"]
+__all__ = ["choose", "prune", "search"]
 
 MOST_EFFECTS = 10
 LEADERS = 3  # candidates that are refitted jointly before one is taken
@@ -78,21 +78,21 @@ def _step(problem: Problem, state: Search, step: int, tell: Callable[[str], None
     view = look(problem, state)
     if step == 1:
         state = replace(state, absorbs=view.absorbs)
-    choice = _choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
+    choice = choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
     if choice is None and state.refused and step <= MOST_EFFECTS:
-        choice = _choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
+        choice = choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
     if choice is None:
         grown = grow(problem, state, tell)
         return replace(grown or state, verdicts=view.verdicts(state), finished=grown is None)
     choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
-    state = _prune(problem, choice, tell)
+    state = prune(problem, choice, tell)
     trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
     return replace(state, verdicts=view.verdicts(state), trail=trail)
 
 
-def _choose(
-    problem: Problem, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str]
+def choose(
+    problem: Problem, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str], tries: int = TRIES
 ) -> Search | None:
     """The candidate that clears every bar, refitted; None where none does. Keeps going past one that fails."""
     able = [
@@ -107,7 +107,7 @@ def _choose(
     ]
     # what rows tell comes first; what only the clusters tell, when nothing else is left
     able.sort(key=lambda s: (s.plain, -worth(s.gain, s.candidate)))
-    for _ in range(TRIES):
+    for _ in range(tries):
         if not able:
             break
         first = able[0]
@@ -225,7 +225,7 @@ def _stability(problem: Problem, view: View, chosen: Score, names: set[str], ref
     return hits / RESAMPLES
 
 
-def _prune(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search:
+def prune(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search:
     """Backward: an effect that the later ones made superfluous goes, the weakest first."""
     while len(state.found) > 1:
         residual = problem.measured - state.fit.predicted

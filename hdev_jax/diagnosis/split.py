@@ -8,7 +8,9 @@ import numpy as np
 from hdev_jax.errors import InputError
 from hdev_jax.logs import Log
 
-__all__ = ["Split", "split_trips"]
+__all__ = ["LAST_THIRD", "Split", "split_trips"]
+
+LAST_THIRD = " (last third)"  # what the test part of a single trip is called after it
 
 
 @dataclass(frozen=True)
@@ -73,4 +75,4 @@ def _halves(log: Log) -> Log:
         raise InputError(f"trip {log.trip_names[0]!r} is too short to be split into training and test; add trips")
     name = log.trip_names[0]
     segments = replace(log.segments, trip=np.where(late, 1, 0).astype(np.int32))
-    return replace(log, segments=segments, trip_names=(f"{name} (first two thirds)", f"{name} (last third)"))
+    return replace(log, segments=segments, trip_names=(f"{name} (first two thirds)", f"{name}{LAST_THIRD}"))

@@ -110,6 +110,7 @@ def summarise(
             "noise_floor_rmse": left.noise_floor_rmse,
             "depends_on": list(left.depends_on),
             "signature": left.signature,
+            "expression": left.expression,
         },
         "verdict": verdict,
         "parameters_fitted": _fitted(state),
@@ -165,7 +166,7 @@ def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
     worst = int(np.argmax(square))
     share = square[worst] / max(float(np.sum(square)), 1e-300)
     size = np.sort(np.abs(problem.measured))
-    if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) < 3.0 * size[-2]:
+    if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) <= 3.0 * size[-2]:
         return []
     trip = problem.log.trip_names[int(np.asarray(problem.segments.trip)[worst])]
     at = float(np.asarray(problem.segments.time_s)[worst])

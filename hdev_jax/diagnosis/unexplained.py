@@ -30,6 +30,19 @@ class Remainder:
     signature: str
     rms: float  # of the structure seen, in the target's unit; 0 where none is
     correction: Float[np.ndarray, " test"]
+    expression: str | None = None
+
+    def described(
+        self, formula: str, channels: Sequence[str], rms: float, unit: str, error: tuple[float, float]
+    ) -> "Remainder":
+        """The same with a formula that fits it; `rms` is the formula's own, `error` on test rows without and with."""
+        errors = f"test RMSE {error[0]:.4g} → {error[1]:.4g} {unit}"
+        words = f"it follows {formula}, which the library does not hold ({errors})"
+        start, between = (self.signature.rstrip("."), "; ") if self.significant else ("What is left", ": ")
+        return replace(
+            self, significant=True, depends_on=tuple(dict.fromkeys((*channels, *self.depends_on))),
+            signature=f"{start}{between}{words}.", rms=max(self.rms, rms), expression=formula,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -165,6 +178,8 @@ def _period(rows: Rows) -> tuple[float, float] | None:
     seconds = [float(np.sum(rows.duration_s[s])) for _, s in trip_slices(rows.trip)]
     step = float(np.median(rows.duration_s))
     window = int(np.median(seconds) / step)
+    while window >= 128 and sum(int(t / step / window + 0.5) for t in seconds) < 2:
+        window //= 2  # a single trip is its own repetition
     if window < 64:
         return None
     window = min(window, 1 << 15)
@@ -182,14 +197,13 @@ def _period(rows: Rows) -> tuple[float, float] | None:
             count += 1
     if count < 2:
         return None
-    frequency = np.fft.rfftfreq(window, step)
     power = total / count
     low, high = 3, len(power) // 4  # three cycles or more in a window; nothing within four samples
     best: tuple[float, int] | None = None
     bias, spread = float(special.digamma(count) - np.log(count)), float(special.polygamma(1, count))
     for k in range(low, high):
-        wide = max(3, k // 3)
-        if min(k - 1, wide) + min(len(power) - k - 2, wide) < 6:
+        wide = max(6, k // 3)
+        if power[k] < max(power[k - 1], power[k + 1]):  # a side lobe of its neighbour
             continue
         # a smooth spectrum, falling as a power of frequency at most: its logarithm is linear in that of frequency
         where = np.r_[np.arange(max(2, k - wide), max(k - 1, 2)), np.arange(k + 2, min(k + 2 + wide, len(power)))]
@@ -211,10 +225,15 @@ def _period(rows: Rows) -> tuple[float, float] | None:
     if p > LEVEL or best[0] < 3.0:
         return None
     k = best[1]
-    amplitude = 2.0 * np.sqrt(power[k]) / np.sum(taper)
+    # between two lines of the spectrum the Hann taper splits a cycle; where it is from how (Grandke 1983)
+    side = k + 1 if power[k + 1] > power[k - 1] else k - 1
+    ratio = float(np.sqrt(power[side] / power[k]))
+    offset = np.clip((2 * ratio - 1) / (1 + ratio), 0.0, 0.5) * (side - k)
+    lost = np.sinc(offset) / (1 - offset**2)  # of the taper's spectrum at that distance from its centre
+    amplitude = 2.0 * np.sqrt(power[k]) / np.sum(taper) / lost
     if amplitude**2 / 2 < LEAST_SHARE * np.mean(rows.residual**2):
         return None
-    return float(1.0 / frequency[k]), float(amplitude)
+    return float(window * step / (k + offset)), float(amplitude)
 
 
 def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[Rows], float]] | None:
@@ -242,7 +261,7 @@ def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[R
 
 def _levels(rows: Rows) -> tuple[int, float, float] | None:
     """Trips whose mean residual is further out than the noise inside trips allows: (worst, its level, sd of levels)."""
-    slices = list(trip_slices(rows.trip))
+    slices = [(t, s) for t, s in trip_slices(rows.trip) if s.stop - s.start >= 8]  # fewer rows have no level
     if len(slices) < 4:
         return None
     means, errors = [], []

@@ -43,13 +43,19 @@ class Noise:
 
 
 def _levinson(acov: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Predictors of every order up to `order` and the sd of their errors (Levinson 1946, Durbin 1960)."""
+    """Predictors of every order up to `order` and the sd of their errors (Levinson 1946, Durbin 1960).
+
+    Orders that the sequence cannot support have an infinite sd.
+    """
     phi = np.zeros((order + 1, order))
     var = np.empty(order + 1)
     var[0] = acov[0]
     for k in range(1, order + 1):
         prev = phi[k - 1, : k - 1]
         reflection = (acov[k] - prev @ acov[k - 1 : 0 : -1]) / var[k - 1] if k > 1 else acov[1] / acov[0]
+        if abs(reflection) >= 0.9999 and k > 1:  # no stationary noise has it: the lags of short trips are not exact
+            var[k:] = np.inf
+            break
         reflection = np.clip(reflection, -0.9999, 0.9999)
         phi[k, : k - 1] = prev - reflection * prev[::-1]
         phi[k, k - 1] = reflection

@@ -98,9 +98,11 @@ class PassengerHeat(Effect):
 
     def power(self, row, car, point):
         t = row.channels["ambient_temp_c"]
-        hvac = car.effect("hvac_power") if car.has("hvac_power") else None
-        heat_c = HEATING_BELOW_C if hvac is None else hvac.heat_c
-        cool_c = COOLING_ABOVE_C if hvac is None else hvac.cool_c
+        heat_c, cool_c = HEATING_BELOW_C, COOLING_ABOVE_C
+        if car.has("hvac_power"):  # a side that costs nothing has no temperature to speak of
+            hvac = car.effect("hvac_power")
+            heat_c = jnp.where(hvac.below_w_per_k > 0, hvac.heat_c, heat_c)
+            cool_c = jnp.where(hvac.above_w_per_k > 0, hvac.cool_c, cool_c)
         # an edge of 1 K: a cabin does not change over at once, and the temperatures keep a slope
         side = jax.nn.sigmoid((t - cool_c) / 1.0) - jax.nn.sigmoid((heat_c - t) / 1.0)
         return self.w_per_passenger * row.channels["passengers"] * side

@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.inference import padded
 from hdev_jax.report.data import ReportData
-from hdev_jax.report.words import answer
+from hdev_jax.report.words import answer, next_drives
 
 __all__ = ["answer_text", "of_diagnosis", "report_data"]
 
@@ -69,6 +69,7 @@ def answer_text(data: ReportData, out: Path) -> str:
         sizes = ", ".join(f"{k} {p['value']:.4g} ± {p['sd']:.2g} {p['unit']}" for k, p in e["parameters"].items())
         twins = f"; not told from {', '.join(e['indistinguishable_from'])}" if e["indistinguishable_from"] else ""
         lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")
+    lines += next_drives(s)
     lines.append(s["unexplained"]["signature"])
     lines += [f"note: {note}" for note in s.get("notes", [])]
     lines.append(str(out / "report.html"))

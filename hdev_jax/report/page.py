@@ -124,6 +124,7 @@ def _common(data: ReportData) -> dict[str, Any]:
         "target": names.target(data.summary["target"])[0],
         "summary": data.summary,
         "notes": data.summary.get("notes", []),
+        "next_drives": words.next_drives(data.summary),
         "clusters": data.summary.get("clusters", {}),
         "total": total_name(data),
         "trips": lines,

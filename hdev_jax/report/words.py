@@ -4,10 +4,23 @@ import math
 from numbers import Real
 from typing import Any
 
+from hdev_jax.diagnosis.split import LAST_THIRD
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
 
-__all__ = ["NBSP", "answer", "answer_parts", "count", "number", "pair", "percent", "plus_minus", "q_value", "remaining"]
+__all__ = [
+    "NBSP",
+    "answer",
+    "answer_parts",
+    "count",
+    "next_drives",
+    "number",
+    "pair",
+    "percent",
+    "plus_minus",
+    "q_value",
+    "remaining",
+]
 
 NBSP = "\u00a0"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -143,14 +156,10 @@ def _errors(data: ReportData) -> str:
 
 
 def _where(data: ReportData) -> str:
-    test, trip = data.row("test"), data.row("trip")
-    if shared := set(trip[test].tolist()) & set(trip[data.row("used") & ~test].tolist()):
-        i = min(shared)  # a log of one trip: its end is tested on
-        return (
-            f"on the part of {data.trip_names[i] if i < len(data.trip_names) else 'the trip'} that no choice has seen"
-        )
-    n = len(data.summary.get("split", {}).get("test_trips", []))
-    return f"on {count(n, 'trip')} that no choice has seen"
+    tested = data.summary.get("split", {}).get("test_trips", [])
+    if len(tested) == 1 and tested[0].endswith(LAST_THIRD):  # a log of one trip: its end is tested on
+        return f"on the last third of {tested[0].removesuffix(LAST_THIRD)} that no choice has seen"
+    return f"on {count(len(tested), 'trip')} that no choice has seen"
 
 
 def remaining(data: ReportData) -> str:
@@ -168,12 +177,12 @@ DOUBTFUL = 0.5  # q from which on the clusters speak against it
 
 
 def _suspect(summary: dict[str, Any]) -> dict[str, Any] | None:
-    """The candidate that looks best of those that no sign, range or declared coefficient rules out."""
-    ruled_out = ("absorbed", "its best size", "found", "declared", "the mean of")
+    """The candidate that looks best of those that only more trips could decide."""
+    open_still = ("too few", "not significant", "comes first in only")
     able = [
         c for c in summary.get("candidates", [])
         if _finite(c.get("score")) and c["score"] > SUSPICIOUS and c["q_value"] < DOUBTFUL
-        and not str(c.get("why_not", "")).startswith(ruled_out)
+        and str(c.get("why_not", "")).startswith(open_still)
     ]  # fmt: skip
     return max(able, key=lambda c: c["score"], default=None)
 
@@ -223,6 +232,20 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
         if piece:
             pieces.append((piece, i % 2 == 1))
     return pieces
+
+
+def next_drives(summary: dict[str, Any]) -> list[str]:
+    """One sentence for each drive that would tell a found effect from its rival, the shortest first."""
+    out = []
+    for d in summary.get("next_drives", []):
+        pair = f"{names.effect(d['effect'])} from {names.effect(d['rival'])}"
+        if not d["drive"]:
+            how = next((e["separated_by"] for e in summary["effects"] if e["id"] == d["effect"]), "")
+            out.append(f"no drive that was simulated tells {pair} in good time{f'; what may: {how}' if how else ''}")
+            continue
+        length = f"{number(d['kilometres'], 2)} km, " if d["kilometres"] > 0 else ""
+        out.append(f"to tell {pair}: {d['drive']} ({length}{number(d['hours'], 2)} h)")
+    return out
 
 
 def answer(data: ReportData) -> str:

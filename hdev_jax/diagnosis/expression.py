@@ -1,0 +1,169 @@
+"""A formula for what is left where the library has none: sparse search over monomials of the log's channels.
+
+Each monomial is a power at the battery, k times a product of channels, and goes through the kernel, the scores, the
+joint refit and the placebos as an effect of the library does; trying many of them counts. Its coefficient has the unit
+that makes the product a power. What is accepted is a description, not a cause: it is labelled as not in the library
+and is added to no vehicle.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hdev_jax.diagnosis.candidates import Candidate, columns
+from hdev_jax.diagnosis.look import Problem, Search, look
+from hdev_jax.diagnosis.select import choose, prune
+from hdev_jax.physics import Effect, Parameter
+from hdev_jax.segments import Segments
+from hdev_jax.units import registry, unit_of
+
+__all__ = ["Expression", "Factor", "find_expression", "monomials"]
+
+STRICTER = 5.0  # a description of the rest has to clear a level so much lower than a cause does
+MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds of columns
+QUANTILES = (0.5, 0.75, 0.9)
+MOTION = ("speed_mps", "accel_mps2")
+TERM = "derived:expression"
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One factor of a monomial: a channel or a motion less `centre`, to a power, or whether it is above a threshold."""
+
+    name: str
+    exponent: int = 1
+    centre: float = 0.0
+    above: float | None = None
+
+    def __call__(self, segments: Segments) -> np.ndarray:
+        """The factor on every row."""
+        x = np.asarray(getattr(segments, self.name) if self.name in MOTION else segments.channels[self.name], float)
+        return (x > self.above).astype(float) if self.above is not None else (x - self.centre) ** self.exponent
+
+    def words(self) -> str:
+        """`(ambient_temp_c − 12.3)²`, `[humidity_pct > 70]`."""
+        if self.above is not None:
+            return f"[{self.name} > {self.above:.4g}]"
+        inner = self.name if not self.centre else f"({self.name} − {self.centre:.4g})"
+        return inner + {1: "", 2: "²", 3: "³"}[self.exponent]
+
+    def unit(self) -> str:
+        """Its unit as pint reads it; 1 for a threshold and where the column's name says none."""
+        if self.above is not None:
+            return "1"
+        own = {"speed_mps": "m/s", "accel_mps2": "m/s**2"}.get(self.name) or unit_of(self.name) or "1"
+        own = own.replace("degree_Celsius", "kelvin").replace("%", "percent").replace("tan", "1")
+        return f"({own})**{self.exponent}"
+
+
+class Described(Effect):
+    """k times a column that was made for it, as power at the battery."""
+
+    id: ClassVar = "expression"
+    stage: ClassVar = "battery"
+    order: ClassVar = 80
+    equation: ClassVar = "k·term"
+    source: ClassVar = "found in the log by search"
+    needs: ClassVar = (TERM,)
+    parameters: ClassVar = (Parameter("k", "W", 0.0, 1000.0),)
+    k: Any
+
+    def power(self, row, car, point):
+        return self.k * row.channels[TERM]
+
+
+@dataclass(frozen=True)
+class Expression:
+    """What was accepted: the formula with its coefficient, the channels in it, the prediction with it in place.
+
+    `superfluous` are found effects that say nothing more once the formula is there: they stood in for it.
+    """
+
+    formula: str
+    channels: tuple[str, ...]
+    q_value: float
+    predicted: np.ndarray
+    superfluous: tuple[str, ...]
+
+
+def _power_unit(factors: Sequence[Factor]) -> str:
+    """The coefficient's unit: a watt over the product of the factors' units."""
+    ureg = registry()
+    unit = ureg.Quantity(1.0, "watt")
+    for f in factors:
+        unit = unit / ureg.Quantity(1.0, f.unit())
+    return f"{unit.units:~P}"
+
+
+def product(factors: Sequence[Factor], segments: Segments) -> np.ndarray:
+    """The monomial on every row, in SI units."""
+    out = np.ones(len(segments))
+    for f in factors:
+        out = out * f(segments)
+    return out
+
+
+def monomials(segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
+    """Every monomial that the log can tell: powers of motion, each channel, its square, with speed, above quantiles."""
+    values = {k: np.asarray(v, dtype=float)[:rows] for k, v in segments.channels.items() if ":" not in k}
+    values = {k: v for k, v in values.items() if np.ptp(v) > 0}
+    centred = {k: float(f"{np.median(v):.3g}") for k, v in values.items() if unit_of(k) == "degree_Celsius"}
+    speed = Factor("speed_mps")
+    sets: list[tuple[Factor, ...]] = [(Factor("speed_mps", 2),), (Factor("speed_mps", 3),), (Factor("accel_mps2"),)]
+    linear = {k: Factor(k, centre=centred.get(k, 0.0)) for k in values}
+    for k, f in linear.items():
+        sets += [(f,), (f, speed)]
+        if len(np.unique(values[k][:: max(1, rows // 2000)])) > 2:
+            sets.append((replace(f, exponent=2),))
+            cuts = sorted({float(f"{np.quantile(values[k], q):.3g}") for q in QUANTILES})
+            sets += [(Factor(k, above=c),) for c in cuts if values[k].min() <= c < values[k].max()]
+    if rows <= MOST_ROWS:
+        sets += [(linear[a], linear[b]) for a, b in combinations(linear, 2)]
+    return sets
+
+
+def find_expression(
+    state: Search, problem: Problem, everything: Segments, *, predict: Callable[..., np.ndarray],
+    tell: Callable[[str], None] = lambda _: None,
+) -> Expression | None:  # fmt: skip
+    """The monomial that clears every bar that an effect has to clear, at a stricter level; None where none does.
+
+    **Arguments:** where the loop ended; its `problem` on training rows (whose effects are not looked at); `everything`,
+    the rows to predict with `predict(vehicle, segments)`.
+    """
+    n, segments = problem.rows.rows, problem.rows.segments
+    sets, terms, scales, data = [], [], [], []
+    for factors in monomials(segments, n):
+        term = product(factors, segments)
+        scale = float(np.sqrt(np.mean(term[:n] ** 2)))
+        if np.isfinite(scale) and np.std(term[:n]) > 1e-9 * scale > 0:
+            with_term = segments.with_channels(**{TERM: term / scale})
+            _, matrix, _ = columns(state.fit.vehicle, [Described], with_term, n, problem.target)
+            sets, terms = [*sets, factors], [*terms, term / scale]
+            scales, data = [*scales, scale], [*data, matrix[:, 0]]
+    if not sets:
+        return None
+    found = [Candidate(Described, ("k",), (None,), (), "size", (i,)) for i in range(len(sets))]
+    start = replace(state, refused=(), taken_out=())
+    view = look(problem, start, made=(found, np.stack(data, axis=1), {}))
+    best = view.best.get("expression")
+    if best is None:
+        return None
+    which = best.candidate.columns[0]
+    rows = replace(problem.rows, segments=segments.with_channels(**{TERM: terms[which]}))
+    narrow = replace(problem, rows=rows, fdr=problem.fdr / STRICTER)
+    chosen = choose(narrow, start, view, tell, skip=(), tries=1)
+    if chosen is None:
+        return None
+    at = next(i for i, c in enumerate(chosen.fit.table.free) if c.path == "effects.expression.k")
+    value, sd = chosen.fit.values[at] / scales[which], chosen.fit.sd[at] / scales[which]
+    words = "·".join(f.words() for f in sets[which])
+    formula = f"({value:.3g} ± {sd:.2g}) {_power_unit(sets[which])} · {words}"
+    everything = everything.with_channels(**{TERM: product(sets[which], everything) / scales[which]})
+    names = tuple(dict.fromkeys(f.name for f in sets[which]))
+    kept = {f.id for f in prune(narrow, chosen, tell).found}
+    superfluous = tuple(f.id for f in state.found if f.id not in kept)
+    return Expression(formula, names, chosen.found[-1].q_value, predict(chosen.fit.vehicle, everything), superfluous)
