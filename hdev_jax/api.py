@@ -13,6 +13,7 @@ from hdev_jax.diagnosis.diagnose import Diagnosis
 from hdev_jax.diagnosis.diagnose import diagnose as run_loop
 from hdev_jax.diagnosis.metrics import metrics
 from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.stages import add_stages
 from hdev_jax.diagnosis.summary import baseline_block
 from hdev_jax.errors import InputError
 from hdev_jax.inference import calibrate as fit_map
@@ -64,6 +65,7 @@ def diagnose(
             return (run.work / "answer.txt").read_text()
         progress.step(start.read)
         result = run_loop(problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
+        add_stages(result, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
         progress.step("writing the report")
         data = of_diagnosis(result, command_line("diagnose", run), started)
         text = _augmented(result, start.sheet)

@@ -17,7 +17,7 @@ from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.select import search
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.summary import summarise
-from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
+from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, Fit, calibrate, cluster_rows, padded
 from hdev_jax.physics import Effect, Vehicle
@@ -125,6 +125,8 @@ def _formula(
     if found is None:
         return {}
     rms = float(np.sqrt(np.mean((found.predicted - predicted) ** 2)))
+    if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted) ** 2):
+        return {}  # real perhaps, but it explains nothing
     return {
         "formula": found.formula, "channels": list(found.channels), "rms": rms, "predicted": found.predicted,
         "superfluous": list(found.superfluous),

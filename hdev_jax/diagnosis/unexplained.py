@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import Clusters
 from hdev_jax.segments import trip_slices
 
-__all__ = ["Remainder", "remainder"]
+__all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 
 LEVEL = 1e-3  # for each of the looks below; there are four, so false alarms stay under one in two hundred logs
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing

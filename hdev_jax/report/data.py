@@ -117,7 +117,7 @@ def metrics(data: ReportData, rows: np.ndarray, when: str) -> dict[str, Any]:
     return {"rmse": mse**0.5, "mse": mse, "bias": float(np.mean(error)), "pe_percent": pe, "n": len(rows)}
 
 
-def _parts(data: ReportData) -> Iterator[tuple[int, str, np.ndarray, bool]]:
+def _parts(data: ReportData) -> Iterator[tuple[int, str, np.ndarray]]:
     trip = data.row("trip")
     role = np.where(~data.row("used"), "unused", np.where(data.row("test"), "test", "train"))
     order = np.argsort(trip, kind="stable")
@@ -125,19 +125,19 @@ def _parts(data: ReportData) -> Iterator[tuple[int, str, np.ndarray, bool]]:
     for rows in sorted(groups, key=lambda g: int(g[0])):
         roles = [r for r in ("train", "test", "unused") if np.any(role[rows] == r)]
         for r in roles:
-            yield int(trip[rows[0]]), r, rows[role[rows] == r], len(roles) > 1
+            yield int(trip[rows[0]]), r, rows[role[rows] == r]
 
 
 def trip_lines(data: ReportData) -> list[TripLine]:
     """Every trip in the order of the log. Test trips take their errors from diagnosis.json, where it lists them."""
     lines = []
-    for i, role, rows, split in _parts(data):
+    for i, role, rows in _parts(data):
         name = data.trip_names[i] if 0 <= i < len(data.trip_names) else f"trip {i + 1}"
         listed = {w: data.summary.get(w, {}).get("test_by_trip", {}).get(name) for w in ("before", "after")}
         found = {w: (role == "test" and listed[w]) or metrics(data, rows, w) for w in ("before", "after")}
         lines.append(
             TripLine(
-                name=f"{name} ({role} part)" if split else name,
+                name=name,
                 role=role,
                 n=len(rows),
                 hours=float(np.nansum(data.row("duration_s")[rows])) / 3600.0,
