@@ -26,6 +26,7 @@ from hdev_jax.physics import Vehicle
 __all__ = ["grow", "is_size", "refit"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
+HINTED = 1.0  # standard errors, in the direction that whitened rows say
 AGREES = 2.5  # standard errors between what plain rows say of a size and what whitened ones do
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
@@ -41,7 +42,8 @@ def refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search
     new = _tried(problem, state, _refined(problem, s, view), {}) if try_plain else None
     if new is None and c.kind == "size" and not s.plain and not borne_out:
         white, white_sd = view.evidence.estimate(c)
-        if np.all(np.abs(plain - white) <= AGREES * plain_sd):
+        hinted = np.any((np.abs(plain) > HINTED * plain_sd) & (plain * white > 0))
+        if hinted and np.all(np.abs(plain - white) <= AGREES * plain_sd):
             # rows of equal weight do not bear it out, but leave room for what the whitened rows say: that is then what
             # is known of it beforehand
             known = {n: (float(w), float(e)) for n, w, e in zip(c.sizes, white, white_sd, strict=True)}
