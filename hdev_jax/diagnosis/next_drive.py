@@ -147,25 +147,28 @@ def advise(
     """
     out = []
     for found, rival in pairs:
-        now = _information(problem, state, rows, found, rival)
-        if now is None:
+        at, size = _places(state, found)
+        logged = _information(problem, state, rows, rival)
+        if not logged or not len(at):
             continue
-        information, size, at = now
-        information = information + _prior(state)
+        # of the ways to have the rival, the one that is the hardest to tell from what was found
+        logged = [information + _prior(state) for information in logged]
+        which = max(range(len(logged)), key=lambda k: _relative_sd(logged[k], size, at))
+        now = _relative_sd(logged[which], size, at)
         options = []
         for name, parts in DRIVES.items():
             drive = simulate(parts, problem)
-            extra = _information(problem, state, padded(drive, np.zeros(len(drive))), found, rival)
-            if extra is None:
+            extras = _information(problem, state, padded(drive, np.zeros(len(drive))), rival)
+            if which >= len(extras):
                 continue
-            repeats = _repeats(information, extra[0], size, at)
-            if repeats is None:
-                continue
-            kilometres = repeats * float(np.sum(drive.distance_m)) / 1e3
-            hours = repeats * float(np.sum(drive.duration_s)) / 3600
-            before, after = (_relative_sd(information + k * extra[0], size, at) for k in (0.0, repeats))
-            options.append(Advice(found, rival.id, name, kilometres, hours, min(before, 1e6), after))
-        nothing = Advice(found, rival.id, "", 0.0, 0.0, min(_relative_sd(information, size, at), 1e6), 1e6)
+            extra = extras[which]
+            repeats = _repeats(logged[which], extra, size, at)
+            if repeats is not None:
+                kilometres = repeats * float(np.sum(drive.distance_m)) / 1e3
+                hours = repeats * float(np.sum(drive.duration_s)) / 3600
+                after = _relative_sd(logged[which] + repeats * extra, size, at)
+                options.append(Advice(found, rival.id, name, kilometres, hours, min(now, 1e6), after))
+        nothing = Advice(found, rival.id, "", 0.0, 0.0, min(now, 1e6), 1e6)
         out += sorted(options, key=lambda a: a.hours)[:best] or [nothing]
     return out
 
@@ -187,36 +190,31 @@ def _repeats(information: np.ndarray, extra: np.ndarray, size: np.ndarray, at: n
     return float(np.ceil(high))
 
 
-def _information(
-    problem: Problem, state: Search, rows: Fit, found: str, rival: type[Effect]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Fisher information of these rows on [free coefficients, rival's size]; sizes and places of the found effect."""
+def _places(state: Search, found: str) -> tuple[np.ndarray, np.ndarray]:
+    """Where the found effect's sizes are among the free coefficients, and what they are."""
+    sizes = next(f.score.candidate.sizes for f in state.found if f.id == found)
+    paths = {f"effects.{found}.{n}" for n in sizes}
+    at = np.array([k for k, c in enumerate(state.fit.table.free) if c.path in paths], dtype=int)
+    return at, np.asarray(state.fit.values)[at]
+
+
+def _information(problem: Problem, state: Search, rows: Fit, rival: type[Effect]) -> list[np.ndarray]:
+    """Fisher information of these rows on [free coefficients, rival's size], for each way to have the rival."""
     fit = state.fit
     jac = jacobian(fit.vehicle, fit.table, rows.segments, problem.target)[: rows.rows]
     candidates, matrix, _ = columns(fit.vehicle, [rival], rows.segments, rows.rows, problem.target)
-    single = [c for c in candidates if len(c.columns) == 1 and c.kind == "size"]
-    if not single:
-        return None
-    column = matrix[:, single[0].columns[0]]
-    prefix = f"effects.{found}."
-    at = np.array([
-        k for k, c in enumerate(fit.table.free)
-        if c.path.startswith(prefix) and c.path.removeprefix(prefix) in _sizes(state, found)
-    ])  # fmt: skip
-    if not len(at):
-        return None
-    both = np.concatenate([jac, column[:, None]], axis=1)
-    return both.T @ both / (fit.sigma**2 * fit.inflation), np.asarray(fit.values)[at], at
+    out = []
+    for c in candidates:
+        if len(c.columns) == 1 and c.kind == "size":
+            both = np.concatenate([jac, matrix[:, [c.columns[0]]]], axis=1)
+            out.append(both.T @ both / (fit.sigma**2 * fit.inflation))
+    return out
 
 
 def _prior(state: Search) -> np.ndarray:
     """What the sheet's tables say of the coefficients, and nothing of the rival."""
     precision = [0.0 if c.sd is None else 1.0 / c.sd**2 for c in state.fit.table.free]
     return np.diag([*precision, 0.0])
-
-
-def _sizes(state: Search, found: str) -> tuple[str, ...]:
-    return next(f.score.candidate.sizes for f in state.found if f.id == found)
 
 
 def _relative_sd(information: np.ndarray, size: np.ndarray, at: np.ndarray) -> float:

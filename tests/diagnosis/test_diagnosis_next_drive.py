@@ -1,0 +1,69 @@
+"""Drives that would tell two causes apart: what is asked for is enough, less is not; the inseparable is said to be so."""
+
+import numpy as np
+import pytest
+
+from hdev_jax.diagnosis import look as looks
+from hdev_jax.diagnosis.candidates import columns, realised
+from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.next_drive import DRIVES, TOLD, _information, _prior, _relative_sd, advise, simulate
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    """A log with a constant load in it, and a vehicle that has it."""
+    effects = {"auxiliary_power": {"power_w": 3000.0}}
+    made = synthetic_log(seed=5, trips=4, rows_per_trip=60, effects=effects, noise="white", noise_level=0.05)
+    files = made.write(tmp_path_factory.mktemp("log"), truth=False)
+    problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
+    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
+    found, _, _ = columns(problem.vehicle, [LIBRARY["auxiliary_power"]], rows.segments, rows.rows, problem.target)
+    effect = realised(found[0], np.array([3000.0]))
+    table = problem.table.plus(*effect_coefficients(effect, ("power_w",)))
+    fit = calibrate(problem.vehicle.plus(effect), table, rows, problem.target, clusters)
+    score = Score(found[0], np.array([3000.0]), 99.0, 0.0, 0.0, 99.0, 1.0)
+    entry = looks.Found("auxiliary_power", score, 0.0, 1.0, (), 99.0)
+    return problem, looks.Search(fit.vehicle, table, fit, [entry]), rows
+
+
+def test_a_drive_is_rows_like_the_logs(known):
+    problem, _, _ = known
+    for name, parts in DRIVES.items():
+        drive = simulate(parts, problem)
+        assert set(drive.channels) >= set(problem.segments.channels), name
+        assert all(np.all(np.isfinite(v)) for v in drive.channels.values()), name
+        assert np.sum(drive.duration_s) == pytest.approx(sum(p.seconds for p in parts), rel=0.2), name
+        assert np.max(drive.speed_mps) <= 25.0, name
+
+
+def test_what_is_advised_is_enough_and_less_is_not(known):
+    problem, state, rows = known
+    given = advise(problem, state, rows, [("auxiliary_power", LIBRARY["cabin_warmup"])], best=3)
+    assert given
+    assert [a.hours for a in given] == sorted(a.hours for a in given)
+    at = np.array([k for k, c in enumerate(state.fit.table.free) if c.path == "effects.auxiliary_power.power_w"])
+    logged = _information(problem, state, rows, LIBRARY["cabin_warmup"])
+    for a in (a for a in given if a.drive):
+        drive = simulate(DRIVES[a.drive], problem)
+        extra = _information(problem, state, padded(drive, np.zeros(len(drive))), LIBRARY["cabin_warmup"])
+        times = a.hours / (float(np.sum(drive.duration_s)) / 3600)
+        assert times == pytest.approx(round(times))
+        size = np.asarray(state.fit.values)[at]
+        worst = max(range(len(logged)), key=lambda k: _relative_sd(logged[k] + _prior(state), size, at))
+        base = logged[worst] + _prior(state)
+        assert _relative_sd(base + times * extra[worst], size, at) <= 1 / TOLD
+        if times > 1:
+            assert _relative_sd(base + (times - 1) * extra[worst], size, at) > 1 / TOLD
+
+
+def test_what_no_drive_tells_is_said_to_be(known):
+    problem, state, rows = known
+    (only,) = advise(problem, state, rows, [("auxiliary_power", LIBRARY["power_gain"])])
+    assert only.drive == ""  # an offset of the power sensor is a constant load in every drive
+    assert only.sd_now > 10
