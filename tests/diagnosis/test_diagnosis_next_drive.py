@@ -1,4 +1,4 @@
-"""Drives that would tell two causes apart: what is asked for is enough, less is not; the inseparable is said to be so."""
+"""Drives that would tell two causes apart: what is asked for is enough, less is not; what no drive tells is said so."""
 
 import numpy as np
 import pytest
