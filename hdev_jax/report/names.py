@@ -56,7 +56,7 @@ _EFFECTS = {
     "torque_offset": "offset or gain of the torque signal",
     "power_gain": "offset or gain of the power signal",
     "time_skew": "time skew between channels",
-    "sampling_filter": "filter of the power signal",
+    "sampling_filter": "filter of the measured signal",
     "accelerometer_bias": "bias of the accelerometer",
     "voltage_dependence": "dependence on the battery's voltage",
     "cornering": "cornering resistance",
@@ -77,6 +77,11 @@ _PARAMETERS = {
     "above_w_per_k": "above the cooling limit",
     "heat_c": "heating limit",
     "cool_c": "cooling limit",
+    "per_nm_w": "power per torque",
+    "n_per_unit": "force per unit of the signal",
+    "w_per_radps": "power per motor speed",
+    "w_per_radps2": "power per motor speed squared",
+    "w_per_passenger": "power per passenger",
 }
 _SUFFIXES = {"w", "s", "m", "mps", "nm", "n", "ohm", "rad", "c", "v", "mps2", "kg", "kw"}
 

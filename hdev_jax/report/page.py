@@ -231,7 +231,12 @@ def _found(data: ReportData, e: dict[str, Any]) -> dict[str, Any]:
 
 def _candidates(summary: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Candidates by gain, the leaders apart; those that this log cannot show last."""
-    rows = [{**c, "name": names.effect(c["id"])} for c in summary.get("candidates", [])]
+    there = ("found", "declared in the sheet")
+    rows = [
+        {**c, "name": names.effect(c["id"])}
+        for c in summary.get("candidates", [])
+        if c.get("why_not") not in there  # in the model: shown where effects and coefficients are
+    ]
     tried = sorted((c for c in rows if c.get("score") is not None), key=lambda c: -c["score"])
     tried += [c for c in rows if c.get("score") is None]
     most = CANDIDATES_SHOWN if len(tried) > CANDIDATES_SHOWN + 2 else len(tried)

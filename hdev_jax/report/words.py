@@ -123,6 +123,7 @@ def _sizes(effect: dict[str, Any]) -> str:
     found = [
         f"{names.parameter(name)} {plus_minus(p.get('value'), p.get('sd'), p.get('unit'))}"
         for name, p in effect.get("parameters", {}).items()
+        if p.get("sd")  # what was chosen among a few is in the table
     ]
     if len(found) > 3:
         return f" ({', '.join(found[:2])} and {len(found) - 2} more values)"
@@ -168,7 +169,7 @@ def remaining(data: ReportData) -> str:
     on = [names.channel(c).label for c in u.get("depends_on") or []]
     text = f"it depends on {names.verbose_join(on)}" if on else "no channel of the log names it"
     if signature := str(u.get("signature") or "").strip():
-        text += f" – {signature.rstrip('.')}"
+        text += f" – {signature.rstrip('.').removeprefix('What is left: ')}"
     return text
 
 
