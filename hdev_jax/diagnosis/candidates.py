@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdev_jax.inference import insert
-from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unavailable
+from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, most_group, unavailable
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
@@ -100,12 +100,12 @@ def _of_effect(effect: type[Effect], segments: Segments, row_s: float, grids: Gr
             if first.kind == "limit":
                 for g in _grid(first, segments, row_s, grids):
                     yield variant, (None,), (*at, (first.name, g)), "limit"
-            elif first.by == "gear":
-                gear = np.asarray(segments.channels["gear"]).astype(int)
+            elif first.by:
+                gear = np.asarray(segments.channels[first.by]).astype(int)
                 seen = [
                     int(k) for k, n in zip(*np.unique(gear, return_counts=True), strict=True) if n > 0.02 * len(gear)
                 ]
-                if len(seen) > 1:  # one gear is the reference: the overall efficiency is declared already
+                if len(seen) > 1:  # the commonest is the reference: it is declared already
                     most = max(seen, key=lambda k: int(np.sum(gear == k)))
                     groups = tuple(k for k in seen if k != most)
                     yield variant * len(groups), groups, at, "size"
@@ -162,7 +162,7 @@ def columns(
         else:
             usable.append(c)
     row_s = float(np.median(np.asarray(segments.duration_s)[:rows]))
-    gears = int(np.max(np.asarray(segments.channels["gear"]))) if segments.has("gear") else 1
+    gears = most_group(segments)
     nulls = {c.id: at_null(c, gears=gears) for c in usable}
     shared = [e for e in nulls.values() if _row_level(e)]
     groups: list[tuple[list[Effect], tuple[str, ...] | None]] = [(shared, None)] if shared else []

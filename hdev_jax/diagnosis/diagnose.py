@@ -20,7 +20,7 @@ from hdev_jax.diagnosis.summary import summarise
 from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, Fit, calibrate, cluster_rows, padded
-from hdev_jax.physics import Effect, Vehicle
+from hdev_jax.physics import Effect, Vehicle, most_group
 from hdev_jax.physics.across import distance_since_start
 
 __all__ = ["Diagnosis", "diagnose"]
@@ -67,7 +67,7 @@ def diagnose(
     train = problem.rows(split.train)
     rows = padded(problem.segments.take(train), problem.measured[train])
     real = problem.segments.take(train)
-    gears = int(np.max(np.asarray(real.channels["gear"]))) if real.has("gear") else 1
+    gears = most_group(real)
 
     def remember(step: int, compute: Callable[[], Search]) -> Search:
         plain = checkpoint(f"step-{step}", lambda: to_plain(compute()))

@@ -22,7 +22,7 @@ from hdev_jax.diagnosis.look import (
 from hdev_jax.diagnosis.refit import grow, is_size, refit
 from hdev_jax.diagnosis.whiten import estimate_noise, whiten
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
-from hdev_jax.physics import Effect, Vehicle
+from hdev_jax.physics import Effect, Vehicle, most_group
 from hdev_jax.physics.vehicle import Target
 
 __all__ = ["choose", "prune", "search"]
@@ -56,7 +56,7 @@ def search(
     **Returns:** the vehicle with every effect that cleared the bar, its fit, and a verdict on every other candidate.
     """
     real = rows.segments.take(np.arange(rows.rows))
-    gears = int(np.max(np.asarray(real.channels["gear"]))) if real.has("gear") else 1
+    gears = most_group(real)
     clusters = cluster_rows(real)
 
     def declared() -> Search:

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.inference.parameters import Coefficient, ParameterTable
-from hdev_jax.inference.sheet import BATTERY_TARGETS, Built, Sheet, most_gear
+from hdev_jax.inference.sheet import BATTERY_TARGETS, Built, Sheet
 from hdev_jax.inference.sheet_schema import KEYS, SECTIONS, Declared, Key, effect_key
-from hdev_jax.physics import Driveline, Effect, Grouped, Machine, Vehicle, at_null, unavailable
+from hdev_jax.physics import Driveline, Effect, Grouped, Machine, Vehicle, at_null, most_group, unavailable
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.loads import Auxiliary
@@ -157,7 +157,7 @@ class Builder:
         keys = [
             int(k) for p in paths.values() if p in sheet.declared for k in sheet.declared[p].groups if k.isdecimal()
         ]
-        gears = max(most_gear(self.segments), len(sheet.gear_ratios or ()), *keys, 1)
+        gears = max(most_group(self.segments), len(sheet.gear_ratios or ()), *keys)
         null = at_null(cls, gears=gears)
         for p in cls.parameters:
             d, key = sheet.declared.get(paths[p.name]), effect_key(cls, p)

@@ -95,7 +95,7 @@ def effect_key(effect: type[Effect], p: Parameter) -> Key:
     """The key of an effect's parameter. A size may be anything; a shape or a limit keeps to its plausible range."""
     bounds = (-math.inf, math.inf) if p.kind == "size" else (p.lower, p.upper)
     across = effect.across is not Effect.across or effect.observe is not Effect.observe
-    return Key("coefficient", p.unit, *bounds, support=bounds, by_gear=p.by == "gear", across_rows=across or bool(p.by))
+    return Key("coefficient", p.unit, *bounds, support=bounds, by_gear=bool(p.by), across_rows=across or bool(p.by))
 
 
 def parse(

@@ -2,7 +2,7 @@
 
 from hdev_jax.physics.driveline import Driveline, EfficiencyMap
 from hdev_jax.physics.effect import Effect, Grouped, Parameter, Point
-from hdev_jax.physics.library import LIBRARY, at_null, derived, library, unavailable
+from hdev_jax.physics.library import LIBRARY, at_null, derived, library, most_group, unavailable
 from hdev_jax.physics.machine import Machine
 from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
 
@@ -21,5 +21,6 @@ __all__ = [
     "at_null",
     "derived",
     "library",
+    "most_group",
     "unavailable",
 ]

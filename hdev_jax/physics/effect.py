@@ -43,7 +43,7 @@ class Parameter:
     kind: Literal["size", "shape", "limit", "choice"] = "size"
     grid: tuple[float, ...] = ()
     least: float = 0.0
-    by: Literal["", "gear"] = ""
+    by: Literal["", "gear", "road_surface"] = ""
     smooth: bool = False  # a limit whose difference grows about in proportion: a fraction of a grid step is as good
     in_rows: bool = False  # `grid` and `scale` count rows of the log; multiplied by its median duration
 
@@ -58,16 +58,14 @@ class Point(eqx.Module):
 
 
 class Grouped(eqx.Module):
-    """A coefficient with one value for each vehicle, gear or trip, looked up by the row's id."""
+    """A coefficient with one value for each vehicle, trip, gear or kind of surface, looked up by the row's id."""
 
     values: Float[Array, " group"]
     by: str = eqx.field(static=True)
 
     def at(self, row: Segments) -> Real:
         """The value that holds for this row; ids past the end take the last."""
-        key = {"vehicle": lambda: row.vehicle, "trip": lambda: row.trip, "gear": lambda: row.channels["gear"]}[
-            self.by
-        ]()
+        key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.channels[self.by]
         return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, self.values.shape[0] - 1)]
 
 

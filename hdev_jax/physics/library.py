@@ -10,7 +10,7 @@ from hdev_jax.physics.across import with_bounds
 from hdev_jax.physics.effect import STAGES, Effect
 from hdev_jax.segments import Segments
 
-__all__ = ["DECLARED", "LIBRARY", "at_null", "derived", "library", "unavailable"]
+__all__ = ["DECLARED", "LIBRARY", "at_null", "derived", "library", "most_group", "unavailable"]
 
 DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, road.Aero, loads.Auxiliary)
 
@@ -36,6 +36,13 @@ def library(extra: Iterable[type[Effect]] = ()) -> dict[str, type[Effect]]:
             raise ValueError(f"effect id {c.id!r} is in the library already; give yours a name of its own")
         found[c.id] = c
     return found
+
+
+def most_group(segments: Segments) -> int:
+    """The highest id in the channels that coefficients may be grouped by (gears, kinds of surface); at least 1."""
+    seen = [np.asarray(segments.channels[k], dtype=float) for k in ("gear", "road_surface") if segments.has(k)]
+    finite = [x[np.isfinite(x)] for x in seen]
+    return max([1, *(int(x.max()) for x in finite if len(x))])
 
 
 def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:

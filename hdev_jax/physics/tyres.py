@@ -8,7 +8,7 @@ from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.effect import Effect, Parameter
 from hdev_jax.physics.road import ROAD, mean_square_speed, weight_on_road
 
-__all__ = ["Cornering", "RollingSpeed", "RollingTemperature", "TyreWarmup", "WetRoad"]
+__all__ = ["Cornering", "RoadSurface", "RollingSpeed", "RollingTemperature", "TyreWarmup", "WetRoad"]
 
 REFERENCE_TEMP_C = 20.0  # where a tabular c_rr is measured (ISO 28580: 25 °C in the laboratory; 20 °C on the road)
 
@@ -98,6 +98,24 @@ class WetRoad(Effect):
         water = row.channels["wet_road"]
         rolling = self.excess * car.rolling() * weight_on_road(row, car)
         return water * (rolling + self.spray * car.drag() * mean_square_speed(row))
+
+
+class RoadSurface(Effect):
+    """Rolling resistance by kind or place of the road: m·g·cosθ·C_rr·e[surface], against the commonest of the log."""
+
+    id: ClassVar = "road_surface"
+    stage: ClassVar = "road"
+    equation: ClassVar = "m·g·cosθ·C_rr·e[surface]"
+    source: ClassVar = "Sandberg, Rolling resistance: basic information and state of the art, MIRIAM (2011)"
+    needs: ClassVar = ("road_surface",)  # whole numbers from 0: kinds of surface, or stretches of road
+    entries: ClassVar = ROAD
+    parameters: ClassVar = (Parameter("excess", "1", 0.0, 0.2, -0.6, 3.0, least=0.01, by="road_surface"),)
+    mistaken_for: ClassVar = ("grade_bias", "wet_road")
+    separated_by: ClassVar = "the same surfaces up and down, and at several loads"
+    excess: Any
+
+    def force(self, row, car):
+        return self.excess * car.rolling() * weight_on_road(row, car)
 
 
 class Cornering(Effect):

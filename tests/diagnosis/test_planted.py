@@ -11,6 +11,14 @@ import numpy as np
 import pytest
 from planted import breaches, run
 
+from hdev_jax.diagnosis.diagnose import diagnose
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.split import split_trips
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
+
 SHARED = Path(os.environ.get("HDEV_DATA", "../shared/data")).parent
 
 # effect → (the parameter that sizes it, options of the log); over all five stages
@@ -71,3 +79,22 @@ def test_a_cause_outside_the_library_is_called_unexplained(cause):
     assert result.summary["effects"] == []
     assert result.summary["verdict"] == "unexplained_structure"
     assert np.isfinite(result.summary["unexplained"]["noise_floor_rmse"])
+
+
+@pytest.mark.slow
+def test_a_surface_of_its_own_resistance_is_named_with_its_size(tmp_path):
+    """The generator knows no surfaces: stretches of cobbles are laid into its log here, 35 % worse than the asphalt."""
+    made = synthetic_log(seed=6, trips=24, noise_level=0.02)
+    rng = np.random.default_rng(6)
+    surface = np.repeat(rng.choice([0, 1, 2], size=len(made.frame) // 20 + 1, p=[0.6, 0.2, 0.2]), 20)[: len(made.frame)]
+    weight_n = made.frame["mass_kg"] * 9.80665 * np.cos(made.frame["grade_rad"])
+    extra = np.where(surface == 2, 0.35 * made.vehicle.c_rr * weight_n * made.frame["distance_m"] / 0.91 / 3600, 0.0)
+    made.frame["road_surface"] = surface
+    made.frame["energy_wh"] += extra
+    files = made.write(tmp_path, truth=False)
+    log, sheet = read_log([files["log"]]), read_sheet(files["sheet"])
+    summary = diagnose(prepare(log, sheet), split_trips(log), LIBRARY).summary
+    assert [e["id"] for e in summary["effects"]] == ["road_surface"]
+    size = summary["effects"][0]["parameters"]
+    assert abs(size["excess[2]"]["value"] - 0.35) < 3 * size["excess[2]"]["sd"] + 0.05, size
+    assert abs(size["excess[1]"]["value"]) < 3 * size["excess[1]"]["sd"] + 0.02, size

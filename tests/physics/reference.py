@@ -77,6 +77,8 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
         force += m * G * math.cos(theta) * p["per_k"] * (r["ambient_temp_c"] - 20)
     if p := effects.get("tyre_warmup"):
         force += m * G * math.cos(theta) * car["c_rr"] * p["excess"] * math.exp(-r["gone_m"] / p["distance_m"])
+    if p := effects.get("road_surface"):
+        force += m * G * math.cos(theta) * car["c_rr"] * p["excess"][int(r["road_surface"])]
     if p := effects.get("cornering"):
         force += p["coefficient"] * m * (square * r["curvature_1pm"]) ** 2
 
