@@ -30,7 +30,8 @@ CAR = {
 }
 REFERENCED = (
     "grade_lag", "grade_bias", "mass_scale", "speed_scale", "time_skew", "sampling_filter", "power_gain",
-    "headwind", "rolling_temperature", "tyre_warmup", "road_surface", "cornering", "brake_drag", "driveline_drag", "gear_efficiency",
+    "headwind", "rolling_temperature", "tyre_warmup", "road_surface", "cornering", "brake_drag",
+    "driveline_drag", "gear_efficiency",
     "copper_loss", "iron_loss", "auxiliary_power", "hvac_power", "passenger_heat", "cabin_warmup", "friction_blending",
     "battery_resistance", "regen_limit",
 )  # fmt: skip
