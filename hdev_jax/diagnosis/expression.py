@@ -11,12 +11,17 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any, ClassVar
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from hdev_jax.diagnosis.candidates import Candidate, columns
+from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.look import Problem, Search, look
 from hdev_jax.diagnosis.select import choose, prune
-from hdev_jax.physics import Effect, Parameter
+from hdev_jax.physics import Effect, Parameter, Vehicle
+from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 from hdev_jax.units import registry, unit_of
 
@@ -125,6 +130,23 @@ def monomials(segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
     return sets
 
 
+def _columns(car: Vehicle, segments: Segments, target: Target, terms: np.ndarray) -> Float[np.ndarray, "row k"]:
+    """What a watt times each of the terms [k, row] adds to the target, through the whole vehicle."""
+    width = -(-len(terms) // 64) * 64  # a few widths only, so that it is compiled a few times
+    wide = np.concatenate([terms, np.zeros((width - len(terms), terms.shape[1]))])
+    car = car.plus(Described(np.asarray(1.0)))
+    return np.asarray(_added(car, jax.tree.map(jnp.asarray, segments), target, jnp.asarray(wide)))[: len(terms)].T
+
+
+@eqx.filter_jit
+def _added(car: Vehicle, segments: Segments, target: Target, terms: Array) -> Array:
+    def predicted(term: Array) -> Array:
+        return car.predict(segments.with_channels(**{TERM: term}), target)
+
+    nothing = predicted(jnp.zeros(terms.shape[1]))
+    return jax.lax.map(lambda term: predicted(term) - nothing, terms)
+
+
 def find_expression(
     state: Search, problem: Problem, everything: Segments, *, predict: Callable[..., np.ndarray],
     tell: Callable[[str], None] = lambda _: None,
@@ -135,20 +157,18 @@ def find_expression(
     the rows to predict with `predict(vehicle, segments)`.
     """
     n, segments = problem.rows.rows, problem.rows.segments
-    sets, terms, scales, data = [], [], [], []
+    sets, terms, scales = [], [], []
     for factors in monomials(segments, n):
         term = product(factors, segments)
         scale = float(np.sqrt(np.mean(term[:n] ** 2)))
         if np.isfinite(scale) and np.std(term[:n]) > 1e-9 * scale > 0:
-            with_term = segments.with_channels(**{TERM: term / scale})
-            _, matrix, _ = columns(state.fit.vehicle, [Described], with_term, n, problem.target)
-            sets, terms = [*sets, factors], [*terms, term / scale]
-            scales, data = [*scales, scale], [*data, matrix[:, 0]]
+            sets, terms, scales = [*sets, factors], [*terms, term / scale], [*scales, scale]
     if not sets:
         return None
+    matrix = _columns(state.fit.vehicle, segments, problem.target, np.stack(terms))[:n]
     found = [Candidate(Described, ("k",), (None,), (), "size", (i,)) for i in range(len(sets))]
     start = replace(state, refused=(), taken_out=())
-    view = look(problem, start, made=(found, np.stack(data, axis=1), {}))
+    view = look(problem, start, made=(found, matrix, {}))
     best = view.best.get("expression")
     if best is None:
         return None
