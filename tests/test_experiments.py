@@ -1,12 +1,13 @@
 """The experiment engine: configs that extend and sweep, one line for a fault, tasks done once, a tiny study."""
 
+import importlib
 import json
 from pathlib import Path
 
 import pytest
 
 from experiments.config import expanded, resolve, typed
-from experiments.engine import run_config
+from experiments.engine import run_config, run_tasks
 from experiments.planted import Config, exact, tasks
 from experiments.tables import wilson
 from hdev_jax.errors import InputError
@@ -88,6 +89,21 @@ def test_intervals_of_shares():
     assert low == pytest.approx(0.0215, abs=1e-3)  # R: prop.test(5, 100, correct = FALSE)
     assert high == pytest.approx(0.1118, abs=1e-3)
     assert wilson(0, 0) == (0.0, 1.0)
+
+
+@pytest.mark.slow
+def test_many_tasks_on_two_workers_come_back_in_order(tmp_path, monkeypatch):
+    """More tasks than a worker keeps its compiled programs for; an error of a task is the run's."""
+    write(
+        tmp_path, "toy_experiment.py", "def run(task):\n    return {'square': task['n'] ** 2, 'by': 1 / task['by']}\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    toy = importlib.import_module("toy_experiment")
+    todo = [{"n": n, "by": 1} for n in range(90)]
+    found = list(run_tasks(toy, todo, workers=2, kept=tmp_path / "kept"))
+    assert [(t["n"], r["square"]) for t, r in found] == [(n, n * n) for n in range(90)]
+    with pytest.raises(ZeroDivisionError):
+        list(run_tasks(toy, [{"n": 1, "by": 0}, {"n": 2, "by": 0}], workers=2, kept=tmp_path / "kept"))
 
 
 @pytest.mark.slow

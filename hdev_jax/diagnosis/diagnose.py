@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.diagnosis.expression import find_expression
-from hdev_jax.diagnosis.look import Problem as LoopProblem
-from hdev_jax.diagnosis.look import Search, Verdict
+from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.next_drive import advise
 from hdev_jax.diagnosis.problem import Problem
@@ -120,7 +119,7 @@ def _formula(
     """A formula for what is left, as plain values; empty where none clears the bar."""
     tell("what is left: a formula from the log's own channels")
     clusters = cluster_rows(rows.segments.take(np.arange(rows.rows)))
-    loop = LoopProblem(rows, problem.target, clusters, (), fdr, np.random.default_rng([seed, 999]), gears)
+    loop = Loop(rows, problem.target, clusters, (), fdr, np.random.default_rng([seed, 999]), gears)
     found = find_expression(state, loop, problem.segments, predict=problem.predict)
     if found is None:
         return {}

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.look import Problem, Search, look
+from hdev_jax.diagnosis.look import Loop, Search, look
 from hdev_jax.diagnosis.select import choose, prune
 from hdev_jax.physics import Effect, Parameter, Vehicle
 from hdev_jax.physics.vehicle import Target
@@ -32,6 +32,8 @@ MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds o
 QUANTILES = (0.5, 0.75, 0.9)
 MOTION = ("speed_mps", "accel_mps2")
 TERM = "derived:expression"
+# units with an offset count as differences, a slope as a ratio
+_PLAIN = {"degree_Celsius": "kelvin", "degree_Fahrenheit": "delta_degree_Fahrenheit", "tan": "1", "%": "percent"}
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,7 @@ class Factor:
         if self.above is not None:
             return "1"
         own = {"speed_mps": "m/s", "accel_mps2": "m/s**2"}.get(self.name) or unit_of(self.name) or "1"
-        own = own.replace("degree_Celsius", "kelvin").replace("%", "percent").replace("tan", "1")
-        return f"({own})**{self.exponent}"
+        return f"({_PLAIN.get(own, own)})**{self.exponent}"
 
 
 class Described(Effect):
@@ -148,7 +149,7 @@ def _added(car: Vehicle, segments: Segments, target: Target, terms: Array) -> Ar
 
 
 def find_expression(
-    state: Search, problem: Problem, everything: Segments, *, predict: Callable[..., np.ndarray],
+    state: Search, problem: Loop, everything: Segments, *, predict: Callable[..., np.ndarray],
     tell: Callable[[str], None] = lambda _: None,
 ) -> Expression | None:  # fmt: skip
     """The monomial that clears every bar that an effect has to clear, at a stricter level; None where none does.

@@ -16,7 +16,7 @@ from hdev_jax.physics.vehicle import Target
 __all__ = [
     "LEFT_OUT",
     "Found",
-    "Problem",
+    "Loop",
     "Search",
     "Verdict",
     "View",
@@ -72,7 +72,7 @@ class Search:
 
 
 @dataclass(frozen=True)
-class Problem:
+class Loop:
     """What stays the same through the loop."""
 
     rows: Fit
@@ -170,7 +170,7 @@ def distance_from_table(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
 Made = tuple[list[Candidate], np.ndarray, dict[str, str]]
 
 
-def look(problem: Problem, state: Search, made: Made | None = None) -> View:
+def look(problem: Loop, state: Search, made: Made | None = None) -> View:
     """Whiten, gather and score everything once: the problem's effects, or candidates `made` elsewhere."""
     rows, n = problem.rows, problem.rows.rows
     residual = problem.measured - state.fit.predicted
@@ -232,7 +232,7 @@ def _first_plausible(scores: list[Score]) -> Score:
 
 
 def both_looks(
-    problem: Problem, fit: Calibration, noise: Noise, jac: np.ndarray, matrix: np.ndarray, residual: np.ndarray
+    problem: Loop, fit: Calibration, noise: Noise, jac: np.ndarray, matrix: np.ndarray, residual: np.ndarray
 ) -> tuple[Evidence, Evidence]:
     """Evidence from whitened rows, and from rows as they are, each worth 1/inflation of its own variance."""
     rows = np.concatenate([jac, matrix, residual[:, None]], axis=1)
@@ -245,7 +245,7 @@ def both_looks(
     )
 
 
-def evidence_of(problem: Problem, fit: Calibration, noise: Noise) -> Evidence:
+def evidence_of(problem: Loop, fit: Calibration, noise: Noise) -> Evidence:
     """A fitted vehicle's own Jacobian and residual, whitened; no candidates."""
     jac = jacobian(fit.vehicle, fit.table, problem.rows.segments, problem.target)[: problem.rows.rows]
     white = whiten(np.c_[jac, problem.measured - fit.predicted], noise, problem.trip, problem.seconds)

@@ -223,4 +223,4 @@ def _relative_sd(information: np.ndarray, size: np.ndarray, at: np.ndarray) -> f
     scaled = information / np.outer(d, d) + 1e-9 * np.eye(len(d))
     covariance = np.linalg.inv(scaled) / np.outer(d, d)
     sd = np.sqrt(np.maximum(np.diag(covariance)[at], 0.0))
-    return float(np.min(sd / np.maximum(np.abs(size), 1e-300)))
+    return float(np.min(np.divide(sd, np.abs(size), out=np.full(len(sd), np.inf), where=size != 0)))

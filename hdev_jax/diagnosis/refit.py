@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.candidates import FIXED, Candidate, columns, finer, realised
 from hdev_jax.diagnosis.evidence import ABSORBED, Score
 from hdev_jax.diagnosis.look import (
     Found,
-    Problem,
+    Loop,
     Search,
     View,
     best_of,
@@ -21,7 +21,8 @@ from hdev_jax.diagnosis.look import (
     slow,
 )
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian
-from hdev_jax.physics import Vehicle
+from hdev_jax.inference.parameters import Coefficient
+from hdev_jax.physics import Effect, Vehicle
 
 __all__ = ["grow", "is_size", "refit"]
 
@@ -31,7 +32,7 @@ AGREES = 2.5  # standard errors between what plain rows say of a size and what w
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
-def refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
+def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
     """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
     c = s.candidate
     shaped = any(c.parameter(n).kind != "choice" for n, _ in c.shapes)
@@ -51,15 +52,13 @@ def refit(problem: Problem, state: Search, s: Score, view: View) -> tuple[Search
     return None if new is None else (new, _gain(problem, state, new.fit, view))
 
 
-def _tried(problem: Problem, state: Search, s: Score, known: Mapping[str, tuple[float, float]]) -> Search | None:
+def _tried(problem: Loop, state: Search, s: Score, known: Mapping[str, tuple[float, float]]) -> Search | None:
     """The state with the candidate in a joint fit, its sizes with what is known of them; None where it fails."""
     c = s.candidate
     effect = realised(c, s.beta, gears=problem.gears)
-    groups = [str(g) for g in c.groups if g is not None]
-    if known and groups:
+    if known and any(g is not None for g in c.groups):
         return None
-    rows = effect_coefficients(effect, c.sizes, groups=groups, shapes=not known)
-    rows = tuple(replace(r, free=False) if _idle(c, r.path) else r for r in rows)
+    rows = _coefficients(c, effect, shapes=not known)
     rows = tuple(replace(r, **_prior(known.get(r.path.rpartition(".")[2]))) for r in rows)
     table = state.table.plus(*rows)
     fit = calibrate(state.fit.vehicle.plus(effect), table, problem.rows, problem.target, problem.clusters)
@@ -68,11 +67,18 @@ def _tried(problem: Problem, state: Search, s: Score, known: Mapping[str, tuple[
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
 
 
+def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) -> tuple[Coefficient, ...]:
+    """The table's rows of a candidate: its sizes and shapes free, shapes of sizes that it does not have held."""
+    groups = [str(g) for g in candidate.groups if g is not None]
+    rows = effect_coefficients(effect, candidate.sizes, groups=groups, shapes=shapes)
+    return tuple(replace(r, free=False) if _idle(candidate, r.path) else r for r in rows)
+
+
 def _prior(known: tuple[float, float] | None) -> dict[str, float]:
     return {} if known is None else {"value": known[0], "sd": known[1]}
 
 
-def _refined(problem: Problem, s: Score, view: View) -> Score:
+def _refined(problem: Loop, s: Score, view: View) -> Score:
     """The same way to have the effect with its shapes on a finer grid: switches have many small optima.
 
     Where trips alone tell it, the grid reaches a whole step to either side and least squares chooses on it: thresholds
@@ -129,7 +135,7 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
     return True
 
 
-def _gain(problem: Problem, state: Search, fit: Calibration, view: View) -> float:
+def _gain(problem: Loop, state: Search, fit: Calibration, view: View) -> float:
     """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
     after = evidence_of(problem, fit, view.noise)
     prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (state.fit, fit)]
@@ -137,7 +143,7 @@ def _gain(problem: Problem, state: Search, fit: Calibration, view: View) -> floa
     return after.base_likelihood(after.totals()) - prior[1] - before
 
 
-def grow(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search | None:
+def grow(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search | None:
     """The state with a size more in one found effect, or None: heating was found, cooling may be there too.
 
     An effect is found in the way that its first step shows best; once it is in, only a joint refit can show the rest.
@@ -151,14 +157,10 @@ def grow(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search
             values = {p.name: getattr(now, p.name) for p in c.effect.parameters}
             new = [n for n in sizes if n not in c.sizes]
             values.update({n: np.asarray(c.parameter(n).scale) for n in new})
-            shapes = tuple(
-                (p.name, float(values[p.name])) for p in c.effect.parameters if p.kind in ("shape", "choice")
-            )
+            shapes = tuple((p.name, float(values[p.name])) for p in c.effect.parameters if p.kind in FIXED)
             wider = replace(c, sizes=sizes, groups=(None,) * len(sizes), shapes=shapes)
             effect = c.effect(**values)
-            rows = tuple(
-                replace(r, free=False) if _idle(wider, r.path) else r for r in effect_coefficients(effect, sizes)
-            )
+            rows = _coefficients(wider, effect)
             vehicle, table = state.fit.vehicle.minus(f.id).plus(effect), state.table.minus(f.id).plus(*rows)
             paths = {f"effects.{f.id}.{n}" for n in new}
             if _left(problem, vehicle, table, paths) < ABSORBED:
@@ -178,7 +180,7 @@ def grow(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search
     return None
 
 
-def _left(problem: Problem, vehicle: Vehicle, table: ParameterTable, paths: set[str]) -> float:
+def _left(problem: Loop, vehicle: Vehicle, table: ParameterTable, paths: set[str]) -> float:
     """Smallest share of these coefficients' columns that the other coefficients do not hold."""
     jac = jacobian(vehicle, table, problem.rows.segments, problem.target)[: problem.rows.rows]
     new = np.array([r.path in paths for r in table.free])

@@ -10,7 +10,7 @@ from hdev_jax.diagnosis.evidence import Score, gather
 from hdev_jax.diagnosis.look import (
     LEFT_OUT,
     Found,
-    Problem,
+    Loop,
     Search,
     View,
     distance_from_table,
@@ -65,14 +65,14 @@ def search(
 
     state = remember(0, declared)
     for step in range(1, MOST_EFFECTS + 2):
-        problem = Problem(rows, target, clusters, effects, fdr, np.random.default_rng([seed, step]), gears)
+        problem = Loop(rows, target, clusters, effects, fdr, np.random.default_rng([seed, step]), gears)
         state = remember(step, lambda p=problem, s=state, k=step: _step(p, s, k, tell))
         if state.finished:
             break
     return state
 
 
-def _step(problem: Problem, state: Search, step: int, tell: Callable[[str], None]) -> Search:
+def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) -> Search:
     """One look at all candidates, and the vehicle with the one that is taken; `finished` where none is."""
     tell(f"scoring candidates, step {step}")
     view = look(problem, state)
@@ -92,7 +92,7 @@ def _step(problem: Problem, state: Search, step: int, tell: Callable[[str], None
 
 
 def choose(
-    problem: Problem, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str], tries: int = TRIES
+    problem: Loop, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str], tries: int = TRIES
 ) -> Search | None:
     """The candidate that clears every bar, refitted; None where none does. Keeps going past one that fails."""
     able = [
@@ -142,7 +142,7 @@ def choose(
     return None
 
 
-def _placebo(problem: Problem, s: Score, view: View, draws: int = 19) -> str | None:
+def _placebo(problem: Loop, s: Score, view: View, draws: int = 19) -> str | None:
     """Why a placebo does as well, or None.
 
     A column that changes inside trips is moved in time by a random amount in each; one that hardly does is given a
@@ -174,7 +174,7 @@ def _placebo(problem: Problem, s: Score, view: View, draws: int = 19) -> str | N
     return "a placebo (its column shifted in time) does as well" if max(gains) >= s.gain else None
 
 
-def _twins(view: View, s: Score, problem: Problem) -> tuple[str, ...]:
+def _twins(view: View, s: Score, problem: Loop) -> tuple[str, ...]:
     """At most two other effects that, put in its place, leave the chosen one insignificant and explain as much."""
     total = view.evidence.totals()
     before = view.evidence.base_likelihood(total)
@@ -195,7 +195,7 @@ def _twins(view: View, s: Score, problem: Problem) -> tuple[str, ...]:
     return tuple(id_ for _, id_ in sorted(out)[:2])
 
 
-def _stability(problem: Problem, view: View, chosen: Score, names: set[str], refused: Sequence[str]) -> float:
+def _stability(problem: Loop, view: View, chosen: Score, names: set[str], refused: Sequence[str]) -> float:
     """Share of resampled sets of clusters in which the same effect (or its class) comes first of its kind.
 
     Its rivals are those that clusters could be speaking for at all (p at most 0.01 before any correction) and that
@@ -225,7 +225,7 @@ def _stability(problem: Problem, view: View, chosen: Score, names: set[str], ref
     return hits / RESAMPLES
 
 
-def prune(problem: Problem, state: Search, tell: Callable[[str], None]) -> Search:
+def prune(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search:
     """Backward: an effect that the later ones made superfluous goes, the weakest first."""
     while len(state.found) > 1:
         residual = problem.measured - state.fit.predicted

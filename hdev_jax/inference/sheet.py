@@ -15,12 +15,12 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference.maps import read_map
 from hdev_jax.inference.parameters import ParameterTable
 from hdev_jax.inference.sheet_schema import Declared, parse
-from hdev_jax.physics import LIBRARY, Driveline, Effect, EfficiencyMap, Vehicle
+from hdev_jax.physics import LIBRARY, Driveline, Effect, EfficiencyMap, Vehicle, most_group
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.vehicle import Entry, Target
 from hdev_jax.segments import Segments
 
-__all__ = ["BATTERY_TARGETS", "Built", "Sheet", "choose_entry", "most_gear", "read_sheet", "traction_force_from_torque"]
+__all__ = ["BATTERY_TARGETS", "Built", "Sheet", "choose_entry", "read_sheet", "traction_force_from_torque"]
 
 BATTERY_TARGETS = ("energy_wh", "battery_power_kw")
 _ENTRIES = {
@@ -101,7 +101,7 @@ class Sheet:
                     f"sheet {self.path}: driveline.gear_ratios has {len(self.gear_ratios)} gears, but the log has no "
                     "column 'gear'; one ratio, or a log with gears, is expected"
                 )
-            if (most := most_gear(segments)) > len(self.gear_ratios):
+            if (most := most_group(segments, ("gear",))) > len(self.gear_ratios):
                 raise InputError(
                     f"sheet {self.path}: driveline.gear_ratios has {len(self.gear_ratios)} gears, but the log is in "
                     f"gear {most}; a ratio for each gear is expected"
@@ -184,12 +184,3 @@ def _declared_efficiency(sheet: Sheet, why: str) -> Any:
     if "driveline.efficiency" not in sheet.declared:
         raise sheet.fail("driveline.efficiency (or map)", why)
     return np.asarray(sheet.declared["driveline.efficiency"].value)
-
-
-def most_gear(segments: Segments) -> int:
-    """The highest gear in the log, 0 without gears."""
-    if not segments.has("gear"):
-        return 0
-    gear = np.asarray(segments.channels["gear"], dtype=float)
-    gear = gear[np.isfinite(gear)]
-    return int(gear.max()) if len(gear) else 0

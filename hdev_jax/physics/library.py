@@ -38,15 +38,18 @@ def library(extra: Iterable[type[Effect]] = ()) -> dict[str, type[Effect]]:
     return found
 
 
-def most_group(segments: Segments) -> int:
+def most_group(segments: Segments, channels: tuple[str, ...] = ("gear", "road_surface")) -> int:
     """The highest id in the channels that coefficients may be grouped by (gears, kinds of surface); at least 1."""
-    seen = [np.asarray(segments.channels[k], dtype=float) for k in ("gear", "road_surface") if segments.has(k)]
+    seen = [np.asarray(segments.channels[k], dtype=float) for k in channels if segments.has(k)]
     finite = [x[np.isfinite(x)] for x in seen]
     return max([1, *(int(x.max()) for x in finite if len(x))])
 
 
 def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
-    """An instance with every size at its null value and every shape at its default."""
+    """An instance with every size at its null value and every shape at its default.
+
+    `gears` is the highest id that a grouped size has to have a value for, as `most_group` gives it.
+    """
     values = {}
     for p in effect.parameters:
         if p.by:

@@ -29,7 +29,7 @@ def heating_found(folder, above_w_per_k: float):
     rows = padded(problem.segments, problem.measured)
     clusters = cluster_rows(problem.segments)
     library = [LIBRARY["hvac_power"]]
-    loop = looks.Problem(rows, problem.target, clusters, library, 0.05, np.random.default_rng(0), 4)
+    loop = looks.Loop(rows, problem.target, clusters, library, 0.05, np.random.default_rng(0), 4)
     declared = looks.Search(
         problem.vehicle, problem.table, calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
     )

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis.expression import Factor, monomials
+from hdev_jax.diagnosis.expression import Factor, _power_unit, monomials
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.unexplained import Rows, _levels, _period
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Clusters
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
+from hdev_jax.units import _SUFFIXES
 
 
 def residual(rng, trips: int, rows: int, *, rho: float = 0.0, cycles: float = 0.0, size: float = 0.0) -> Rows:
@@ -56,6 +57,11 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     found = _levels(short)
     assert found is not None
     assert found[2] == pytest.approx(np.std(level), rel=0.3)
+
+
+@pytest.mark.parametrize("suffix", [s for kind in _SUFFIXES.values() for s in kind])
+def test_every_suffix_gives_a_coefficient_its_unit(suffix):
+    assert _power_unit((Factor(f"something_{suffix}"), Factor("speed_mps", 2)))
 
 
 def test_monomials_carry_units_that_make_a_power(tmp_path):
