@@ -14,7 +14,7 @@ demo: $(READY)
 	@$(PY) -m hdev_jax.demo --out out/demo
 
 test: $(READY)
-	@$(PY) -m pytest $(ARGS)
+	@$(PY) -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
 lint: $(READY)
 	@$(PY) -m ruff check .

@@ -1,6 +1,7 @@
 """Every test runs with float64, without silent rank promotion, and with the shapes in annotations checked."""
 
 import os
+import tempfile
 from pathlib import Path
 
 import hypothesis
@@ -8,6 +9,17 @@ import jax
 import jaxtyping
 import matplotlib as mpl
 import pytest
+
+# One cache of compiled programs for a test process and the processes that it starts: the tests compile the same few
+# programs for log after log. A folder of its own for each worker, for JAX does not write an entry in one step.
+_COMPILED = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
+for _name, _value in {
+    "jax_compilation_cache_dir": _COMPILED.name,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}.items():
+    jax.config.update(_name, _value)
+    os.environ[_name.upper()] = str(_value)  # the same for the processes that a test starts
 
 # Before any module of the package is imported.
 jaxtyping.install_import_hook("hdev_jax", "beartype.beartype")
