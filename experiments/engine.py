@@ -11,7 +11,9 @@ import importlib
 import itertools
 import json
 import multiprocessing
+import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -86,12 +88,16 @@ def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: i
     todo = [i for i, p in enumerate(places) if not p.exists()]
     progress.step(f"{len(tasks)} tasks, {len(tasks) - len(todo)} done before")
     if workers > 1 and len(todo) > 1:
-        pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare_worker)
+        compiled = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
+        threads = max(1, (os.cpu_count() or 1) // workers)
+        spawn = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled.name, threads))
         try:
             futures = {pool.submit(_call, module.__name__, tasks[i]): i for i in todo}
             for future in progress.track(as_completed(futures), "running", total=len(todo)):
                 _keep(places[futures[future]], future.result())
             pool.shutdown()
+            compiled.cleanup()
         except BaseException:  # an interrupt keeps what is done and waits for nothing else
             workers_now = list((getattr(pool, "_processes", None) or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
@@ -127,10 +133,17 @@ def _call(module: str, task: dict[str, Any]) -> dict[str, Any]:
     return importlib.import_module(module).run(task)
 
 
-def _prepare_worker() -> None:
+def _prepare_worker(compiled: str, threads: int) -> None:
+    """Double precision, a share of the cores, and one cache of compiled programs for all workers."""
+    if threads == 1:
+        os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = str(threads)
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_compilation_cache_dir", compiled)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 @cache

@@ -130,7 +130,10 @@ def sizes(synthetic: SyntheticLog, found: list[dict[str, Any]]) -> list[dict[str
         size = PLANTABLE[e["id"]].size if planted else ()
         for name, p in e["parameters"].items():
             if name in size and planted.get(name) and p["sd"] > 0:
-                out.append({"id": e["id"], "name": name, "true": planted[name], "found": p["value"], "sd": p["sd"]})
+                low, high = p["interval_90"]
+                covered = low <= planted[name] <= high
+                both = {"true": planted[name], "found": p["value"], "sd": p["sd"], "covered": covered}
+                out.append({"id": e["id"], "name": name, **both})
     return out
 
 
@@ -211,7 +214,7 @@ def _row(config: Config, setting: str, group: list) -> dict[str, Any]:
         "called_unexplained": sum(r["unexplained"] for _, r in group) / n,
         "mean_class": float(np.mean([len(x["class"]) for _, r in group for x in r["named"]] or [0.0])),
         "size_within_3_sd": float(np.mean(z < 3)) if len(z) else None,
-        "size_covered_90": float(np.mean(z < 1.645)) if len(z) else None,
+        "size_covered_90": float(np.mean([s["covered"] for s in pairs])) if pairs else None,
         "within_5_percent_of_oracle": float(np.mean(ratio < 1.05)) if len(ratio) else None,
         "seconds": float(np.median([r["seconds"] for _, r in group])),
         "wanted": wanted,

@@ -201,12 +201,14 @@ def plain(text) -> str:
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_a_strong_suspect_is_named_as_one(verdict):
     data = fake(verdict)
-    strong = {"id": "regen_cutoff", "score": 30.0, "q_value": 0.2, "why_not": "too few trips bear it out"}
-    absorbed = {"id": "grade_bias", "score": 90.0, "q_value": 1.0, "why_not": "absorbed: this log cannot tell it"}
-    data.summary["candidates"] += [strong, absorbed]
+    data.summary["candidates"] += [{"id": "grade_bias", "score": 90.0, "q_value": 1.0, "why_not": "absorbed"}]
+    data.summary["clusters"] = {"kind": "trip", "count": 9}
+    data.summary["not_decidable"] = [{"id": "regen_cutoff", "clusters_needed": 14, "why_not": "too few trips"}]
     said = answer(data)
-    assert ("Not decidable on this log: cut-off of regeneration" in said) == (verdict == "nothing_missing")
-    assert ("could not be named with confidence (the nearest is cut-off of" in said) == ("unexplained" in verdict)
+    assert ("Not decidable on this log: with 9 trips for training" in said) == (verdict == "nothing_missing")
+    assert ("could not be named with confidence" in said) == ("unexplained" in verdict)
+    decided = "cannot decide on cut-off of regeneration at low speed (about 14 trips like these would tell)"
+    assert (decided in said) == (verdict != "effects_found")
     assert "slope bias" not in said
     assert "Nothing is missing" not in said
 

@@ -15,7 +15,7 @@ from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.inference import Clusters
 
-__all__ = ["ABSORBED", "Evidence", "Score", "adjusted", "gather", "gather_plain", "wald"]
+__all__ = ["ABSORBED", "Evidence", "Score", "adjusted", "clusters_needed", "gather", "gather_plain", "wald"]
 
 ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
 
@@ -42,6 +42,16 @@ class Score:
     def p(self) -> float:
         """Both tests have to agree; twice that, since whitened and plain rows are both looked at."""
         return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
+
+    def over(self, ways: int) -> float:
+        """p of the best of so many ways to have the effect.
+
+        The way is chosen by its likelihood, so its own p bears the choice; the clusters are asked about that one way
+        alone. Where only clusters speak, they have chosen it.
+        """
+        if self.plain:
+            return min(1.0, ways * self.p)
+        return min(1.0, max(2.0 * ways * self.p_model, self.p_cluster))
 
 
 @dataclass(frozen=True)
@@ -142,6 +152,19 @@ class Evidence:
         spread = self._jackknife(at, v)[:, self.base :] - beta
         return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
 
+    def step(self) -> tuple[np.ndarray, np.ndarray]:
+        """The base columns' own Gauss-Newton step, and its standard errors from clusters left out in turn.
+
+        They are no smaller than the working model's: what a single cluster tells, the others leave as it is.
+        """
+        none, totals = np.empty(0, int), self.totals()
+        likelihood, x = self._fit(totals, none)
+        v, g = int(np.argmax(likelihood)), self.count
+        normal = self._normal(totals, none)[0][v]
+        d = np.sqrt(np.diag(normal))
+        model = np.diag(np.linalg.pinv(normal / np.outer(d, d), rcond=1e-12)) / d**2
+        return x[v], np.sqrt(np.maximum(model, (g - 1) / g * np.sum((self._jackknife(none, v) - x[v]) ** 2, axis=0)))
+
     def plain_score(self, candidate: Candidate) -> Score:
         """A candidate's tests where rows are as they were measured and only clusters count as independent.
 
@@ -234,6 +257,19 @@ def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]
     d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     w = float((beta / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (beta / d))
     return float(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
+
+
+def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
+    """How many clusters would bring a Wald test of `k` numbers from `p` down to `level`, its size staying as it is.
+
+    **Returns:** None where twenty times as many would not do.
+    """
+    if clusters <= k + 1:
+        return None
+    statistic = float(stats.f.isf(p, k, clusters - k))
+    more = np.arange(clusters, 20 * clusters + 1)
+    enough = stats.f.sf(statistic * more / clusters, k, more - k) <= level
+    return int(more[np.argmax(enough)]) if enough.any() else None
 
 
 LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)  # variances of levels that are tried, over the one estimated

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hdev_jax.diagnosis.candidates import Candidate, columns
-from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, gather, gather_plain
+from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, clusters_needed, gather, gather_plain
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable, jacobian
 from hdev_jax.inference.calibrate import WEAK
@@ -30,6 +30,7 @@ __all__ = [
     "worth",
 ]
 
+HINT = 0.1  # p, before any correction, from which on a candidate is not even hinted at
 LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
 
@@ -47,12 +48,17 @@ class Found:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A candidate that was not chosen, and why."""
+    """A candidate that was not chosen, and why.
+
+    `needed`: with how many clusters like these it could be told from chance; `between`: only trips can tell it.
+    """
 
     id: str
     score: float | None
     q_value: float
     why_not: str
+    needed: int | None = None
+    between: bool = False
 
 
 @dataclass
@@ -115,16 +121,24 @@ class View:
     matrix: np.ndarray
     reasons: dict[str, str] = field(default_factory=dict)
 
-    def verdicts(self, state: Search) -> list[Verdict]:
+    def verdicts(self, state: Search, fdr: float, trip: np.ndarray) -> list[Verdict]:
         """Why each candidate that the vehicle still lacks was not chosen."""
         out = []
         for id_, s in sorted(self.best.items(), key=lambda kv: -kv[1].gain):
             if state.vehicle.has(id_):
                 continue
             why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
-            out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why))
+            between = bool(slow(self.matrix[:, list(s.candidate.columns)], trip).all())
+            out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, self._needed(s, fdr), between))
         out += [Verdict(id_, None, 1.0, f"not tried: {why}") for id_, why in self.left_out.items()]
         return out
+
+    def _needed(self, s: Score, fdr: float) -> int | None:
+        """Clusters that would do for a candidate that looks right but is not told from chance by those there are."""
+        if self.q[s.candidate.id] <= fdr or s.p > HINT or s.candidate.id in self.reasons or not plausible(s):
+            return None
+        level = fdr / len(self.best)
+        return clusters_needed(s.over(self.ways[s.candidate.id]), len(s.beta), self.evidence.count, level)
 
 
 def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
@@ -184,7 +198,7 @@ def look(problem: Loop, state: Search, made: Made | None = None) -> View:
         left_out[id_] = "does nothing on this log"
     absorbs, absorbed_by = _absorption(evidence, state, best)
     ids = list(best)
-    ps = [min(1.0, best[i].p * ways[i]) if i not in absorbed_by else 1.0 for i in ids]
+    ps = [best[i].over(ways[i]) if i not in absorbed_by else 1.0 for i in ids]
     q = dict(zip(ids, adjusted(ps), strict=True))
     return View(evidence, plain, noise, best, ways, q, left_out, absorbs, absorbed_by, state.fit, residual, jac, matrix)
 

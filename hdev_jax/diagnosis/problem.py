@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from hdev_jax.diagnosis.metrics import sum_weight
-from hdev_jax.inference import ParameterTable, padded
+from hdev_jax.inference import ParameterTable, padded, predict
 from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
 from hdev_jax.logs import Log
 from hdev_jax.physics import Vehicle
@@ -50,12 +48,7 @@ class Problem:
     def predict(self, vehicle: Vehicle, segments: Segments | None = None) -> np.ndarray:
         """The target's column by this vehicle on every row of the log, or of `segments` in its place."""
         rows = padded(self.segments if segments is None else segments, self.measured)
-        return np.asarray(_column(vehicle, rows.segments, self.target))[: rows.rows]
-
-
-@eqx.filter_jit
-def _column(vehicle: Vehicle, segments: Segments, target: Target) -> jax.Array:
-    return vehicle.predict(segments, target)
+        return np.asarray(predict(vehicle, rows.segments, self.target))[: rows.rows]
 
 
 def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured: bool = True) -> Problem:

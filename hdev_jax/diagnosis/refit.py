@@ -20,15 +20,17 @@ from hdev_jax.diagnosis.look import (
     plausible,
     slow,
 )
-from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian
+from hdev_jax.diagnosis.whiten import Noise
+from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian, predict
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
 __all__ = ["grow", "is_size", "refit"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
-HINTED = 1.0  # standard errors, in the direction that whitened rows say
-AGREES = 2.5  # standard errors between what plain rows say of a size and what whitened ones do
+AGREES = 2.25  # standard errors between what plain rows say of a size and what whitened ones do
+SEEN = 12.0  # standard errors of whitened rows: a quarter of it would be three
+STEPS, SETTLED = 6, 0.05  # Gauss-Newton steps on whitened rows; standard errors that the last may move by
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
@@ -37,19 +39,54 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     c = s.candidate
     shaped = any(c.parameter(n).kind != "choice" for n, _ in c.shapes)
     plain, plain_sd = view.plain.estimate(c)
+    white, white_sd = view.evidence.estimate(c)
+    if s.plain and _contradicted(plain, white, white_sd):
+        return None
     borne_out = bool(np.any(np.abs(plain) > BORNE_OUT * plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
-    new = _tried(problem, state, _refined(problem, s, view), {}) if try_plain else None
-    if new is None and c.kind == "size" and not s.plain and not borne_out:
-        white, white_sd = view.evidence.estimate(c)
-        hinted = np.any((np.abs(plain) > HINTED * plain_sd) & (plain * white > 0))
-        if hinted and np.all(np.abs(plain - white) <= AGREES * plain_sd):
-            # rows of equal weight do not bear it out, but leave room for what the whitened rows say: that is then what
-            # is known of it beforehand
-            known = {n: (float(w), float(e)) for n, w, e in zip(c.sizes, white, white_sd, strict=True)}
-            new = _tried(problem, state, s, known)
+    refined = _refined(problem, s, view) if try_plain else s
+    new = _tried(problem, state, refined, {}) if try_plain else None
+    if new is None and c.kind == "size" and not s.plain and np.all(np.abs(plain - white) <= AGREES * plain_sd):
+        # rows of equal weight do not bear it out, but leave room for what the whitened rows say: that is then what is
+        # known of it beforehand
+        known = _whitened(problem, state, refined, view.noise)
+        new = _tried(problem, state, refined, known) if known else None
     return None if new is None else (new, _gain(problem, state, new.fit, view))
+
+
+def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:
+    """Whether whitened rows, which would have seen a size a quarter as large, see none of that sign.
+
+    What rows of equal weight say of a slow column may be slow noise; weights that drown a cause leave it its sign.
+    """
+    return bool(np.all((np.abs(plain) > SEEN * white_sd) & (plain * white <= 0)))
+
+
+def _whitened(problem: Loop, state: Search, s: Score, noise: Noise) -> dict[str, tuple[float, float]]:
+    """Sizes and standard errors by whitened rows, every coefficient fitted with them; empty where a size leaves its
+    range or the steps do not settle.
+
+    One linear step is not enough: the coefficients that it starts from have been fitted without the effect.
+    """
+    effect = realised(s.candidate, s.beta, gears=problem.gears)
+    table = state.table.plus(*_coefficients(s.candidate, effect, shapes=False))
+    vehicle, rows = state.fit.vehicle.plus(effect), problem.rows
+    theta, moved = table.values(vehicle), np.inf
+    names = [c.path.removeprefix(f"effects.{s.candidate.id}.") for c in table.free]
+    at = [names.index(n) for n in s.candidate.sizes if n in names]
+    error = np.zeros(len(theta))
+    for _ in range(STEPS):
+        vehicle = table.insert(vehicle, theta)
+        predicted = np.asarray(predict(vehicle, rows.segments, problem.target))[: rows.rows]
+        fit = replace(state.fit, vehicle=vehicle, table=table, values=theta, predicted=predicted)
+        step, error = evidence_of(problem, fit, noise).step()
+        theta, moved = theta + step, float(np.max(np.abs(step[at]) / np.maximum(error[at], 1e-300)))
+        if not all(c.lower <= x <= c.upper for c, x in zip(table.free, theta, strict=True)):
+            return {}
+        if moved < SETTLED:
+            break
+    return {names[k]: (float(theta[k]), float(error[k])) for k in at} if moved < 1.0 else {}
 
 
 def _tried(problem: Loop, state: Search, s: Score, known: Mapping[str, tuple[float, float]]) -> Search | None:

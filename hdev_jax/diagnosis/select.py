@@ -83,12 +83,12 @@ def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) 
         choice = choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
     if choice is None:
         grown = grow(problem, state, tell)
-        return replace(grown or state, verdicts=view.verdicts(state), finished=grown is None)
+        return replace(grown or state, verdicts=view.verdicts(state, problem.fdr, problem.trip), finished=grown is None)
     choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
     state = prune(problem, choice, tell)
     trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
-    return replace(state, verdicts=view.verdicts(state), trail=trail)
+    return replace(state, verdicts=view.verdicts(state, problem.fdr, problem.trip), trail=trail)
 
 
 def choose(

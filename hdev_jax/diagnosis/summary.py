@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
-from hdev_jax.diagnosis.look import Found, Search
+from hdev_jax.diagnosis.look import Found, Search, Verdict
 from hdev_jax.diagnosis.metrics import metrics
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.split import Split
@@ -15,6 +16,8 @@ from hdev_jax.inference import Calibration, cluster_rows
 __all__ = ["baseline_block", "summarise"]
 
 ODD_SHARE = 0.2
+SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
+DOUBTFUL = 0.5  # q from which on the clusters speak against it
 FAR = 2.0  # tabular standard deviations beyond which a coefficient has moved suspiciously far
 
 
@@ -29,11 +32,25 @@ def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> di
     return block
 
 
-def _effect_block(f: Found, fit: Calibration, before: float, after: float) -> dict[str, Any]:
+def sized(value: float, error: float, clusters: int) -> dict[str, Any]:
+    """A size with what is known of it from a few clusters: Student's t with `clusters` − 1 degrees of freedom.
+
+    **Arguments:** `error`, the standard error jackknifed over clusters.
+
+    **Returns:** `value`, the distribution's standard deviation `sd` (wider than the standard error; of three degrees
+    of freedom where there are fewer, which have none) and the central `interval_90`.
+    """
+    freedom = max(clusters - 1, 1)
+    sd = error * float(np.sqrt(max(freedom, 3) / (max(freedom, 3) - 2)))
+    half = error * float(stats.t.ppf(0.95, freedom))
+    return {"value": value, "sd": sd, "interval_90": [value - half, value + half]}
+
+
+def _effect_block(f: Found, fit: Calibration, before: float, after: float, clusters: int) -> dict[str, Any]:
     c = f.score.candidate
     prefix = f"effects.{f.id}."
     parameters = {
-        row.name.removeprefix(prefix): {"value": float(v), "sd": float(s), "unit": row.unit}
+        row.name.removeprefix(prefix): {**sized(float(v), float(s), clusters), "unit": row.unit}
         for row, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
         if row.path.startswith(prefix)
     }
@@ -76,14 +93,17 @@ def summarise(
         }
 
     rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
-    effects = [{**_effect_block(f, steps[-1], rmse[k], rmse[k + 1]), "order": k + 1} for k, f in enumerate(state.found)]
+    clusters = cluster_rows(problem.segments.take(train))
+    effects = [
+        {**_effect_block(f, steps[-1], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
+        for k, f in enumerate(state.found)
+    ]
     verdict = {
         (False, False): "nothing_missing",
         (True, False): "effects_found",
         (False, True): "unexplained_structure",
         (True, True): "effects_found_and_unexplained_structure",
     }[bool(effects), left.significant]
-    clusters = cluster_rows(problem.segments.take(train))
     candidates = [{"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts]
     considered = {c["id"] for c in candidates}
     for e in state.fit.vehicle.effects:  # in the vehicle: nothing to turn down, but considered all the same
@@ -112,12 +132,29 @@ def summarise(
             "signature": left.signature,
             "expression": left.expression,
         },
+        "not_decidable": _not_decidable(state.verdicts, left),
         "verdict": verdict,
         "parameters_fitted": _fitted(state),
         "clusters": {"kind": clusters.kind, "count": clusters.count},
         "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
         "notes": [*problem.notes, *_warnings(steps, state), *_odd_rows(problem, predicted[0])],
     }
+
+
+def _not_decidable(verdicts: Sequence[Verdict], left: Remainder) -> list[dict[str, Any]]:
+    """What more trips (or stretches of driving) would tell, the nearest first, three at most.
+
+    Either rows speak for it and clusters not yet, or trips differ in level and it is a cause that differs by trip: of
+    that a log knows no more than it has trips.
+    """
+    levels = left.significant and "trip_id" in left.depends_on
+    able = [
+        v for v in verdicts
+        if v.needed is not None
+        and ((levels and v.between) or (v.q_value < DOUBTFUL and (v.score or 0.0) > SUSPICIOUS))
+    ]  # fmt: skip
+    able.sort(key=lambda v: v.needed or 0)
+    return [{"id": v.id, "clusters_needed": v.needed, "why_not": v.why_not} for v in able[:3]]
 
 
 def _fitted(state: Search) -> int:

@@ -76,7 +76,7 @@ def remainder(
     white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
     period = _period(train)
     steps = _change_point(white, train.trip)
-    level = _levels(train)
+    level = _levels(train, noise)
     parts, depends, sizes = [], [], [0.0]
     if learned:
         sizes.append(float(np.sqrt(share * np.mean(test.residual**2))))
@@ -259,22 +259,21 @@ def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[R
     return t, minutes
 
 
-def _levels(rows: Rows) -> tuple[int, float, float] | None:
-    """Trips whose mean residual is further out than the noise inside trips allows: (worst, its level, sd of levels)."""
-    slices = [(t, s) for t, s in trip_slices(rows.trip) if s.stop - s.start >= 8]  # fewer rows have no level
-    if len(slices) < 4:
+def _levels(rows: Rows, plain: Noise) -> tuple[int, float, float] | None:
+    """Trips of a level of their own, if coloured noise could not have made it: (worst, its level, sd of levels).
+
+    The likelihood ratio of the noise with random levels against `plain`, the noise without, each with an order of its
+    own; half a χ², since a variance at its bound is no two-sided question (Self and Liang 1987).
+    """
+    long = {t: s for t, s in trip_slices(rows.trip) if s.stop - s.start >= 8}  # fewer rows have no level
+    if len(long) < 4:
         return None
-    means, errors = [], []
-    for _, s in slices:
-        r = rows.residual[s]
-        blocks = np.array_split(r, max(4, min(20, len(r) // 50)))
-        centre = np.array([b.mean() for b in blocks])
-        means.append(r.mean())
-        errors.append(np.std(centre, ddof=1) / np.sqrt(len(centre)))
-    m, e = np.array(means), np.array(errors) + 1e-300
-    f = float(np.sum((m / e) ** 2) / len(m))
-    between = max(0.0, float(np.mean(m**2) - np.mean(e**2)))
-    if stats.f.sf(f, len(m), 3 * len(m)) > LEVEL / 10 or between < 0.1 * np.mean(rows.residual**2):
+    noise = estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=True)
+    gain = noise.log_likelihood - plain.log_likelihood
+    if 0.5 * stats.chi2.sf(2.0 * max(gain, 0.0), 1) > LEVEL / 10:
         return None
-    worst = int(np.argmax(np.abs(m)))
-    return slices[worst][0], float(m[worst]), float(np.sqrt(between))
+    if noise.level_sd**2 < 0.1 * np.mean(rows.residual**2):
+        return None
+    means = {t: float(np.mean(rows.residual[s])) for t, s in long.items()}
+    worst = max(means, key=lambda t: abs(means[t]))
+    return worst, means[worst], noise.level_sd

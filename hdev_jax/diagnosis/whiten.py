@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hdev_jax.segments import trip_slices
+from hdev_jax.segments import padded_size, trip_slices
 
 __all__ = ["Noise", "estimate_noise", "whiten"]
 
 MAX_ORDER = 24
+ORDERS = (4, 12, 24)  # that the filter is compiled for; the rest of the coefficients are zero
+NARROW, WIDE = 2, 32  # columns that it takes at once
 BLOCK_S = 600.0
 BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
@@ -126,7 +128,7 @@ def estimate_noise(
     assert best is not None
     noise = best[1]
     # scale by trip from what is white, shrunk by the number of rows: 50 rows are worth as much as the common scale
-    white = np.asarray(_filter(residual[:, None], noise.coefficients, noise.scales, _positions(trip)))[:, 0]
+    white = _filtered(residual[:, None], noise, trip)[:, 0]
     rows = np.array([s.stop - s.start for s in slices])
     own = np.array([np.mean(white[s] ** 2) for s in slices])
     pooled = float(np.mean(white**2))
@@ -153,7 +155,7 @@ def _block_sd(noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: 
 def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices: list[slice]) -> float:
     """Gaussian log-likelihood with the levels integrated out."""
     position = np.minimum(_positions(trip), noise.order)
-    both = np.asarray(_filter(np.c_[residual, np.ones_like(residual)], noise.coefficients, noise.scales, position))
+    both = _filtered(np.c_[residual, np.ones_like(residual)], noise, trip)
     z, u = both[:, 0], both[:, 1]
     total = -np.sum(np.log(noise.scales[position])) - 0.5 * np.sum(z**2)
     for s in slices:
@@ -163,17 +165,36 @@ def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices
     return float(total)
 
 
+def _filtered(columns: np.ndarray, noise: Noise, trip: np.ndarray) -> np.ndarray:
+    """Columns less what the rows before predict of them, over the prediction's sd.
+
+    Rows, orders and widths come in a few shapes only: a program for each log, order and set of candidates would take
+    longer to compile than to run.
+    """
+    (n, k), order = columns.shape, noise.order
+    lags = next(o for o in ORDERS if o >= order)
+    at = np.minimum(_positions(trip), order)
+    size = padded_size(n)
+    phi, inverse = np.zeros((size, lags)), np.ones(size)
+    phi[:n, :order], inverse[:n] = noise.coefficients[at], 1.0 / noise.scales[at]
+    out = np.empty((n, k))
+    width = NARROW if k <= NARROW else WIDE
+    for first in range(0, k, width):
+        part = columns[:, first : first + width]
+        wide = np.zeros((size, width))
+        wide[:n, : part.shape[1]] = part
+        out[:, first : first + width] = np.asarray(_filter(wide, phi, inverse))[:n, : part.shape[1]]
+    return out
+
+
 @jax.jit
-def _filter(columns: Any, coefficients: Any, scales: Any, position: Any) -> Array:
-    order = coefficients.shape[1]
-    at = jnp.minimum(position, order)
-    phi = coefficients[at]
+def _filter(columns: Any, phi: Any, inverse: Any) -> Array:
     out = columns
-    for k in range(order):
+    for k in range(phi.shape[1]):
         back = jnp.concatenate([jnp.zeros_like(columns[: k + 1]), columns[: -(k + 1)]])
         # rows too early in their trip have a zero coefficient here, so nothing leaks from the trip before
         out = out - phi[:, k : k + 1] * back
-    return out / scales[at][:, None]
+    return out * inverse[:, None]
 
 
 def whiten(
@@ -187,11 +208,8 @@ def whiten(
     Levels of blocks are taken out as far as their variance asks (random intercepts). The last column is what a level
     of 1 of the trip looks like; `evidence.gather` takes those out by their variance.
     """
-    position = _positions(trip)
     n, k = columns.shape
-    pad = (-(k + 1)) % 16  # a few widths only, so that the filter is compiled a few times
-    wide = np.concatenate([columns, np.ones((n, 1)), np.zeros((n, pad))], axis=1)
-    out = np.array(_filter(wide, noise.coefficients, noise.scales, position)[:, : k + 1])
+    out = _filtered(np.concatenate([columns, np.ones((n, 1))], axis=1), noise, trip)
     for t, (_, s) in enumerate(trip_slices(trip)):
         out[s] /= noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
     if noise.block_sd > 0:

@@ -142,10 +142,10 @@ def _ar1(innovations: np.ndarray, coefficient: float) -> np.ndarray:
 
 def _noise(rng: np.random.Generator, rows: np.ndarray, kind: str, coefficient: float) -> np.ndarray:
     """Noise of RMS 1 over the log. `ar1_white`: a fifth of the variance is white; `trip_levels`: half of it is a level
-    by trip; `student_t`: innovations with four degrees of freedom; `trip_variance`: sizes log-normal by trip."""
+    by trip; `student_t`: innovations with three degrees of freedom; `trip_variance`: sizes log-normal by trip."""
     trips, n = len(rows), int(rows.max())
     white = rng.standard_normal((trips, n))
-    tails = rng.standard_t(4, (trips, n)) / np.sqrt(2.0)
+    tails = rng.standard_t(3, (trips, n)) / np.sqrt(3.0)
     other = rng.standard_normal((trips, n))
     levels, sizes = rng.standard_normal((trips, 1)), np.exp(0.6 * rng.standard_normal((trips, 1)))
     noise = {

@@ -1,6 +1,6 @@
 """Estimators on top of the kernel: one parameter table, calibration, clusters."""
 
-from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, jacobian, padded
+from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, jacobian, padded, predict
 from hdev_jax.inference.clusters import Clusters, cluster_rows
 from hdev_jax.inference.parameters import Coefficient, ParameterTable, effect_coefficients, insert
 
@@ -16,4 +16,5 @@ __all__ = [
     "insert",
     "jacobian",
     "padded",
+    "predict",
 ]

@@ -15,9 +15,9 @@ from hdev_jax.inference.clusters import Clusters
 from hdev_jax.inference.parameters import ParameterTable, insert
 from hdev_jax.physics import Vehicle, derived
 from hdev_jax.physics.vehicle import Target
-from hdev_jax.segments import Segments
+from hdev_jax.segments import Segments, padded_size
 
-__all__ = ["Calibration", "Fit", "calibrate", "jacobian", "padded"]
+__all__ = ["Calibration", "Fit", "calibrate", "jacobian", "padded", "predict"]
 
 STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
@@ -61,9 +61,7 @@ class Calibration:
 def padded(segments: Segments, measured: np.ndarray) -> Fit:
     """Rows padded to the next of eight shapes per octave, so that logs of like length share one compilation."""
     n = len(segments)
-    quantum = max(64, 2 ** max(int(np.ceil(np.log2(max(n, 1)))) - 3, 0))
-    size = int(np.ceil(n / quantum) * quantum)
-    extra = size - n
+    extra = padded_size(n) - n
 
     def pad(x: Any, fill: Any = None) -> np.ndarray:
         x = np.asarray(x)
@@ -123,10 +121,10 @@ def _solve(
 
 @eqx.filter_jit
 def _jacobian(vehicle: Vehicle, structure: Any, target: Target, segments: Segments, theta: Any) -> Array:
-    def predict(x: Array) -> Array:
+    def column(x: Array) -> Array:
         return insert(vehicle, structure, x).predict(segments, target)
 
-    return jax.jacfwd(predict)(theta)
+    return jax.jacfwd(column)(theta)
 
 
 def jacobian(
@@ -165,7 +163,7 @@ def calibrate(
     measured = np.asarray(fit.measured)[:rows]
     theta = table.values(vehicle)
     if not free:
-        predicted = np.asarray(_predict(vehicle, fit.segments, target))[:rows]
+        predicted = np.asarray(predict(vehicle, fit.segments, target))[:rows]
         sigma = float(np.sqrt(np.mean((base * (measured - predicted)) ** 2)))
         none = np.zeros((0, 0))
         return Calibration(vehicle, table, theta, theta, none, predicted, sigma, 1.0, True, "nothing to estimate", 0)
@@ -182,11 +180,12 @@ def calibrate(
     covariance = np.zeros((len(free), len(free)))
     for sweep in range(8 if noise == "student_t" else 3):
         if sweep == 0:  # the first sweep only looks for σ: the prior weighs as against a perfect log
-            p = np.asarray(_predict(insert(vehicle, structure, jnp.asarray(theta)), fit.segments, target))[:rows]
+            p = np.asarray(predict(insert(vehicle, structure, jnp.asarray(theta)), fit.segments, target))[:rows]
             sigma = float(np.sqrt(np.mean((base * (measured - p)) ** 2))) + 1e-12
         row_weight = np.zeros(np.shape(fit.weight)[0])
         row_weight[:rows] = base * np.sqrt(tail / inflation) / sigma
-        weighted = eqx.tree_at(lambda f: f.weight, fit, row_weight)
+        # its number of real rows left out: a log of another length must not be another program
+        weighted = Fit(fit.segments, fit.measured, row_weight, 0)
         new, p, result, taken = _solve(vehicle, structure, target, weighted, jnp.asarray(theta), scale, prior, prior_sd)
         if not (np.isfinite(sigma) and np.all(np.isfinite(new)) and np.all(np.isfinite(p))):
             message, converged = "left the finite numbers; start nearer or give a prior", False
@@ -256,5 +255,6 @@ def _clustered(
 
 
 @eqx.filter_jit
-def _predict(vehicle: Vehicle, segments: Segments, target: Target) -> Array:
+def predict(vehicle: Vehicle, segments: Segments, target: Target) -> Array:
+    """The target's column on every row of `segments`, in its unit; one compiled program for each padded shape."""
     return vehicle.predict(segments, target)

@@ -48,21 +48,28 @@ class BatteryResistance(Effect):
 
 
 class VoltageDependence(Effect):
-    """Consumption that follows the voltage: P·k·(V − 600 V)."""
+    """Consumption that follows the voltage: P·k·(V − V₀)."""
 
     id: ClassVar = "voltage_dependence"
     stage: ClassVar = "battery"
     equation: ClassVar = "P·k·(V − V₀)"
     source: ClassVar = "inverter efficiency against DC voltage"
     needs: ClassVar = ("voltage_v",)
-    parameters: ClassVar = (Parameter("per_v", "1/V", 0.0, 5e-4, -0.02, 0.02, least=1e-6),)
+    parameters: ClassVar = (
+        Parameter("per_v", "1/V", 0.0, 5e-4, -0.02, 0.02, least=1e-6),
+        # where the sheet's efficiencies hold; far off it is a gain of the power, which they may not be able to absorb
+        Parameter(
+            "at_v", "V", 650.0, 50.0, 200.0, 1000.0, kind="shape", grid=(350.0, 550.0, 600.0, 650.0, 700.0, 800.0)
+        ),
+    )
     mistaken_for: ClassVar = ("battery_resistance",)
     separated_by: ClassVar = "long trips from full to empty"
     order: ClassVar = 40
     per_v: Any
+    at_v: Any
 
     def power(self, row, car, point):
-        return point.power_w * self.per_v * (row.channels["voltage_v"] - 600.0)
+        return point.power_w * self.per_v * (row.channels["voltage_v"] - self.at_v)
 
 
 class FrictionBlending(Effect):

@@ -173,27 +173,20 @@ def remaining(data: ReportData) -> str:
     return text
 
 
-SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
-DOUBTFUL = 0.5  # q from which on the clusters speak against it
+def _suspects(data: ReportData) -> str:
+    """What only more trips could decide, and how many would do; empty where there is nothing of the kind."""
+    able, clusters = data.summary.get("not_decidable") or [], data.summary.get("clusters") or {}
+    if not able:
+        return ""
+    unit = "trips" if clusters.get("kind") == "trip" else "stretches of driving"
+    named = [f"{names.effect(c['id'])} (about {c['clusters_needed']} {unit} like these would tell)" for c in able]
+    return f"with {clusters.get('count')} {unit} for training this log cannot decide on {names.verbose_join(named)}"
 
 
-def _suspect(summary: dict[str, Any]) -> dict[str, Any] | None:
-    """The candidate that looks best of those that only more trips could decide."""
-    open_still = ("too few", "not significant", "comes first in only")
-    able = [
-        c for c in summary.get("candidates", [])
-        if _finite(c.get("score")) and c["score"] > SUSPICIOUS and c["q_value"] < DOUBTFUL
-        and str(c.get("why_not", "")).startswith(open_still)
-    ]  # fmt: skip
-    return max(able, key=lambda c: c["score"], default=None)
-
-
-def _unnamed(summary: dict[str, Any]) -> str:
+def _unnamed(data: ReportData) -> str:
     """Whether the library has no word for what is left, or has one that did not clear the bar."""
-    if suspect := _suspect(summary):
-        return (
-            f"could not be named with confidence (the nearest is {names.effect(suspect['id'])}: {suspect['why_not']})"
-        )
+    if suspects := _suspects(data):
+        return f"could not be named with confidence ({suspects})"
     return "the library does not hold"
 
 
@@ -204,10 +197,10 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     if effects:
         text = f"The declared model misses {_missing(effects)}: {_where(data)} {_errors(data)}."
         if "unexplained" in verdict:
-            text += f" \x02Something more\x03 is missing that {_unnamed(s)}: {remaining(data)}."
+            text += f" \x02Something more\x03 is missing that {_unnamed(data)}: {remaining(data)}."
     elif "unexplained" in verdict:
         share = s.get("unexplained", {}).get("share_of_test_variance")
-        text = f"\x02Something is missing that {_unnamed(s)}\x03: {remaining(data)}."
+        text = f"\x02Something is missing that {_unnamed(data)}\x03: {remaining(data)}."
         if _finite(share):
             text += (
                 f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left."
@@ -215,11 +208,8 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     else:
         tried = sum(c.get("score") is not None for c in s.get("candidates", []))
         test = s["after"]["test"]
-        if suspect := _suspect(s):
-            text = (
-                f"\x02Not decidable on this log\x03: {names.effect(suspect['id'])} would explain part of what is left, "
-                f"but {suspect['why_not']}; more trips would tell; "
-            )
+        if suspects := _suspects(data):
+            text = f"\x02Not decidable on this log\x03: {suspects}; "
         else:
             text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
         text += (

@@ -6,6 +6,7 @@ import pytest
 from hdev_jax.diagnosis.expression import Factor, _power_unit, monomials
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.unexplained import Rows, _levels, _period
+from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Clusters
 from hdev_jax.inference.sheet import read_sheet
@@ -48,13 +49,25 @@ def test_noise_has_no_cycle(rho, trips):
     assert sum(_period(residual(rng, trips, 300, rho=rho)) is not None for _ in range(40)) <= 1
 
 
+def _without_levels(rows):
+    return estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=False)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9, 0.97])
+@pytest.mark.parametrize("trips", [9, 24])
+def test_slow_noise_has_no_levels_of_trips(rho, trips):
+    rng = np.random.default_rng(5)
+    logs = [residual(rng, trips, 250, rho=rho) for _ in range(20)]
+    assert all(_levels(rows, _without_levels(rows)) is None for rows in logs)
+
+
 def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     rng = np.random.default_rng(4)
     rows = residual(rng, 8, 200)
     level = np.repeat(rng.normal(0, 2.0, 8), 200)
     trip, values = np.r_[rows.trip, 8, 8, 8], np.r_[rows.residual + level, 0.1, 0.0, -0.1]
     short = Rows(np.zeros((1603, 1)), values, Clusters(trip, 9, "trip"), trip, np.full(1603, 2.0))
-    found = _levels(short)
+    found = _levels(short, _without_levels(short))
     assert found is not None
     assert found[2] == pytest.approx(np.std(level), rel=0.3)
 

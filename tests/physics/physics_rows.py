@@ -61,7 +61,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "standstill_load": {"power_w": 2500.0, "by_door": 0.5},
     "step_change": {"power_w": 900.0, "c_rr": 1e-3, "loss": 0.04, "at_trip": 1.0},
     "traction_limit": {"power_w": 9.1e4},
-    "voltage_dependence": {"per_v": 5e-4},
+    "voltage_dependence": {"per_v": 5e-4, "at_v": 640.0},
 }
 
 
