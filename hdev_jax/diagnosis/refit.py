@@ -6,20 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates import FIXED, Candidate, columns, finer, realised
+from hdev_jax.diagnosis.candidates import FIXED, Candidate, finer, plan_of, realised
 from hdev_jax.diagnosis.evidence import ABSORBED, Score
-from hdev_jax.diagnosis.look import (
-    Found,
-    Loop,
-    Search,
-    View,
-    best_of,
-    both_looks,
-    distance_from_table,
-    evidence_of,
-    plausible,
-    slow,
-)
+from hdev_jax.diagnosis.look import Found, Loop, Search, View, best_of, plausible
+from hdev_jax.diagnosis.sums import both_looks, distance_from_table, evidence_of
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
@@ -84,15 +74,15 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
     Where trips alone tell it, the grid reaches a whole step to either side and least squares chooses on it: thresholds
     of a few trips have many small optima for the joint refit to end in.
     """
-    row_s = float(np.median(np.asarray(problem.rows.segments.duration_s)[: problem.rows.rows]))
-    grids = finer(s.candidate, row_s, reach=1.0 if s.plain else 0.5)
+    facts = problem.facts
+    grids = finer(s.candidate, facts.row_s, reach=1.0 if s.plain else 0.5)
+    if "at_trip" in grids:
+        grids["at_trip"] = facts.steps_near(dict(s.candidate.shapes)["at_trip"])
     if all(len(g) == 1 for g in grids.values()):
         return s
-    n = problem.rows.rows
-    effects = [s.candidate.effect]
-    found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
-    same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
-    evidence, plain = both_looks(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
+    plan = plan_of(view.ground.fit.vehicle, [s.candidate.effect], facts, problem.target, grids)
+    same = [c for c in plan.candidates if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
+    evidence, plain, slow = both_looks(view.ground, plan)
     if s.plain:
         totals = plain.totals()
         fits = [(*plain.gain(totals, c.columns), c) for c in same]
@@ -101,7 +91,7 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
             return s
         _, beta, c = max(inside, key=lambda f: f[0])
         return replace(s, candidate=c, beta=beta)
-    best, _ = best_of(evidence, plain, same, slow(matrix, problem.trip))
+    best, _ = best_of(evidence, plain, same, slow)
     finest = best.get(s.candidate.id)
     return finest if finest is not None and finest.gain > s.gain and not finest.plain else s
 
@@ -137,7 +127,7 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
 
 def _gain(problem: Loop, state: Search, fit: Calibration, view: View) -> float:
     """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
-    after = evidence_of(problem, fit, view.noise)
+    after = evidence_of(problem.ground(fit, view.ground.noise))
     prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (state.fit, fit)]
     before = view.evidence.base_likelihood(view.evidence.totals()) - prior[0]
     return after.base_likelihood(after.totals()) - prior[1] - before

@@ -14,6 +14,8 @@ from hdev_jax.segments import trip_slices
 __all__ = ["Noise", "estimate_noise", "whiten"]
 
 MAX_ORDER = 24
+ORDERS = (2, 4, 8, 16, MAX_ORDER)  # that the filter is compiled for
+PIECE = 65_536  # rows filtered at a time
 BLOCK_S = 600.0
 BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
@@ -40,6 +42,10 @@ class Noise:
     def order(self) -> int:
         """Order of the autoregression."""
         return self.coefficients.shape[1]
+
+    def after(self, trips: int) -> "Noise":
+        """The noise of a log that begins so many trips later."""
+        return replace(self, trip_scale=self.trip_scale[min(trips, len(self.trip_scale) - 1) :])
 
 
 def _levinson(acov: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
@@ -126,7 +132,7 @@ def estimate_noise(
     assert best is not None
     noise = best[1]
     # scale by trip from what is white, shrunk by the number of rows: 50 rows are worth as much as the common scale
-    white = np.asarray(_filter(residual[:, None], noise.coefficients, noise.scales, _positions(trip)))[:, 0]
+    white = _filtered(residual[:, None], noise, _positions(trip))[:, 0]
     rows = np.array([s.stop - s.start for s in slices])
     own = np.array([np.mean(white[s] ** 2) for s in slices])
     pooled = float(np.mean(white**2))
@@ -153,7 +159,7 @@ def _block_sd(noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: 
 def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices: list[slice]) -> float:
     """Gaussian log-likelihood with the levels integrated out."""
     position = np.minimum(_positions(trip), noise.order)
-    both = np.asarray(_filter(np.c_[residual, np.ones_like(residual)], noise.coefficients, noise.scales, position))
+    both = _filtered(residual[:, None], noise, position)
     z, u = both[:, 0], both[:, 1]
     total = -np.sum(np.log(noise.scales[position])) - 0.5 * np.sum(z**2)
     for s in slices:
@@ -161,6 +167,32 @@ def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices
         g = noise.level_sd**2
         total += -0.5 * np.log1p(g * uu) + 0.5 * g * uz**2 / (1 + g * uu)
     return float(total)
+
+
+def _filtered(
+    columns: Float[np.ndarray, "row k"], noise: Noise, position: Int[np.ndarray, " row"]
+) -> Float[np.ndarray, "row k+1"]:
+    """Columns and a level of 1 through the autoregression's inverse, a piece of rows at a time.
+
+    Rows, widths and orders are padded to a few, so that the filter is compiled a few times.
+    """
+    n, k = columns.shape
+    order = next(o for o in ORDERS if o >= noise.order)
+    extra = order - noise.order
+    coefficients = np.pad(noise.coefficients, ((0, extra), (0, extra)))
+    coefficients[noise.order :] = coefficients[noise.order]
+    scales = np.r_[noise.scales, np.full(extra, noise.scales[-1])]
+    out = np.empty((n, k + 1))
+    before, rows = (order, PIECE) if n > PIECE else (0, n)
+    width = k + 1 if k == 1 else k + 1 + (-(k + 1)) % 16
+    for start in range(0, n, rows):
+        low, stop = max(start - before, 0), min(start + rows, n)
+        here = slice(before - (start - low), before - start + stop)  # rows of the log in this piece
+        piece, place = np.zeros((before + rows, width)), np.zeros(before + rows, dtype=position.dtype)
+        piece[here, :k], piece[here, k], place[here] = columns[low:stop], 1.0, position[low:stop]
+        white = np.asarray(_filter(piece, coefficients, scales, place))
+        out[start:stop] = white[before : before + stop - start, : k + 1]
+    return out
 
 
 @jax.jit
@@ -185,13 +217,10 @@ def whiten(
     """Columns as the noise's own units see them: independent rows of variance 1, but for the levels of the trips.
 
     Levels of blocks are taken out as far as their variance asks (random intercepts). The last column is what a level
-    of 1 of the trip looks like; `evidence.gather` takes those out by their variance.
+    of 1 of the trip looks like; `Sums.evidence` takes those out by their variance.
     """
-    position = _positions(trip)
-    n, k = columns.shape
-    pad = (-(k + 1)) % 16  # a few widths only, so that the filter is compiled a few times
-    wide = np.concatenate([columns, np.ones((n, 1)), np.zeros((n, pad))], axis=1)
-    out = np.array(_filter(wide, noise.coefficients, noise.scales, position)[:, : k + 1])
+    k = columns.shape[1]
+    out = _filtered(columns, noise, _positions(trip))
     for t, (_, s) in enumerate(trip_slices(trip)):
         out[s] /= noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
     if noise.block_sd > 0:
