@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -65,7 +66,7 @@ def facts_of(segments: Segments, rows: int | None = None) -> Facts:
     n = len(segments) if rows is None else rows
     if n < 1:
         raise ValueError("a log of no rows has no candidates; expected at least one row")
-    part = segments.take(np.arange(n)) if n < len(segments) else segments
+    part = jax.tree.map(lambda x: np.asarray(x)[:n], segments)
     groups = {}
     for name in GROUPS:
         if part.has(name):

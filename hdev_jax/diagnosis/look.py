@@ -73,7 +73,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Loop:
-    """What stays the same through the loop."""
+    """What stays the same through the loop; passes over its rows take `chunk_rows` of them at a time."""
 
     rows: Fit
     target: Target
@@ -98,6 +98,7 @@ class Loop:
 
     @property
     def facts(self) -> Facts:
+        """What its candidates depend on beside its rows."""
         return facts_of(self.rows.segments, self.rows.rows)
 
     def noise(self, fit: Calibration) -> Noise:
