@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["Column", "Ids", "Segments", "padded_size", "trip_slices"]
+__all__ = ["Column", "Ids", "Segments", "trip_slices"]
 
 Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
 Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
@@ -66,12 +66,6 @@ class Segments(eqx.Module):
     def take(self, rows: np.ndarray) -> "Segments":
         """Rows by boolean mask or index; ids are kept as they are. Host arrays only."""
         return jax.tree.map(lambda x: np.asarray(x)[rows], self)
-
-
-def padded_size(rows: int) -> int:
-    """The next of eight sizes per octave (64 rows at least): logs of like length then share one compiled program."""
-    quantum = max(64, 2 ** max(int(np.ceil(np.log2(max(rows, 1)))) - 3, 0))
-    return int(np.ceil(rows / quantum) * quantum)
 
 
 def trip_slices(trip: np.ndarray) -> Iterator[tuple[int, slice]]:

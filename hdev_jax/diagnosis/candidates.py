@@ -3,22 +3,22 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from hdev_jax.inference import insert
-from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, most_group, unavailable
+from hdev_jax.diagnosis.facts import Facts, facts_of
+from hdev_jax.diagnosis.programs import Program, Recipe, written
+from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unavailable
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["FIXED", "Candidate", "Column", "columns", "finer", "realised"]
+__all__ = ["FIXED", "Candidate", "Column", "Plan", "Source", "columns", "finer", "plan_of", "realised"]
 
 FIXED = ("shape", "choice")  # what has no column of its own
+TOGETHER = 6  # effects in one program: more of them run slower, fewer take longer to compile
 
 
 @dataclass(frozen=True)
@@ -78,43 +78,39 @@ def _own(effect: Effect, size: str, shapes: tuple[tuple[str, float], ...]) -> tu
     return tuple((n, v) for n, v in shapes if n == size or _matters(by_name[n], (size,)))
 
 
-def _grid(p: Parameter, segments: Segments, row_s: float, grids: Grids) -> tuple[float, ...]:
+def _grid(p: Parameter, facts: Facts, grids: Grids) -> tuple[float, ...]:
     if p.name in grids:
         return grids[p.name]
     if p.name == "at_trip":
-        trips = np.unique(np.asarray(segments.trip))
-        # three trips on either side at least: with fewer, one odd trip would be a step
-        return tuple(float(t) for t in trips[3:-2]) if len(trips) >= 6 else ()
-    return tuple(g * row_s if p.in_rows else g for g in p.grid)
+        return facts.steps
+    return tuple(g * facts.row_s if p.in_rows else g for g in p.grid)
 
 
-def _of_effect(effect: type[Effect], segments: Segments, row_s: float, grids: Grids) -> Iterable[tuple[Any, ...]]:
+def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tuple[Any, ...]]:
     """`(sizes, groups, shapes, kind)` for each way to have the effect."""
     by_name = {p.name: p for p in effect.parameters}
     sizes = tuple(p.name for p in effect.parameters if p.kind not in FIXED)
     for variant in effect.variants or (sizes,):
         shapes = [p for p in effect.parameters if p.kind in FIXED and _matters(p, variant)]
-        each = [[(p.name, g) for g in _grid(p, segments, row_s, grids)] for p in shapes]
+        each = [[(p.name, g) for g in _grid(p, facts, grids)] for p in shapes]
         for at in product(*each):
             first = by_name[variant[0]]
             if first.kind == "limit":
-                for g in _grid(first, segments, row_s, grids):
+                for g in _grid(first, facts, grids):
                     yield variant, (None,), (*at, (first.name, g)), "limit"
             elif first.by:
-                gear = np.asarray(segments.channels[first.by]).astype(int)
-                seen = [
-                    int(k) for k, n in zip(*np.unique(gear, return_counts=True), strict=True) if n > 0.02 * len(gear)
-                ]
-                if len(seen) > 1:  # the commonest is the reference: it is declared already
-                    most = max(seen, key=lambda k: int(np.sum(gear == k)))
-                    groups = tuple(k for k in seen if k != most)
+                # the commonest is the reference: it is declared already
+                if groups := tuple(sorted(facts.seen(first.by)[1:])):
                     yield variant * len(groups), groups, at, "size"
             else:
                 yield variant, (None,) * len(variant), at, "size"
 
 
 def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int = 7) -> dict[str, tuple[float, ...]]:
-    """Grids for the candidate's shapes and limits, `reach` of a step to either side of where it stands."""
+    """Grids for the candidate's shapes and limits, `reach` of a step to either side of where it stands.
+
+    `row_s` is the median duration of a row [s].
+    """
     grids: dict[str, tuple[float, ...]] = {}
     for name, at in candidate.shapes:
         p = candidate.parameter(name)
@@ -137,6 +133,93 @@ def _row_level(effect: Effect) -> bool:
     return not any(effect.overrides(h) for h in ("across", "observe", "derive"))
 
 
+@runtime_checkable
+class Source(Protocol):
+    """What makes candidates' columns of any rows: the library's `Plan`, or the terms of a formula.
+
+    `candidates` hold places among `width` columns; `left_out` says by id why other effects are no candidates.
+    """
+
+    @property
+    def candidates(self) -> Sequence[Candidate]: ...
+
+    @property
+    def left_out(self) -> Mapping[str, str]: ...
+
+    @property
+    def width(self) -> int: ...
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The candidates that a log allows, and how each of their columns is made of any of its rows.
+
+    Made once from the facts of the whole log; whole trips are then evaluated a chunk at a time.
+    """
+
+    candidates: tuple[Candidate, ...]
+    left_out: Mapping[str, str]
+    target: Target
+    programs: tuple[Program, ...]
+    recipes: tuple[Recipe, ...]
+
+    @property
+    def width(self) -> int:
+        """How many columns there are."""
+        return len(self.recipes)
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column], in the target's unit."""
+        written(out, [self.recipes[k] for k in (range(self.width) if at is None else at)], segments, self.target)
+
+
+def plan_of(
+    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: Target, grids: Grids | None = None
+) -> Plan:
+    """Every candidate that a log of these facts allows beside what the vehicle has.
+
+    Effects of one row share a vehicle, a few with all of them at their null value, so that one compiled `jvp` serves
+    them all; what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name.
+    """
+    left_out: dict[str, str] = {}
+    nulls: list[Effect] = []
+    for c in effects:
+        if vehicle.has(c.id):
+            continue
+        if why := unavailable(c, facts.sample, vehicle.entry):
+            left_out[c.id] = why
+        else:
+            nulls.append(at_null(c, gears=facts.gears))
+    shared = [e for e in nulls if _row_level(e)]
+    groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
+    groups += [(shared[k : k + TOGETHER], None) for k in range(0, len(shared), TOGETHER)]
+    for e in (e for e in nulls if not _row_level(e)):
+        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.kind not in FIXED),):
+            groups.append(([_only(e, sizes)], sizes))
+
+    found: list[Candidate] = []
+    place: dict[Column, int] = {}
+    recipes: list[Recipe] = []
+    programs = [Program.of(vehicle, group) for group, _ in groups]
+    for program, (group, only) in zip(programs, groups, strict=True):
+        for e in group:
+            for sizes, subs, shapes, kind in _of_effect(type(e), facts, grids or {}):
+                if only is not None and sizes != only:
+                    continue
+                keys = [Column(e.id, s, g, _own(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
+                for key in keys:
+                    if key not in place:
+                        place[key] = len(recipes)
+                        size = None if kind == "limit" else (key.name, key.group)
+                        recipes.append(program.recipe(e.id, shapes, size))
+                found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
+    return Plan(tuple(found), left_out, target, tuple(programs), tuple(recipes))
+
+
 def columns(
     vehicle: Vehicle,
     effects: Sequence[type[Effect]],
@@ -145,99 +228,20 @@ def columns(
     target: Target,
     grids: Grids | None = None,
 ) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
-    """Every candidate's columns on the first `rows` rows of padded segments.
-
-    Effects of one row share one vehicle with all of them at their null value, so that one compiled `jvp` serves all;
-    what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name.
+    """Every candidate's columns on the first `rows` rows of padded segments, all at once: for few rows or effects.
 
     **Returns:** candidates, their columns in the target's unit, and why the other effects were left out.
     """
-    left_out: dict[str, str] = {}
-    usable = []
-    for c in effects:
-        if vehicle.has(c.id):
-            continue
-        if why := unavailable(c, segments, vehicle.entry):
-            left_out[c.id] = why
-        else:
-            usable.append(c)
-    row_s = float(np.median(np.asarray(segments.duration_s)[:rows]))
-    gears = most_group(segments)
-    nulls = {c.id: at_null(c, gears=gears) for c in usable}
-    shared = [e for e in nulls.values() if _row_level(e)]
-    groups: list[tuple[list[Effect], tuple[str, ...] | None]] = [(shared, None)] if shared else []
-    for e in (e for e in nulls.values() if not _row_level(e)):
-        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.kind not in FIXED),):
-            groups.append(([_only(e, sizes)], sizes))
-
-    found: list[Candidate] = []
-    data: list[np.ndarray] = []
-    place: dict[Column, int] = {}
-    segments = jax.tree.map(jnp.asarray, segments)
-    for group, only in groups:
-        car = vehicle.plus(*group)
-        structure, null = _structure(group)
-        base = None
-        for e in group:
-            for sizes, subs, shapes, kind in _of_effect(type(e), segments, row_s, grids or {}):
-                if only is not None and sizes != only:
-                    continue
-                keys = [Column(e.id, s, g, _own(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
-                for key in keys:
-                    if key in place:
-                        continue
-                    values = null.copy()
-                    for name, v in shapes:
-                        values[_index(structure, e.id, name, None)] = v
-                    if kind == "limit":
-                        base = np.asarray(_predict(car, structure, target, segments, null)) if base is None else base
-                        column = np.asarray(_predict(car, structure, target, segments, values)) - base
-                    else:
-                        tangent = np.zeros_like(null)
-                        tangent[_index(structure, e.id, key.name, key.group)] = 1.0
-                        column = np.asarray(_slope(car, structure, target, segments, values, tangent))
-                    place[key] = len(data)
-                    data.append(np.nan_to_num(column[:rows], posinf=0.0, neginf=0.0))
-                found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
-    matrix = np.stack(data, axis=1) if data else np.zeros((rows, 0))
-    return found, matrix, left_out
+    plan = plan_of(vehicle, effects, facts_of(segments, rows), target, grids)
+    out = np.zeros((len(segments), plan.width))
+    plan.write(out, segments)
+    return list(plan.candidates), out[:rows], dict(plan.left_out)
 
 
 def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
     """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
     idle = {p.name for p in effect.parameters if p.kind == "limit" and p.name not in sizes}
     return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
-
-
-def _structure(effects: Sequence[Effect]) -> tuple[tuple[Any, ...], np.ndarray]:
-    structure, null = [], []
-    for e in effects:
-        for p in e.parameters:
-            leaf = getattr(e, p.name)
-            if leaf is None:
-                continue
-            count = len(leaf.values) if isinstance(leaf, Grouped) else None
-            for g in range(count) if count is not None else (None,):
-                structure.append((f"effects.{e.id}.{p.name}", g, -np.inf, np.inf))
-                null.append(p.null)
-    return tuple(structure), np.array(null)
-
-
-def _index(structure: Sequence[Any], effect_id: str, name: str, group: int | None) -> int:
-    return next(i for i, s in enumerate(structure) if s[0] == f"effects.{effect_id}.{name}" and s[1] in (group, None))
-
-
-@eqx.filter_jit
-def _predict(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Any) -> Array:
-    return insert(car, structure, jnp.asarray(values)).predict(segments, target)
-
-
-@eqx.filter_jit
-def _slope(car: Vehicle, structure: Any, target: Target, segments: Segments, values: Any, tangent: Any) -> Array:
-    def predict(x: Array) -> Array:
-        return insert(car, structure, x).predict(segments, target)
-
-    return jax.jvp(predict, (jnp.asarray(values),), (jnp.asarray(tangent),))[1]
 
 
 def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int = 1) -> Effect:

@@ -5,17 +5,17 @@ columns and residual. Gains, clustered tests, left-out gains, resampling and sig
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.whiten import Noise
-from hdev_jax.inference import Clusters
+from hdev_jax.segments import trip_slices
 
-__all__ = ["ABSORBED", "Evidence", "Score", "adjusted", "clusters_needed", "gather", "gather_plain", "wald"]
+__all__ = ["ABSORBED", "Evidence", "Score", "adjusted", "clusters_needed", "wald"]
 
 ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
 
@@ -58,25 +58,58 @@ class Score:
 class Evidence:
     """Gram matrices by cluster of [Jacobian | candidates | residual], and the prior on the Jacobian's part.
 
-    `grams[v]` is for the v-th of a few variances of the clusters' levels, `cost[v]` half its log-determinant. Each
-    model takes the variance that suits it: a candidate that explains the levels is not held against a variance that
-    still contains them, which would let no statistic exceed the number of trips.
+    Trips may have levels of their own: `levels` is what a level of 1 of each trip meets in the same columns, `squares`
+    its own square, `home` the cluster of the trip, `variances` those that are tried. Each model takes the variance
+    that suits it: a candidate that explains the levels is not held against a variance that still contains them, which
+    would let no statistic exceed the number of trips.
     """
 
-    grams: Float[np.ndarray, "variance cluster d d"]
-    cost: Float[np.ndarray, " variance"]
+    grams: Float[np.ndarray, "cluster d d"]
+    levels: Float[np.ndarray, "trip d"]
+    squares: Float[np.ndarray, " trip"]
+    home: Int[np.ndarray, " trip"]
+    variances: Float[np.ndarray, " variance"]
     base: int
     precision: Float[np.ndarray, " base"]
     pull: Float[np.ndarray, " base"]
+    _kept: dict[int, np.ndarray] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     @property
     def count(self) -> int:
         """Number of clusters."""
-        return self.grams.shape[1]
+        return self.grams.shape[0]
+
+    @cached_property
+    def cost(self) -> Float[np.ndarray, " variance"]:
+        """Half the log-determinant that each variance of the levels costs."""
+        return 0.5 * np.sum(np.log1p(self.variances[:, None] * self.squares), axis=1)
+
+    def _shrink(self, v: int) -> np.ndarray:
+        return self.variances[v] / (1.0 + self.variances[v] * self.squares)
+
+    def by_cluster(self, v: int) -> Float[np.ndarray, "cluster d d"]:
+        """Gram matrices with levels of the v-th variance taken out."""
+        if not self.variances[v]:
+            return self.grams
+        if v not in self._kept:
+            out, shrink = self.grams.copy(), self._shrink(v)
+            for g, part in trip_slices(self.home):
+                out[g] -= (self.levels[part] * shrink[part, None]).T @ self.levels[part]
+            self._kept[v] = out
+        return self._kept[v]
+
+    @cached_property
+    def _total(self) -> np.ndarray:
+        return self.totals(np.ones(self.count))
 
     def totals(self, weight: Float[np.ndarray, " cluster"] | None = None) -> Float[np.ndarray, "variance d d"]:
         """One Gram matrix for each variance, each cluster counted so many times."""
-        return self.grams.sum(axis=1) if weight is None else np.einsum("g,vgij->vij", weight, self.grams)
+        if weight is None:
+            return self._total
+        plain = np.tensordot(weight, self.grams, axes=1)
+        by_trip = weight[self.home][:, None] * self.levels
+        every = range(len(self.variances))
+        return np.stack([plain - (by_trip * self._shrink(v)[:, None]).T @ self.levels for v in every])
 
     def _normal(self, gram: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrices and right-hand sides for the base columns and those at `at`."""
@@ -152,6 +185,10 @@ class Evidence:
         spread = self._jackknife(at, v)[:, self.base :] - beta
         return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
 
+    def misfit(self) -> float:
+        """What the residual costs as it is, in log-likelihood, at the levels' best variance."""
+        return float(np.min(0.5 * self.totals()[:, -1, -1] + self.cost))
+
     def step(self) -> tuple[np.ndarray, np.ndarray]:
         """The base columns' own Gauss-Newton step, and its standard errors from clusters left out in turn.
 
@@ -196,12 +233,13 @@ class Evidence:
     def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
         """The same evidence with the candidate's columns given a sign in each cluster."""
         at = self.base + np.asarray(candidate.columns)
-        grams = self.grams.copy()
-        inner = grams[:, :, at[:, None], at[None, :]]
-        grams[:, :, :, at] *= sign[None, :, None, None]
-        grams[:, :, at, :] *= sign[None, :, None, None]
-        grams[:, :, at[:, None], at[None, :]] = inner
-        return replace(self, grams=grams)
+        grams, levels = self.grams.copy(), self.levels.copy()
+        inner = grams[:, at[:, None], at[None, :]]
+        grams[:, :, at] *= sign[:, None, None]
+        grams[:, at, :] *= sign[:, None, None]
+        grams[:, at[:, None], at[None, :]] = inner
+        levels[:, at] *= sign[self.home][:, None]
+        return replace(self, grams=grams, levels=levels)
 
     def present(self, at: Sequence[int], values: Float[np.ndarray, " k"]) -> float:
         """p of base columns against being taken out: their values against zero with jackknifed clusters."""
@@ -212,8 +250,9 @@ class Evidence:
 
     def _jackknife(self, at: np.ndarray, v: int) -> np.ndarray:
         """Coefficients of base and `at` columns with each cluster left out in turn."""
-        grams = self.grams[v]
-        a, b = self._normal(grams.sum(axis=0) - grams, at)
+        index = np.r_[np.arange(self.base), at, self.grams.shape[-1] - 1].astype(int)
+        grams = self.by_cluster(v)[:, index[:, None], index[None, :]]
+        a, b = self._normal(grams.sum(axis=0) - grams, np.arange(self.base, len(index) - 1))
         if not a.shape[-1]:
             return b
         d = np.sqrt(np.maximum(np.einsum("gii->gi", a), 1e-300))
@@ -221,7 +260,7 @@ class Evidence:
 
     def _loss(self, x: np.ndarray, index: np.ndarray, v: int) -> np.ndarray:
         """Half the sum of squares of each cluster under its own left-out coefficients."""
-        grams = self.grams[v]
+        grams = self.by_cluster(v)
         inner, cross = grams[:, index[:, None], index[None, :]], grams[:, index, -1]
         quadratic = np.einsum("gi,gij,gj->g", x, inner, x)
         return 0.5 * (grams[:, -1, -1] - 2 * np.einsum("gi,gi->g", x, cross) + quadratic)
@@ -231,7 +270,7 @@ class Evidence:
         small, candidate = self.only(s.candidate)
         out = np.zeros(draws)
         # what lives in k clusters meets itself, up to its sign, in one draw of 2^(k−1): that is no placebo
-        energy = np.einsum("gii->g", small.grams[0][:, self.base : -1, self.base : -1])
+        energy = np.einsum("gii->g", small.by_cluster(0)[:, self.base : -1, self.base : -1])
         for i in range(draws):
             sign = rng.choice([-1.0, 1.0], size=self.count)
             if abs(sign @ energy) > 0.98 * energy.sum():
@@ -243,8 +282,9 @@ class Evidence:
     def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:
         """Evidence of one candidate alone, and the candidate with its columns' places in it."""
         index = np.r_[np.arange(self.base), self.base + np.asarray(candidate.columns), self.grams.shape[-1] - 1]
-        grams = self.grams[:, :, index[:, None], index[None, :]]
-        return replace(self, grams=grams), replace(candidate, columns=tuple(range(len(candidate.columns))))
+        grams, levels = self.grams[:, index[:, None], index[None, :]], self.levels[:, index]
+        small = replace(self, grams=grams, levels=levels)
+        return small, replace(candidate, columns=tuple(range(len(candidate.columns))))
 
 
 def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
@@ -270,53 +310,6 @@ def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None
     more = np.arange(clusters, 20 * clusters + 1)
     enough = stats.f.sf(statistic * more / clusters, k, more - k) <= level
     return int(more[np.argmax(enough)]) if enough.any() else None
-
-
-LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)  # variances of levels that are tried, over the one estimated
-
-
-def gather(
-    white: Float[np.ndarray, "row k"],
-    base: int,
-    clusters: Clusters,
-    noise: Noise,
-    *,
-    moved: np.ndarray,
-    prior_sd: np.ndarray,
-) -> Evidence:
-    """Gram matrices by cluster of whitened rows [Jacobian | candidates | residual | level].
-
-    **Arguments:** `white` from `whiten`; `base`, the number of Jacobian columns; `moved`, how far the present
-    coefficients are from their tables, whose sds are `prior_sd`. Clusters are trips where levels have a variance.
-    """
-    grams = _by_cluster(white, clusters)
-    inner, level, square = grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1]
-    variances = np.array(LEVELS if noise.level_sd > 0 else (0.0,)) * noise.level_sd**2
-    shrink = variances[:, None] / (1.0 + variances[:, None] * square)
-    out = inner[None] - shrink[:, :, None, None] * np.einsum("gi,gj->gij", level, level)[None]
-    cost = 0.5 * np.sum(np.log1p(variances[:, None] * square), axis=1)
-    precision = 1.0 / prior_sd**2
-    return Evidence(out, cost, base, precision, precision * moved)
-
-
-def gather_plain(
-    rows: Float[np.ndarray, "row k"],
-    base: int,
-    clusters: Clusters,
-    *,
-    variance: float,
-    moved: np.ndarray,
-    prior_sd: np.ndarray,
-) -> Evidence:
-    """The same from rows [Jacobian | candidates | residual] as they are; `variance` is what one row counts for."""
-    precision = 1.0 / prior_sd**2
-    grams = _by_cluster(rows, clusters)[None] / variance
-    return Evidence(grams, np.zeros(1), base, precision, precision * moved)
-
-
-def _by_cluster(rows: np.ndarray, clusters: Clusters) -> np.ndarray:
-    """One Gram matrix per cluster: the only pass over the rows."""
-    return np.stack([part.T @ part for part in np.split(rows, np.flatnonzero(np.diff(clusters.ids)) + 1)])
 
 
 def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:

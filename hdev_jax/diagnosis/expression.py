@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.look import Loop, Search, look
@@ -29,6 +29,7 @@ __all__ = ["Expression", "Factor", "find_expression", "monomials"]
 
 STRICTER = 5.0  # a description of the rest has to clear a level so much lower than a cause does
 MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds of columns
+TOGETHER = 64  # monomials that are evaluated at once
 QUANTILES = (0.5, 0.75, 0.9)
 MOTION = ("speed_mps", "accel_mps2")
 TERM = "derived:expression"
@@ -131,12 +132,41 @@ def monomials(segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
     return sets
 
 
-def _columns(car: Vehicle, segments: Segments, target: Target, terms: np.ndarray) -> Float[np.ndarray, "row k"]:
-    """What a watt times each of the terms [k, row] adds to the target, through the whole vehicle."""
-    width = -(-len(terms) // 64) * 64  # a few widths only, so that it is compiled a few times
-    wide = np.concatenate([terms, np.zeros((width - len(terms), terms.shape[1]))])
-    car = car.plus(Described(np.asarray(1.0)))
-    return np.asarray(_added(car, jax.tree.map(jnp.asarray, segments), target, jnp.asarray(wide)))[: len(terms)].T
+@dataclass(frozen=True)
+class Terms:
+    """Monomials as candidates, each over its RMS `scales` on the log: what makes their columns of any rows."""
+
+    sets: tuple[tuple[Factor, ...], ...]
+    scales: tuple[float, ...]
+    car: Vehicle  # that describes: k is 1
+    target: Target
+
+    @property
+    def candidates(self) -> list[Candidate]:
+        """One for each monomial."""
+        return [Candidate(Described, ("k",), (None,), (), "size", (i,)) for i in range(self.width)]
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """No effect is left out."""
+        return {}
+
+    @property
+    def width(self) -> int:
+        """How many there are."""
+        return len(self.sets)
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write what a watt times each monomial adds to the target, through the whole vehicle, into `out`."""
+        wanted = list(range(self.width) if at is None else at)
+        segments = jax.tree.map(jnp.asarray, segments)
+        for start in range(0, len(wanted), TOGETHER):
+            some = wanted[start : start + TOGETHER]
+            terms = np.zeros((TOGETHER, len(segments)))  # always as many, so that it is compiled once
+            for i, k in enumerate(some):
+                terms[i] = product(self.sets[k], segments) / self.scales[k]
+            added = np.asarray(_added(self.car, segments, self.target, jnp.asarray(terms)))
+            out[:, start : start + len(some)] = added[: len(some)].T
 
 
 @eqx.filter_jit
@@ -146,6 +176,17 @@ def _added(car: Vehicle, segments: Segments, target: Target, terms: Array) -> Ar
 
     nothing = predicted(jnp.zeros(terms.shape[1]))
     return jax.lax.map(lambda term: predicted(term) - nothing, terms)
+
+
+def _terms(vehicle: Vehicle, segments: Segments, rows: int, target: Target) -> Terms:
+    """The monomials that vary on the first `rows` rows."""
+    sets, scales = [], []
+    for factors in monomials(segments, rows):
+        term = product(factors, segments)[:rows]
+        scale = float(np.sqrt(np.mean(term**2)))
+        if np.isfinite(scale) and np.std(term) > 1e-9 * scale > 0:
+            sets, scales = [*sets, factors], [*scales, scale]
+    return Terms(tuple(sets), tuple(scales), vehicle.plus(Described(np.asarray(1.0))), target)
 
 
 def find_expression(
@@ -158,33 +199,27 @@ def find_expression(
     the rows to predict with `predict(vehicle, segments)`.
     """
     n, segments = problem.rows.rows, problem.rows.segments
-    sets, terms, scales = [], [], []
-    for factors in monomials(segments, n):
-        term = product(factors, segments)
-        scale = float(np.sqrt(np.mean(term[:n] ** 2)))
-        if np.isfinite(scale) and np.std(term[:n]) > 1e-9 * scale > 0:
-            sets, terms, scales = [*sets, factors], [*terms, term / scale], [*scales, scale]
-    if not sets:
+    terms = _terms(state.fit.vehicle, segments, n, problem.target)
+    if not terms.width:
         return None
-    matrix = _columns(state.fit.vehicle, segments, problem.target, np.stack(terms))[:n]
-    found = [Candidate(Described, ("k",), (None,), (), "size", (i,)) for i in range(len(sets))]
     start = replace(state, refused=(), taken_out=())
-    view = look(problem, start, made=(found, matrix, {}))
+    view = look(problem, start, made=terms)
     best = view.best.get("expression")
     if best is None:
         return None
     which = best.candidate.columns[0]
-    rows = replace(problem.rows, segments=segments.with_channels(**{TERM: terms[which]}))
+    factors, scale = terms.sets[which], terms.scales[which]
+    rows = replace(problem.rows, segments=segments.with_channels(**{TERM: product(factors, segments) / scale}))
     narrow = replace(problem, rows=rows, fdr=problem.fdr / STRICTER)
     chosen = choose(narrow, start, view, tell, skip=(), tries=1)
     if chosen is None:
         return None
     at = next(i for i, c in enumerate(chosen.fit.table.free) if c.path == "effects.expression.k")
-    value, sd = chosen.fit.values[at] / scales[which], chosen.fit.sd[at] / scales[which]
-    words = "·".join(f.words() for f in sets[which])
-    formula = f"({value:.3g} ± {sd:.2g}) {_power_unit(sets[which])} · {words}"
-    everything = everything.with_channels(**{TERM: product(sets[which], everything) / scales[which]})
-    names = tuple(dict.fromkeys(f.name for f in sets[which]))
+    value, sd = chosen.fit.values[at] / scale, chosen.fit.sd[at] / scale
+    words = "·".join(f.words() for f in factors)
+    formula = f"({value:.3g} ± {sd:.2g}) {_power_unit(factors)} · {words}"
+    everything = everything.with_channels(**{TERM: product(factors, everything) / scale})
+    names = tuple(dict.fromkeys(f.name for f in factors))
     kept = {f.id for f in prune(narrow, chosen, tell).found}
     superfluous = tuple(f.id for f in state.found if f.id not in kept)
     return Expression(formula, names, chosen.found[-1].q_value, predict(chosen.fit.vehicle, everything), superfluous)

@@ -5,13 +5,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hdev_jax.diagnosis.candidates import Candidate, columns
-from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, clusters_needed, gather, gather_plain
-from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
-from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable, jacobian
-from hdev_jax.inference.calibrate import WEAK
+from hdev_jax.diagnosis.candidates import Candidate, Source, plan_of
+from hdev_jax.diagnosis.chunks import CHUNK_ROWS, Shapes, chunks_of_fit
+from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, clusters_needed
+from hdev_jax.diagnosis.facts import Facts, facts_of
+from hdev_jax.diagnosis.settle import settle
+from hdev_jax.diagnosis.sums import Ground, both_looks
+from hdev_jax.diagnosis.whiten import Noise, estimate_noise
+from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
 from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.physics.vehicle import Target
+from hdev_jax.segments import trip_slices
 
 __all__ = [
     "LEFT_OUT",
@@ -21,12 +25,9 @@ __all__ = [
     "Verdict",
     "View",
     "best_of",
-    "both_looks",
-    "distance_from_table",
-    "evidence_of",
     "look",
     "plausible",
-    "slow",
+    "scored",
     "worth",
 ]
 
@@ -79,7 +80,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Loop:
-    """What stays the same through the loop."""
+    """What stays the same through the loop; passes over its rows take `chunk_rows` of them at a time."""
 
     rows: Fit
     target: Target
@@ -88,6 +89,7 @@ class Loop:
     fdr: float
     rng: np.random.Generator
     gears: int
+    chunk_rows: int = CHUNK_ROWS
 
     @property
     def trip(self) -> np.ndarray:
@@ -101,6 +103,25 @@ class Loop:
     def measured(self) -> np.ndarray:
         return np.asarray(self.rows.measured)[: self.rows.rows]
 
+    @property
+    def facts(self) -> Facts:
+        """What its candidates depend on beside its rows."""
+        return facts_of(self.rows.segments, self.rows.rows)
+
+    def noise(self, fit: Calibration) -> Noise:
+        """The noise of what a fit leaves."""
+        levels = self.clusters.kind == "trip"
+        return estimate_noise(self.measured - fit.predicted, self.trip, self.seconds, levels=levels)
+
+    def ground(self, fit: Calibration, noise: Noise) -> Ground:
+        """What passes over these rows stand on, with this fit and noise."""
+        lengths = [s.stop - s.start for _, s in trip_slices(self.trip)]
+        shapes = Shapes(self.rows.rows, max(lengths), self.chunk_rows)
+        residual = self.measured - fit.predicted
+        return Ground(
+            lambda: chunks_of_fit(self.rows, residual, shapes), self.clusters, len(lengths), fit, self.target, noise
+        )
+
 
 @dataclass
 class View:
@@ -108,27 +129,25 @@ class View:
 
     evidence: Evidence
     plain: Evidence
-    noise: Noise
+    ground: Ground
+    source: Source
+    slow: np.ndarray
     best: dict[str, Score]
     ways: dict[str, int]
     q: dict[str, float]
     left_out: dict[str, str]
     absorbs: dict[str, list[str]]
     absorbed_by: dict[str, str]
-    fit: Calibration
-    residual: np.ndarray
-    jacobian: np.ndarray
-    matrix: np.ndarray
     reasons: dict[str, str] = field(default_factory=dict)
 
-    def verdicts(self, state: Search, fdr: float, trip: np.ndarray) -> list[Verdict]:
+    def verdicts(self, state: Search, fdr: float) -> list[Verdict]:
         """Why each candidate that the vehicle still lacks was not chosen."""
         out = []
         for id_, s in sorted(self.best.items(), key=lambda kv: -kv[1].gain):
             if state.vehicle.has(id_):
                 continue
             why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
-            between = bool(slow(self.matrix[:, list(s.candidate.columns)], trip).all())
+            between = bool(self.slow[list(s.candidate.columns)].all())
             out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, self._needed(s, fdr), between))
         out += [Verdict(id_, None, 1.0, f"not tried: {why}") for id_, why in self.left_out.items()]
         return out
@@ -175,44 +194,30 @@ def worth(gain: float, c: Candidate) -> float:
     return gain - 3.0 * len(c.columns) - 1.5 * (c.freedoms - len(c.columns))
 
 
-def distance_from_table(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    prior = np.array([c.value for c in fit.table.free])
-    sd = np.array([c.sd if c.sd is not None else WEAK * c.scale for c in fit.table.free])
-    return fit.values - prior, sd
-
-
-Made = tuple[list[Candidate], np.ndarray, dict[str, str]]
-
-
-def look(problem: Loop, state: Search, made: Made | None = None) -> View:
+def look(problem: Loop, state: Search, made: Source | None = None) -> View:
     """Whiten, gather and score everything once: the problem's effects, or candidates `made` elsewhere."""
-    rows, n = problem.rows, problem.rows.rows
-    residual = problem.measured - state.fit.predicted
-    noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
-    car = state.fit.vehicle
-    jac = jacobian(car, state.table, rows.segments, problem.target)[:n]
-    candidates, matrix, left_out = made or columns(car, problem.effects, rows.segments, n, problem.target)
-    evidence, plain = both_looks(problem, state.fit, noise, jac, matrix, residual)
-    best, ways = best_of(evidence, plain, candidates, slow(matrix, problem.trip))
-    for id_ in {c.id for c in candidates} - set(best):
+    noise = problem.noise(state.fit)
+    fit, _ = settle(problem, state.fit, noise)
+    source = made or plan_of(fit.vehicle, problem.effects, problem.facts, problem.target)
+    return scored(problem.ground(fit, noise), source)
+
+
+def scored(ground: Ground, source: Source) -> View:
+    """Every candidate of the source scored in one pass over the log's chunks."""
+    evidence, plain, slow = both_looks(ground, source)
+    best, ways = best_of(evidence, plain, source.candidates, slow)
+    left_out = dict(source.left_out)
+    for id_ in {c.id for c in source.candidates} - set(best):
         left_out[id_] = "does nothing on this log"
-    absorbs, absorbed_by = _absorption(evidence, state, best)
+    absorbs, absorbed_by = _absorption(evidence, ground.fit.table, best)
     ids = list(best)
     ps = [best[i].over(ways[i]) if i not in absorbed_by else 1.0 for i in ids]
     q = dict(zip(ids, adjusted(ps), strict=True))
-    return View(evidence, plain, noise, best, ways, q, left_out, absorbs, absorbed_by, state.fit, residual, jac, matrix)
-
-
-def slow(matrix: np.ndarray, trip: np.ndarray) -> np.ndarray:
-    """Which columns hardly change inside a trip: those that only trips can tell."""
-    edges = np.r_[0, np.flatnonzero(np.diff(trip)) + 1]
-    rows = np.diff(np.r_[edges, len(trip)])
-    means = np.add.reduceat(matrix, edges, axis=0)
-    return np.sum(means**2 / rows[:, None], axis=0) > 0.5 * np.sum(matrix**2, axis=0)
+    return View(evidence, plain, ground, source, slow, best, ways, q, left_out, absorbs, absorbed_by)
 
 
 def best_of(
-    evidence: Evidence, plain: Evidence, candidates: list[Candidate], slow: np.ndarray
+    evidence: Evidence, plain: Evidence, candidates: Sequence[Candidate], slow: np.ndarray
 ) -> tuple[dict[str, Score], dict[str, int]]:
     """The best plausible way to have each effect, and how many ways were tried."""
     totals = evidence.totals()
@@ -230,7 +235,7 @@ def best_of(
         looks = [_first_plausible([evidence.score(c) for _, c in _leading(entries)])]
         scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
         if scores:
-            looks.append(_first_plausible(sorted(scores, key=lambda s: -worth(s.gain, s.candidate))))
+            looks.append(_first_plausible(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
         # what both looks see is told by the whitened rows, which see it better
         able = [s for s in looks if plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
         best[id_] = min(able, key=lambda s: (s.p > 1e-6, s.p if s.p > 1e-6 else 0.0))
@@ -238,40 +243,26 @@ def best_of(
 
 
 def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
-    return sorted(entries, key=lambda e: -e[0])[:6]
+    return sorted(entries, key=lambda e: _falling(e[0]))[:6]
+
+
+def _falling(worth: float) -> float:
+    """For sorting from the best: ways that come to the same but for rounding keep the order of the library's grids.
+
+    A delay of a row by linear and by cubic interpolation is one column, but where a refit starts from differs.
+    """
+    return -float(f"{worth:.9g}")
 
 
 def _first_plausible(scores: list[Score]) -> Score:
     return next((s for s in scores if plausible(s)), scores[0])
 
 
-def both_looks(
-    problem: Loop, fit: Calibration, noise: Noise, jac: np.ndarray, matrix: np.ndarray, residual: np.ndarray
-) -> tuple[Evidence, Evidence]:
-    """Evidence from whitened rows, and from rows as they are, each worth 1/inflation of its own variance."""
-    rows = np.concatenate([jac, matrix, residual[:, None]], axis=1)
-    moved, sd = distance_from_table(fit)
-    white = whiten(rows, noise, problem.trip, problem.seconds)
-    variance = float(np.mean(residual**2)) * fit.inflation
-    return (
-        gather(white, jac.shape[1], problem.clusters, noise, moved=moved, prior_sd=sd),
-        gather_plain(rows, jac.shape[1], problem.clusters, variance=variance, moved=moved, prior_sd=sd),
-    )
-
-
-def evidence_of(problem: Loop, fit: Calibration, noise: Noise) -> Evidence:
-    """A fitted vehicle's own Jacobian and residual, whitened; no candidates."""
-    jac = jacobian(fit.vehicle, fit.table, problem.rows.segments, problem.target)[: problem.rows.rows]
-    white = whiten(np.c_[jac, problem.measured - fit.predicted], noise, problem.trip, problem.seconds)
-    moved, sd = distance_from_table(fit)
-    return gather(white, jac.shape[1], problem.clusters, noise, moved=moved, prior_sd=sd)
-
-
 def _absorption(
-    evidence: Evidence, state: Search, best: dict[str, Score]
+    evidence: Evidence, table: ParameterTable, best: dict[str, Score]
 ) -> tuple[dict[str, list[str]], dict[str, str]]:
     """Which candidates lie in the span of the fitted coefficients, and of which one mostly."""
-    names = [c.name for c in state.table.free]
+    names = [c.name for c in table.free]
     absorbs: dict[str, list[str]] = {n: [] for n in names}
     by: dict[str, str] = {}
     total = evidence.totals()[0]

@@ -6,20 +6,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates import FIXED, Candidate, columns, finer, realised
+from hdev_jax.diagnosis.candidates import FIXED, Candidate, finer, plan_of, realised
 from hdev_jax.diagnosis.evidence import ABSORBED, Score
-from hdev_jax.diagnosis.look import (
-    Found,
-    Loop,
-    Search,
-    View,
-    best_of,
-    both_looks,
-    distance_from_table,
-    evidence_of,
-    plausible,
-    slow,
-)
+from hdev_jax.diagnosis.look import Found, Loop, Search, View, best_of, plausible
+from hdev_jax.diagnosis.settle import settle
+from hdev_jax.diagnosis.sums import both_looks, distance_from_table, evidence_of
 from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian, predict
 from hdev_jax.inference.parameters import Coefficient
@@ -30,7 +21,6 @@ __all__ = ["grow", "is_size", "refit"]
 BORNE_OUT = 2.6  # standard errors: 1 %
 AGREES = 2.25  # standard errors between what plain rows say of a size and what whitened ones do
 SEEN = 12.0  # standard errors of whitened rows: a quarter of it would be three
-STEPS, SETTLED = 6, 0.05  # Gauss-Newton steps on whitened rows; standard errors that the last may move by
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
@@ -50,7 +40,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     if new is None and c.kind == "size" and not s.plain and np.all(np.abs(plain - white) <= AGREES * plain_sd):
         # rows of equal weight do not bear it out, but leave room for what the whitened rows say: that is then what is
         # known of it beforehand
-        known = _whitened(problem, state, refined, view.noise)
+        known = _whitened(problem, state, refined, view.ground.noise)
         new = _tried(problem, state, refined, known) if known else None
     return None if new is None else (new, _gain(problem, state, new.fit, view))
 
@@ -64,29 +54,23 @@ def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) ->
 
 
 def _whitened(problem: Loop, state: Search, s: Score, noise: Noise) -> dict[str, tuple[float, float]]:
-    """Sizes and standard errors by whitened rows, every coefficient fitted with them; empty where a size leaves its
-    range or the steps do not settle.
+    """Sizes and standard errors by whitened rows, every coefficient fitted with them; empty where that fails.
 
     One linear step is not enough: the coefficients that it starts from have been fitted without the effect.
     """
     effect = realised(s.candidate, s.beta, gears=problem.gears)
     table = state.table.plus(*_coefficients(s.candidate, effect, shapes=False))
     vehicle, rows = state.fit.vehicle.plus(effect), problem.rows
-    theta, moved = table.values(vehicle), np.inf
-    names = [c.path.removeprefix(f"effects.{s.candidate.id}.") for c in table.free]
-    at = [names.index(n) for n in s.candidate.sizes if n in names]
-    error = np.zeros(len(theta))
-    for _ in range(STEPS):
-        vehicle = table.insert(vehicle, theta)
-        predicted = np.asarray(predict(vehicle, rows.segments, problem.target))[: rows.rows]
-        fit = replace(state.fit, vehicle=vehicle, table=table, values=theta, predicted=predicted)
-        step, error = evidence_of(problem, fit, noise).step()
-        theta, moved = theta + step, float(np.max(np.abs(step[at]) / np.maximum(error[at], 1e-300)))
-        if not all(c.lower <= x <= c.upper for c, x in zip(table.free, theta, strict=True)):
-            return {}
-        if moved < SETTLED:
-            break
-    return {names[k]: (float(theta[k]), float(error[k])) for k in at} if moved < 1.0 else {}
+    predicted = np.asarray(predict(vehicle, rows.segments, problem.target))[: rows.rows]
+    start = replace(state.fit, vehicle=vehicle, table=table, values=table.values(vehicle), predicted=predicted)
+    fit, error = settle(problem, start, noise)
+    prefix = f"effects.{s.candidate.id}."
+    found = {
+        c.path.removeprefix(prefix): (float(x), float(e))
+        for c, x, e in zip(table.free, fit.values, error, strict=True)
+        if c.path.startswith(prefix)
+    }
+    return found if all(np.isfinite(e) for _, e in found.values()) else {}
 
 
 def _tried(problem: Loop, state: Search, s: Score, known: Mapping[str, tuple[float, float]]) -> Search | None:
@@ -121,15 +105,15 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
     Where trips alone tell it, the grid reaches a whole step to either side and least squares chooses on it: thresholds
     of a few trips have many small optima for the joint refit to end in.
     """
-    row_s = float(np.median(np.asarray(problem.rows.segments.duration_s)[: problem.rows.rows]))
-    grids = finer(s.candidate, row_s, reach=1.0 if s.plain else 0.5)
+    facts = problem.facts
+    grids = finer(s.candidate, facts.row_s, reach=1.0 if s.plain else 0.5)
+    if "at_trip" in grids:
+        grids["at_trip"] = facts.steps_near(dict(s.candidate.shapes)["at_trip"])
     if all(len(g) == 1 for g in grids.values()):
         return s
-    n = problem.rows.rows
-    effects = [s.candidate.effect]
-    found, matrix, _ = columns(view.fit.vehicle, effects, problem.rows.segments, n, problem.target, grids)
-    same = [c for c in found if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
-    evidence, plain = both_looks(problem, view.fit, view.noise, view.jacobian, matrix, view.residual)
+    plan = plan_of(view.ground.fit.vehicle, [s.candidate.effect], facts, problem.target, grids)
+    same = [c for c in plan.candidates if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
+    evidence, plain, slow = both_looks(view.ground, plan)
     if s.plain:
         totals = plain.totals()
         fits = [(*plain.gain(totals, c.columns), c) for c in same]
@@ -138,7 +122,7 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
             return s
         _, beta, c = max(inside, key=lambda f: f[0])
         return replace(s, candidate=c, beta=beta)
-    best, _ = best_of(evidence, plain, same, slow(matrix, problem.trip))
+    best, _ = best_of(evidence, plain, same, slow)
     finest = best.get(s.candidate.id)
     return finest if finest is not None and finest.gain > s.gain and not finest.plain else s
 
@@ -174,8 +158,8 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
 
 def _gain(problem: Loop, state: Search, fit: Calibration, view: View) -> float:
     """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
-    after = evidence_of(problem, fit, view.noise)
-    prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (state.fit, fit)]
+    after = evidence_of(problem.ground(fit, view.ground.noise))
+    prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (view.ground.fit, fit)]
     before = view.evidence.base_likelihood(view.evidence.totals()) - prior[0]
     return after.base_likelihood(after.totals()) - prior[1] - before
 

@@ -6,21 +6,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.evidence import Score, gather
-from hdev_jax.diagnosis.look import (
-    LEFT_OUT,
-    Found,
-    Loop,
-    Search,
-    View,
-    distance_from_table,
-    evidence_of,
-    look,
-    plausible,
-    worth,
-)
+from hdev_jax.diagnosis.chunks import Chunk
+from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.look import LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
 from hdev_jax.diagnosis.refit import grow, is_size, refit
-from hdev_jax.diagnosis.whiten import estimate_noise, whiten
+from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle, most_group
 from hdev_jax.physics.vehicle import Target
@@ -83,12 +73,12 @@ def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) 
         choice = choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
     if choice is None:
         grown = grow(problem, state, tell)
-        return replace(grown or state, verdicts=view.verdicts(state, problem.fdr, problem.trip), finished=grown is None)
+        return replace(grown or state, verdicts=view.verdicts(state, problem.fdr), finished=grown is None)
     choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
     state = prune(problem, choice, tell)
     trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
-    return replace(state, verdicts=view.verdicts(state, problem.fdr, problem.trip), trail=trail)
+    return replace(state, verdicts=view.verdicts(state, problem.fdr), trail=trail)
 
 
 def choose(
@@ -149,7 +139,7 @@ def _placebo(problem: Loop, s: Score, view: View, draws: int = 19) -> str | None
     random sign in each trip instead. (Signs mean little to an effect of two or three trips, shifts nothing to a
     constant.)
     """
-    column = view.matrix[:, list(s.candidate.columns)]
+    column = written_by_chunk(view.ground, view.source, s.candidate.columns)
     edges = np.flatnonzero(np.diff(problem.trip)) + 1
     parts = np.split(np.arange(len(column)), edges)
     within = np.concatenate([column[p] - column[p].mean(axis=0) for p in parts])
@@ -159,16 +149,18 @@ def _placebo(problem: Loop, s: Score, view: View, draws: int = 19) -> str | None
         if np.mean(signs >= s.gain) > 0.01:
             return "a placebo (its column with the trips' signs drawn at random) does as well"
         return None
-    shifted = []
-    for _ in range(draws):
-        moved = [np.roll(p, int(problem.rng.integers(len(p) // 8, max(len(p) - len(p) // 8, 2)))) for p in parts]
-        shifted.append(column[np.concatenate(moved)])
-    rows = np.concatenate([view.jacobian, *shifted, view.residual[:, None]], axis=1)
-    moved_by, sd = distance_from_table(view.fit)
-    base = view.jacobian.shape[1]
-    white = whiten(rows, view.noise, problem.trip, problem.seconds)
-    evidence = gather(white, base, problem.clusters, view.noise, moved=moved_by, prior_sd=sd)
-    totals, k = evidence.totals(), column.shape[1]
+    sizes = [len(p) for p in parts]
+    shifts = [[int(problem.rng.integers(n // 8, max(n - n // 8, 2))) for n in sizes] for _ in range(draws)]
+    k = column.shape[1]
+
+    def shifted(out: np.ndarray, chunk: Chunk) -> None:
+        own = column[chunk.at]
+        for t, trip in enumerate(chunk.slices(), start=chunk.first_trip):
+            for i, by in enumerate(shifts):
+                out[trip, i * k : (i + 1) * k] = np.roll(own[trip], by[t], axis=0)
+
+    evidence = evidence_of(view.ground, draws * k, shifted)
+    totals = evidence.totals()
     before = evidence.base_likelihood(totals)
     gains = [evidence.gain(totals, range(i * k, (i + 1) * k), before)[0] for i in range(draws)]
     return "a placebo (its column shifted in time) does as well" if max(gains) >= s.gain else None
@@ -217,7 +209,7 @@ def _stability(problem: Loop, view: View, chosen: Score, names: set[str], refuse
         gains = []
         for s, (evidence, candidate) in zip(rivals, small, strict=True):
             if s.plain:
-                gain = replace(evidence, grams=evidence.grams[:, drawn]).plain_score(candidate).gain
+                gain = replace(evidence, grams=evidence.grams[drawn]).plain_score(candidate).gain
             else:
                 gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
             gains.append(worth(gain, candidate))
@@ -228,9 +220,7 @@ def _stability(problem: Loop, view: View, chosen: Score, names: set[str], refuse
 def prune(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search:
     """Backward: an effect that the later ones made superfluous goes, the weakest first."""
     while len(state.found) > 1:
-        residual = problem.measured - state.fit.predicted
-        noise = estimate_noise(residual, problem.trip, problem.seconds, levels=problem.clusters.kind == "trip")
-        evidence = evidence_of(problem, state.fit, noise)
+        evidence = evidence_of(problem.ground(state.fit, problem.noise(state.fit)))
         worst: tuple[float, Found] | None = None
         for f in state.found[:-1]:
             if f.score.candidate.kind == "limit":

@@ -15,9 +15,9 @@ from hdev_jax.inference.clusters import Clusters
 from hdev_jax.inference.parameters import ParameterTable, insert
 from hdev_jax.physics import Vehicle, derived
 from hdev_jax.physics.vehicle import Target
-from hdev_jax.segments import Segments, padded_size
+from hdev_jax.segments import Segments
 
-__all__ = ["Calibration", "Fit", "calibrate", "jacobian", "padded", "predict"]
+__all__ = ["Calibration", "Fit", "calibrate", "jacobian", "padded", "padded_rows", "predict"]
 
 STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
@@ -58,10 +58,19 @@ class Calibration:
         return (self.values - prior) / sd
 
 
-def padded(segments: Segments, measured: np.ndarray) -> Fit:
-    """Rows padded to the next of eight shapes per octave, so that logs of like length share one compilation."""
+def padded_rows(n: int) -> int:
+    """The next of eight shapes per octave, so that logs of like length share one compilation."""
+    quantum = max(64, 2 ** max(int(np.ceil(np.log2(max(n, 1)))) - 3, 0))
+    return int(np.ceil(n / quantum) * quantum)
+
+
+def padded(segments: Segments, measured: np.ndarray, size: int | None = None) -> Fit:
+    """Rows padded to `size` rows, by default to `padded_rows` of them. Raises `ValueError` where they do not fit."""
     n = len(segments)
-    extra = padded_size(n) - n
+    size = padded_rows(n) if size is None else size
+    if size < n:
+        raise ValueError(f"{n} rows do not fit into {size}; give a size of at least as many rows")
+    extra = size - n
 
     def pad(x: Any, fill: Any = None) -> np.ndarray:
         x = np.asarray(x)

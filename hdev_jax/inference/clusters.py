@@ -7,15 +7,16 @@ from jaxtyping import Float, Int
 
 from hdev_jax.segments import Segments, trip_slices
 
-__all__ = ["BLOCK_S", "FEW_TRIPS", "Clusters", "cluster_rows"]
+__all__ = ["BLOCK_S", "FEW_TRIPS", "MOST_CLUSTERS", "Clusters", "cluster_rows", "clusters_of"]
 
 FEW_TRIPS = 8  # below this many training trips a trip is too coarse a unit (design, step 5)
+MOST_CLUSTERS = 256  # tell a variance to 9 %; each more costs a Gram matrix of all candidates
 BLOCK_S = 300.0  # the shortest block, longer than what correlates errors on the road
 
 
 @dataclass(frozen=True)
 class Clusters:
-    """`ids` per row, 0 … `count` − 1, contiguous; `kind` is "trip" or "block"."""
+    """`ids` per row, 0 … `count` − 1, contiguous; `kind` is "trip" (whole trips) or "block" (parts of one)."""
 
     ids: Int[np.ndarray, " row"]
     count: int
@@ -28,17 +29,25 @@ class Clusters:
 
 
 def cluster_rows(segments: Segments) -> Clusters:
-    """Trips where there are at least `FEW_TRIPS`, else contiguous blocks of each trip of at least `BLOCK_S`."""
-    trip = np.asarray(segments.trip)
+    """Clusters of a log's rows, as `clusters_of` its trips and durations."""
+    return clusters_of(np.asarray(segments.trip), np.asarray(segments.duration_s))
+
+
+def clusters_of(trip: Int[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"]) -> Clusters:
+    """Trips where there are at least `FEW_TRIPS`, else contiguous blocks of each trip of at least `BLOCK_S` [s].
+
+    Where there are more than `MOST_CLUSTERS` trips, neighbours share a cluster.
+    """
     slices = list(trip_slices(trip))
     ids = np.zeros(len(trip), dtype=np.int64)
     if len(slices) >= FEW_TRIPS:
+        most = min(len(slices), MOST_CLUSTERS)
         for k, (_, s) in enumerate(slices):
-            ids[s] = k
-        return Clusters(ids, len(slices), "trip")
+            ids[s] = k * most // len(slices)
+        return Clusters(ids, most, "trip")
     count = 0
     for _, s in slices:
-        clock = np.cumsum(np.asarray(segments.duration_s)[s])
+        clock = np.cumsum(duration_s[s])
         # no more than 60 blocks in all: beyond that they only get shorter, not more independent
         most = max(1, 60 // len(slices))
         blocks = int(np.clip(clock[-1] // BLOCK_S, 1, most))

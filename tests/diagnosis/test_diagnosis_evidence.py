@@ -7,10 +7,11 @@ import pytest
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.evidence import LEVELS, Evidence, adjusted, gather, gather_plain, wald
-from hdev_jax.diagnosis.whiten import Noise
+from hdev_jax.diagnosis.evidence import Evidence, adjusted, wald
+from hdev_jax.diagnosis.sums import LEVELS, Sums
 from hdev_jax.inference import Clusters
 from hdev_jax.physics import LIBRARY
+from hdev_jax.segments import trip_slices
 
 BASE, CANDIDATES = 2, 3
 PRIOR_SD, MOVED = np.array([0.5, 2.0]), np.array([0.3, -1.0])
@@ -41,9 +42,12 @@ class Rows:
     def white(self) -> np.ndarray:
         return np.c_[self.jacobian, self.columns, self.residual, self.level]
 
-    def evidence(self) -> Evidence:
-        noise = Noise(np.zeros((2, 1)), np.ones(2), self.level_sd, np.ones(1), 0.0)
-        return gather(self.white, BASE, self.clusters, noise, moved=MOVED, prior_sd=PRIOR_SD)
+    def evidence(self, **prior) -> Evidence:
+        white, trips = self.white, [s for _, s in trip_slices(self.ids)]
+        sums = Sums(white.shape[1] - 1, self.clusters.count, len(trips))
+        sums.add(white[:, :-1], self.clusters.ids)
+        sums.add_levels(white[:, :-1], white[:, -1], self.clusters.ids, trips)
+        return sums.evidence(BASE, level_sd=self.level_sd, **{"moved": MOVED, "prior_sd": PRIOR_SD, **prior})
 
     def variances(self) -> list[float]:
         return [x * self.level_sd**2 for x in (LEVELS if self.level_sd > 0 else LEVELS[:1])]
@@ -127,8 +131,7 @@ def test_absorbed_columns_gain_nothing():
     """A column in the span of the Jacobian gains what the prior holds back, and nothing under a wide one."""
     rows = Rows(level=0.0)
     rows.columns[:, 2] = rows.jacobian[:, 0]
-    noise = Noise(np.zeros((2, 1)), np.ones(2), 0.0, np.ones(1), 0.0)
-    wide = gather(rows.white, BASE, rows.clusters, noise, moved=np.zeros(BASE), prior_sd=np.full(BASE, 1e6))
+    wide = rows.evidence(moved=np.zeros(BASE), prior_sd=np.full(BASE, 1e6))
     assert wide.gain(wide.totals(), (2,))[0] == pytest.approx(0.0, abs=1e-5)
 
 
@@ -155,7 +158,8 @@ def test_signs_flip_columns_by_cluster():
     sign = np.random.default_rng(1).choice([-1.0, 1.0], 9)
     flipped = rows.evidence().flipped(candidate(0, 2), sign)
     rows.columns[:, [0, 2]] *= sign[rows.ids][:, None]
-    np.testing.assert_allclose(flipped.grams, rows.evidence().grams, rtol=1e-9, atol=1e-9)
+    for v in range(len(LEVELS)):
+        np.testing.assert_allclose(flipped.by_cluster(v), rows.evidence().by_cluster(v), rtol=1e-9, atol=1e-9)
     evidence = rows.evidence()
     for one in (-1.0, 1.0):
         same = evidence.flipped(candidate(0), np.full(9, one))
@@ -194,9 +198,9 @@ def test_plain_rows_count_clusters_alone():
     rows = Rows(level=0.0)
     every = np.c_[rows.jacobian, rows.columns, rows.residual]
     wide = {"moved": np.zeros(BASE), "prior_sd": np.full(BASE, 1e6)}
-    one, other = (
-        gather_plain(every, BASE, rows.clusters, variance=v, **wide).plain_score(candidate(0)) for v in (1.0, 50.0)
-    )
+    sums = Sums(every.shape[1], rows.clusters.count, 0)
+    sums.add(every, rows.clusters.ids)
+    one, other = (sums.evidence(BASE, variance=v, **wide).plain_score(candidate(0)) for v in (1.0, 50.0))
     assert one.plain
     assert one.p_cluster == pytest.approx(other.p_cluster, rel=1e-5)
     np.testing.assert_allclose(one.beta, other.beta, rtol=1e-6)

@@ -1,0 +1,101 @@
+"""How a candidate's column is computed: a vehicle with effects at their null, and a derivative or difference of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdev_jax.inference import insert
+from hdev_jax.physics import Effect, Grouped, Vehicle
+from hdev_jax.physics.vehicle import Target
+from hdev_jax.segments import Segments
+
+__all__ = ["Program", "Recipe", "written"]
+
+Structure = tuple[tuple[str, int | None, float, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """A vehicle with a few effects at their null, compiled once for one shape of rows.
+
+    `structure` says where each of their parameters sits, `null` holds the parameters' null values.
+    """
+
+    car: Vehicle
+    structure: Structure
+    null: Float[np.ndarray, " parameter"]
+
+    @staticmethod
+    def of(vehicle: Vehicle, effects: Sequence[Effect]) -> "Program":
+        """The program of a vehicle with these effects. Raises `ValueError` for one it has already."""
+        structure, null = [], []
+        for e in effects:
+            for p in e.parameters:
+                leaf = getattr(e, p.name)
+                if leaf is None:
+                    continue
+                count = len(leaf.values) if isinstance(leaf, Grouped) else None
+                for g in range(count) if count is not None else (None,):
+                    structure.append((f"effects.{e.id}.{p.name}", g, -np.inf, np.inf))
+                    null.append(p.null)
+        return Program(vehicle.plus(*effects), tuple(structure), np.array(null))
+
+    def recipe(
+        self, effect_id: str, shapes: Sequence[tuple[str, float]], size: tuple[str, int | None] | None
+    ) -> "Recipe":
+        """The derivative in a size (and its group) at these shapes; without a size, the difference they make."""
+        values = self.null.copy()
+        for name, v in shapes:
+            values[self._index(effect_id, name, None)] = v
+        if size is None:
+            return Recipe(self, values, None)
+        tangent = np.zeros_like(values)
+        tangent[self._index(effect_id, *size)] = 1.0
+        return Recipe(self, values, tangent)
+
+    def _index(self, effect_id: str, name: str, group: int | None) -> int:
+        path = f"effects.{effect_id}.{name}"
+        return next(i for i, s in enumerate(self.structure) if s[0] == path and s[1] in (group, None))
+
+
+@dataclass(frozen=True, eq=False)
+class Recipe:
+    """One column: the program's derivative at `values` along `tangent`, or without one its difference to the null."""
+
+    program: Program
+    values: Float[np.ndarray, " parameter"]
+    tangent: Float[np.ndarray, " parameter"] | None
+
+
+def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: Target) -> None:
+    """Write the recipes' columns of padded segments into `out` [row, column]; what is no number counts as 0."""
+    segments = jax.tree.map(jnp.asarray, segments)
+    base: dict[int, np.ndarray] = {}
+    for k, r in enumerate(recipes):
+        p = r.program
+        if r.tangent is not None:
+            column = np.asarray(_slope(p.car, p.structure, target, segments, r.values, r.tangent))
+        else:
+            if id(p) not in base:
+                base[id(p)] = np.asarray(_predict(p.car, p.structure, target, segments, p.null))
+            column = np.asarray(_predict(p.car, p.structure, target, segments, r.values)) - base[id(p)]
+        out[:, k] = np.nan_to_num(column, posinf=0.0, neginf=0.0)
+
+
+@eqx.filter_jit
+def _predict(car: Vehicle, structure: Structure, target: Target, segments: Segments, values: Any) -> Array:
+    return insert(car, structure, jnp.asarray(values)).predict(segments, target)
+
+
+@eqx.filter_jit
+def _slope(car: Vehicle, structure: Structure, target: Target, segments: Segments, values: Any, tangent: Any) -> Array:
+    def predict(x: Array) -> Array:
+        return insert(car, structure, x).predict(segments, target)
+
+    return jax.jvp(predict, (jnp.asarray(values),), (jnp.asarray(tangent),))[1]
