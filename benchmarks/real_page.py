@@ -59,8 +59,9 @@ def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]
     niro = {k.removeprefix("niro_"): r for k, r in results.items() if k.startswith("niro_") and k != "niro_road"}
     folds = {k.removeprefix("ztbus_"): r for k, r in results.items() if k.startswith("ztbus_") and "_no_" not in k}
     held = {k: r for k, r in results.items() if "_no_" in k and k.partition("_no_")[0] in results}
-    lines, drawn = [HEAD, "", "## In short", ""], {}
-    lines += _short(niro, folds, held)
+    lines, drawn = [HEAD], {}
+    if short := _short(niro, folds, held):
+        lines += ["", "## In short", "", *short]
     for section in (
         _niro(niro) if niro else None,
         _road(results["niro_road"]) if "niro_road" in results else None,
