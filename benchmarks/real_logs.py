@@ -1,151 +1,182 @@
 """What the loop does on the measured logs: `python benchmarks/real_logs.py [PART …] --work DIR`, from a checkout.
 
-Parts: niro (trained on each trip in turn), road (the Niro's force balance), ztbus (three folds of missions). Each run
-is one `hdev diagnose`; a run that is there already is read, not repeated. Prints a table and, with --write, keeps it
-in docs/real_logs.md. HDEV_DATA names the data (default ../shared/data).
+Parts: niro (trained on each trip in turn), road (the Niro's force balance), ztbus (three folds of missions), withheld
+(a known channel of ZTBus taken out of the log). Each run is one `hdev diagnose`; a run that is there already is read,
+not repeated, and one that was cut off goes on where it was. With --write the page docs/real_logs.md and its figures are
+made from all runs that are kept in DIR; with --kept nothing is run. HDEV_DATA names the data (default ../shared/data).
 """
 
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
+import tomllib
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+import real_page
+from real_withheld import WITHHELD, compare_logs, write_adapter
 
-__all__ = ["main"]
+__all__ = ["Job", "jobs", "kept", "main"]
 
 DATA = Path(os.environ.get("HDEV_DATA", "../shared/data"))
+PARTS = ("niro", "road", "ztbus", "withheld")
 TRIPS = ("1", "2", "3", "4")
+FOLDS = (1, 2, 3)
+# Which channel is withheld in which fold. The warmth of the passengers is small: the fold decides whether it is found.
+HELD = (("temperature", 1), ("passengers", 1), ("passengers", 3), ("steering", 1))
+ZTBUS = Path("configs/adapters/ztbus.toml")
 
 
-def main() -> int:
-    """Run the parts asked for and print what came out."""
+@dataclass(frozen=True)
+class Job:
+    """One run of `hdev diagnose`; `test` and `train` are the trips asked for, empty where the command names none."""
+
+    name: str
+    logs: tuple[Path, ...]
+    vehicle: str
+    adapter: Path
+    train: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    target: str | None = None
+
+    @property
+    def arguments(self) -> list[str]:
+        split = (("--train-trips", self.train), ("--test-trips", self.test))
+        return [
+            *map(str, self.logs), "--vehicle", self.vehicle, "--adapter", str(self.adapter),
+            *(["--target", self.target] if self.target else []),
+            *(word for option, trips in split if trips for word in (option, ",".join(trips))),
+        ]  # fmt: skip
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the parts asked for and print, or write, the page of all that is kept."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", default=["niro", "road", "ztbus"])
-    parser.add_argument("--work", type=Path, default=Path("out/real_logs"))
-    parser.add_argument("--write", action="store_true", help="keep the tables in docs/real_logs.md")
-    options = parser.parse_args()
-    if not DATA.is_dir():
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}; all where none is named")
+    parser.add_argument("--work", type=Path, default=Path("out/real_logs"), help="where the runs are kept")
+    parser.add_argument("--kept", action="store_true", help="run nothing: the page of the runs that are there")
+    parser.add_argument("--write", action="store_true", help="write real_logs.md and its figures")
+    parser.add_argument("--docs", type=Path, default=Path("docs"), help="where --write writes")
+    parser.add_argument("--missions", type=int, help="only so many missions of ZTBus, for a quick look")
+    options = parser.parse_args(argv)
+    if unknown := set(options.parts) - set(PARTS):
+        parser.error(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    if options.missions and options.write and options.docs == Path("docs"):
+        parser.error("a quick look is not written to docs/: name another folder with --docs")
+    if not options.kept and not DATA.is_dir():
         print(f"no measured data in {DATA}: set HDEV_DATA; README.md says where it is from", file=sys.stderr)
         return 2
-    lines = [
-        "# Measured logs",
-        "",
-        "Made by `python benchmarks/real_logs.py --write`. Every number is on trips that no",
-    ]
-    lines += ["choice has seen; predictions are free of measured power (no feedback).", ""]
-    for part in options.parts:
-        lines += [*{"niro": niro, "road": road, "ztbus": ztbus}[part](options.work), ""]
-    print("\n".join(lines))
+    asked, everything = options.parts or PARTS, jobs(options.work, options.missions)
+    todo = [j for part in PARTS for j in everything[part] if part in asked and kept(j, options.work) is None]
+    if not options.kept:
+        for what, (_, columns) in WITHHELD.items():
+            write_adapter(ZTBUS, columns, _adapter(what, options.work))
+        for k, job in enumerate(todo, 1):
+            _run(job, options.work, f"{k} of {len(todo)}")
+        if "withheld" in asked:
+            _same_rest(everything["withheld"], options.work)
+    results = {j.name: r for part in PARTS for j in everything[part] if (r := kept(j, options.work)) is not None}
+    if absent := [j.name for part in PARTS for j in everything[part] if j.name not in results]:
+        print(f"not on the page, for it was not run: {', '.join(absent)}", file=sys.stderr)
+    warm = _temperatures(everything["ztbus"][0], options.work)
+    rest = _json(options.work / "same_rest.json")
+    page, figures = real_page.page(results, warm=warm, rest=rest)
+    print(page)
     if options.write:
-        Path("docs/real_logs.md").write_text("\n".join(lines).rstrip() + "\n")
+        real_page.write(options.docs, page, figures)
     return 0
 
 
-def _run(out: Path, *arguments: str) -> dict:
-    """One diagnosis; its wall-clock seconds and peak memory are kept beside it."""
-    if not (out / "diagnosis.json").exists():
-        started = time.time()
-        command = [sys.executable, "-m", "hdev_jax.cli", "diagnose", *arguments, "--out", str(out)]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-        cost = {"seconds": time.time() - started, "peak_gib": peak}
-        out.with_name(out.name + ".cost.json").write_text(json.dumps(cost))
-    result = json.loads((out / "diagnosis.json").read_text())
-    cost = out.with_name(out.name + ".cost.json")
-    result["cost"] = json.loads(cost.read_text()) if cost.exists() else {"seconds": np.nan, "peak_gib": np.nan}
-    return result
-
-
-def _found(result: dict) -> str:
-    return ", ".join(e["id"] for e in result["effects"])
-
-
-def _cost(result: dict) -> str:
-    return f"{result['cost']['seconds']:.0f} s, {result['cost']['peak_gib']:.1f} GiB"
-
-
-def niro(work: Path) -> list[str]:
-    """Battery power from motor torque and speed; the sheet declares two efficiencies."""
-    lines = ["## Kia Niro: battery power from motor torque and speed", ""]
-    lines += ["| trained on | before, mean test MSE [kW²] | after | parameters | worst trip energy | found | cost |"]
-    lines += ["|---|---|---|---|---|---|---|"]
-    for trip in TRIPS:
-        r = _run(
-            work / f"niro_{trip}", str(DATA / "kia_niro"), "--vehicle", "configs/vehicles/kia_niro.toml",
-            "--adapter", "configs/adapters/kia_niro.toml", "--train-trips", trip,
-        )  # fmt: skip
-        before, after = ([m["mse"] for m in r[when]["test_by_trip"].values()] for when in ("before", "after"))
-        worst = max((m["pe_percent"] for m in r["after"]["test_by_trip"].values()), key=abs)
-        lines.append(
-            f"| {trip} | {np.mean(before):.3f} | {np.mean(after):.4f} | {r['parameters_fitted']} | {worst:+.2f} % | "
-            f"{_found(r)} | {_cost(r)} |"
-        )
-    lines += ["", "The paper's network of 282 parameters, trained on trip 1 (theirs): 0.1604 in free run; LSTM 0.2322."]
-    return lines
-
-
-def road(work: Path) -> list[str]:
-    """The force at the wheels from speed; the sheet declares mass, rolling resistance and drag, the log no slope."""
-    r = _run(
-        work / "niro_road", str(DATA / "kia_niro"), "--vehicle", "configs/vehicles/kia_niro_road.toml",
-        "--adapter", "configs/adapters/kia_niro.toml", "--target", "traction_force_n", "--train-trips", "1",
-    )  # fmt: skip
-    lines = ["## Kia Niro: traction force, no slope in the log, trained on trip 1", ""]
-    lines += ["| rows of trips 2-4 | n | before, RMSE [N] | after | less by |", "|---|---|---|---|---|"]
-    parts = {"all": {k: r[k]["test"] for k in ("before", "after")}, **r["subsets"]}
-    for name, m in parts.items():
-        b, a = m["before"]["rmse"], m["after"]["rmse"]
-        lines.append(f"| {name} | {m['after']['n']} | {b:.1f} | {a:.1f} | {100 * (1 - a / b):.1f} % |")
-    lines += ["", f"Training trip: {r['before']['train']['rmse']:.0f} N before. Found: {_found(r)}. Cost: {_cost(r)}."]
-    return lines
-
-
-def ztbus(work: Path) -> list[str]:
-    """Electric power of a bus from force and speed; every third mission held out, three times."""
+def jobs(work: Path, missions: int | None = None) -> dict[str, list[Job]]:
+    """All runs by part. Every third mission of ZTBus is held out, three times."""
+    niro, adapter = (DATA / "kia_niro",), Path("configs/adapters/kia_niro.toml")
     files = sorted(p for p in (DATA / "ztbus").glob("B*.csv.gz") if ".grade." not in p.name)
+    if missions:
+        files = [files[round(k * len(files) / missions)] for k in range(missions)]
     names = [p.name[:24] for p in files]
-    import pandas as pd
-
-    warm = {
-        n: pd.read_csv(f, usecols=["temperature_ambient"]).iloc[:, 0].mean() - 273.15
-        for n, f in zip(names, files, strict=True)
+    sheet = "configs/vehicles/ztbus.toml"
+    folds = {k: Job(f"ztbus_{k}", tuple(files), sheet, ZTBUS, test=tuple(names[k - 1 :: 3])) for k in FOLDS}
+    return {
+        "niro": [Job(f"niro_{t}", niro, "configs/vehicles/kia_niro.toml", adapter, train=(t,)) for t in TRIPS],
+        "road": [
+            Job("niro_road", niro, "configs/vehicles/kia_niro_road.toml", adapter, ("1",), target="traction_force_n")
+        ],
+        "ztbus": list(folds.values()),
+        "withheld": [
+            Job(f"ztbus_{k}_no_{what}", tuple(files), sheet, _adapter(what, work), test=folds[k].test)
+            for what, k in HELD
+        ],
     }
-    trips, squares, rows = {}, {"before": 0.0, "after": 0.0}, 0
-    lines = ["## ZTBus: electric power from traction force and speed, every third mission held out", ""]
-    lines += ["| held out from | before, RMSE [kW] | after | found | unexplained | cost |", "|---|---|---|---|---|---|"]
-    for k in range(3):
-        r = _run(
-            work / f"ztbus_{k + 1}", *map(str, files), "--vehicle", "configs/vehicles/ztbus.toml",
-            "--adapter", "configs/adapters/ztbus.toml", "--test-trips", ",".join(names[k::3]),
-        )  # fmt: skip
-        b, a = r["before"]["test"], r["after"]["test"]
-        lines.append(
-            f"| {k + 1} | {b['rmse']:.2f} | {a['rmse']:.2f} | {_found(r)} | {r['unexplained']['signature']} "
-            f"| {_cost(r)} |"
-        )
-        trips |= r["after"]["test_by_trip"]
-        rows += a["n"]
-        squares["before"] += b["mse"] * b["n"]
-        squares["after"] += a["mse"] * a["n"]
-    error = np.array([m["pe_percent"] for m in trips.values()])
-    lines += ["", "| pooled, 24 missions | |", "|---|---|"]
-    lines += [
-        f"| RMSE before → after | {np.sqrt(squares['before'] / rows):.2f} → {np.sqrt(squares['after'] / rows):.2f} kW |"
-    ]
-    lines += [f"| signed mean of the missions' energy errors | {error.mean():+.2f} % |"]
-    lines += [f"| mean absolute energy error | {np.abs(error).mean():.2f} % |"]
-    for label, keep in (("missions at 12 °C and colder", lambda t: t <= 12), ("warmer missions", lambda t: t > 12)):
-        chosen = [m for n, m in trips.items() if keep(warm[n])]
-        rmse = np.sqrt(sum(m["mse"] * m["n"] for m in chosen) / sum(m["n"] for m in chosen))
-        lines += [f"| {label} ({len(chosen)}) | {rmse:.2f} kW |"]
-    worst = max(trips, key=lambda n: trips[n]["rmse"])
-    lines += [f"| worst mission | {worst}, {trips[worst]['rmse']:.2f} kW, {trips[worst]['pe_percent']:+.1f} % |"]
-    return lines
+
+
+def _adapter(what: str, work: Path) -> Path:
+    return work / "adapters" / f"ztbus_no_{what}.toml"
+
+
+def kept(job: Job, work: Path) -> dict[str, Any] | None:
+    """A finished run, its cost and configuration with it; None where there is none. Another run's folder ends it."""
+    out = work / job.name
+    result = _json(out / "diagnosis.json")
+    if not result:
+        return None
+    ran = tomllib.loads((out / "config.toml").read_text(encoding="utf-8"))
+    asked: dict[str, Any] = {"vehicle": job.vehicle, "adapter": job.adapter.name}
+    if job.target:
+        asked["target"] = job.target
+    if job.logs:  # where there is no data, the missions are not known by name
+        asked |= {"asked_train": list(job.train), "asked_test": list(job.test)}
+    there = {**ran, "adapter": Path(ran["adapter"]).name}
+    if differs := [k for k, v in asked.items() if (there.get(k) or []) != v]:
+        raise SystemExit(f"{out} holds another run ({', '.join(differs)}): name another --work, or remove it")
+    return {**result, "cost": _json(work / f"{job.name}.cost.json"), "ran": ran}
+
+
+def _run(job: Job, work: Path, place: str) -> None:
+    """One diagnosis; its wall-clock seconds and peak memory are kept beside it."""
+    out = work / job.name
+    out.parent.mkdir(parents=True, exist_ok=True)
+    print(f"{time.strftime('%H:%M:%S')}  {place}: {job.name} …", file=sys.stderr, flush=True)
+    started = time.monotonic()
+    command = [sys.executable, "-m", "hdev_jax.cli", "diagnose", *job.arguments, "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        _, status, usage = os.wait4(process.pid, 0)  # this child's own peak, not the largest of all so far
+        process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise SystemExit(f"{job.name}: hdev diagnose ended with status {process.returncode}")
+    cost = {"seconds": time.monotonic() - started, "peak_gib": usage.ru_maxrss / 2**20}
+    (work / f"{job.name}.cost.json").write_text(json.dumps(cost), encoding="utf-8")
+    seconds, gib = cost["seconds"], cost["peak_gib"]
+    print(f"{time.strftime('%H:%M:%S')}  {job.name}: {seconds:.0f} s, {gib:.1f} GiB", file=sys.stderr, flush=True)
+
+
+def _same_rest(withheld: list[Job], work: Path) -> None:
+    """Read the log with and without each channel, and keep what differs. Once: it takes about a minute."""
+    path = work / "same_rest.json"
+    if not path.exists():
+        print(f"{time.strftime('%H:%M:%S')}  comparing the logs with and without …", file=sys.stderr, flush=True)
+        rest = {what: compare_logs(withheld[0].logs, ZTBUS, _adapter(what, work)) for what in WITHHELD}
+        path.write_text(json.dumps(rest, indent=1), encoding="utf-8")
+
+
+def _temperatures(job: Job, work: Path) -> dict[str, float]:
+    """Mean outside temperature [°C] of each mission, kept beside the runs so that the page needs no data."""
+    path = work / "temperatures.json"
+    if not path.exists() and job.logs:
+        import pandas as pd
+
+        column = "temperature_ambient"
+        warm = {p.name[:24]: pd.read_csv(p, usecols=[column])[column].mean() - 273.15 for p in job.logs}
+        work.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(warm, indent=1), encoding="utf-8")
+    return _json(path)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
 
 if __name__ == "__main__":

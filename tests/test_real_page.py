@@ -1,0 +1,250 @@
+"""The page of measured logs from small made-up results, and the withholding of a channel from a small made-up log."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import tomli_w
+
+from hdev_jax.errors import InputError
+from hdev_jax.logs import read_log
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(autouse=True)
+def _benchmarks(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    yield
+    for name in [n for n in sys.modules if n.startswith("real_")]:
+        del sys.modules[name]
+
+
+def block(rmse: float, trips=("A", "B")) -> dict:
+    metrics = {"rmse": rmse, "mse": rmse**2, "bias": 0.1, "pe_percent": 1.5, "fit_percent": 80.0, "n": 1000}
+    return {"train": metrics, "test": metrics, "test_by_trip": dict.fromkeys(trips, metrics)}
+
+
+def effect(id_: str, path: str, value: float, sd: float, unit: str, twins=()) -> dict:
+    return {
+        "id": id_, "stage": "battery", "order": 1, "verdict": "one_of_class" if twins else "found",
+        "parameters": {path: {"value": value, "sd": sd, "unit": unit}, "shape": {"value": 1.0, "sd": 0.0, "unit": "1"}},
+        "q_value": 1e-6, "stability": 0.97, "test_rmse_before": 12.0, "test_rmse_after": 9.0,
+        "indistinguishable_from": list(twins),
+    }  # fmt: skip
+
+
+def result(effects: list[dict], rmse: float = 9.0, turned_down=(), left: str | None = None) -> dict:
+    candidates = [{"id": i, "score": s, "q_value": 0.2, "why_not": w} for i, s, w in turned_down]
+    return {
+        "target": "battery_power_kw", "before": block(13.0), "after": block(rmse), "effects": effects,
+        "split": {"train_trips": ["C", "D"], "test_trips": ["A", "B"], "unused_trips": []},
+        "candidates": candidates, "parameters_fitted": 7, "clusters": {"kind": "trip", "count": 16},
+        "unexplained": {
+            "significant": left is not None, "share_of_test_variance": 0.04, "noise_floor_rmse": 8.0,
+            "depends_on": ["time_s"] if left else [], "signature": f"What is left: {left or 'noise'}.",
+            "expression": None,
+        },
+        "verdict": "effects_found" if left is None else "effects_found_and_unexplained_structure",
+        "subsets": {"standing still": {"before": block(5.0)["test"], "after": block(4.0)["test"]}},
+        "cost": {"seconds": 60.0, "peak_gib": 1.0},
+    }  # fmt: skip
+
+
+COPPER = effect("copper_loss", "w_per_nm2", 3e-5, 3e-6, "W/Nm²")
+OFFSET = effect("power_gain", "offset_w", 6100.0, 600.0, "W", ["auxiliary_power"])
+CONSTANT = effect("auxiliary_power", "power_w", 6000.0, 700.0, "W", ["power_gain"])
+LARGER = effect("auxiliary_power", "power_w", 9000.0, 700.0, "W", ["power_gain"])
+HEATING = effect("hvac_power", "below_w_per_k", 550.0, 80.0, "W/K")
+STEP = effect("step_change", "jump", 2.0, 0.1, "W")
+NO_CHANNEL = [("hvac_power", None, "not tried: needs a channel that the log lacks: ambient_temp_c")]
+
+
+@pytest.fixture
+def results() -> dict:
+    folds = {
+        "ztbus_1": result([COPPER, OFFSET, HEATING], left="a 5-minute cycle"),
+        "ztbus_2": result([COPPER, CONSTANT, HEATING], turned_down=[("iron_loss", 12.0, "too few trips")]),
+    }
+    niro = {f"niro_{k}": result([COPPER], 0.4, [("iron_loss", 3.0, "too few trips")]) for k in "12"}
+    held = {
+        "ztbus_1_no_temperature": result([COPPER, LARGER], 11.0, NO_CHANNEL, left="levels that differ by trip"),
+        "ztbus_1_no_steering": result([COPPER, OFFSET, HEATING], left="a 5-minute cycle"),
+    }
+    return {**niro, "niro_road": result([COPPER], 150.0), **folds, **held}
+
+
+def test_the_page_tells_all_runs_and_draws_them(results, tmp_path):
+    import real_page
+
+    rest = {"temperature": {"rows": 2000, "trips": 2, "gone": ["ambient_temp_c"], "same": ["time_s"], "ledger": 3}}
+    text, figures = real_page.page(results, warm={"A": 3.0, "B": 20.0}, rest=rest)
+    for heading in ("Kia Niro: battery power", "Kia Niro: traction force", "Stability over folds", "Steering withheld"):
+        assert heading in text
+    assert "| **found**, 0.97 | **found**, 0.97 | 2 of 2 |" in text
+    assert "| no: too few trips |" not in text  # only what some run found has a row
+    assert "The same: sheet, split, seed" in text
+    assert "`ambient_temp_c`. The other 1 columns are equal in all 2,000 rows" in text
+    assert set(figures) == {f"{n}.png" for n in (
+        "niro_errors", "niro_sizes", "ztbus_errors", "ztbus_sizes", "ztbus_withheld"
+    )}  # fmt: skip
+    assert all(name in text for name in figures)
+    assert all(content.startswith(b"\x89PNG") and len(content) < 150_000 for content in figures.values())
+    old = tmp_path / real_page.FOLDER / "gone.png"
+    old.parent.mkdir(parents=True)
+    old.write_bytes(b"")
+    real_page.write(tmp_path, text, figures)
+    assert not old.exists()
+    assert (tmp_path / "real_logs.md").read_text() == text
+
+
+def test_the_page_of_one_part_is_a_page(results):
+    import real_page
+
+    text, figures = real_page.page({"niro_1": results["niro_1"]}, warm={}, rest={})
+    assert "ZTBus" not in text
+    assert set(figures) == {"niro_errors.png", "niro_sizes.png"}
+
+
+def test_sizes_of_one_class_share_a_row_and_a_unit(results):
+    from real_tables import size_rows
+
+    rows = {row.paths: row for row in size_rows({"1": results["ztbus_1"], "2": results["ztbus_2"]})}
+    shared = rows["power_gain.offset_w", "auxiliary_power.power_w"]
+    assert shared.unit == "W"
+    assert shared.cells == {
+        "1": ("power_gain.offset_w", 6100.0, 600.0),
+        "2": ("auxiliary_power.power_w", 6000.0, 700.0),
+    }
+    assert shared.furthest() == pytest.approx(100.0 / np.hypot(600.0, 700.0))
+    assert all("shape" not in path for paths in rows for path in paths)  # chosen among a few: no size
+
+
+def test_sizes_of_effects_that_no_run_calls_one_class_stay_apart():
+    from real_tables import size_rows
+
+    runs = {"1": result([OFFSET]), "2": result([STEP])}  # both in W
+    assert len(size_rows(runs)) == 2
+
+
+def test_a_withheld_cause_and_where_it_went(results):
+    from real_told import changes, moved_sizes, sentences
+
+    without, full, others = results["ztbus_1_no_temperature"], results["ztbus_1"], {"2": results["ztbus_2"]}
+    assert changes(without, full) == (["hvac_power"], [], [("auxiliary_power", "power_gain")])
+    assert [m[0] for m in moved_sizes(without, full)] == ["power_gain.offset_w"]
+    text = " ".join(sentences("outside temperature", without, full, others))
+    assert "cannot try cabin heating and cooling" in text
+    assert "No false name takes the place of cabin heating and cooling" in text
+    assert "lowers the test RMSE from 11.00 to 9.00" in text
+    assert "levels that differ by trip" in text
+
+
+def test_a_false_name_is_called_one(results):
+    from real_told import new_names, sentences
+
+    full, others = results["ztbus_1"], {"2": results["ztbus_2"]}
+    without = result([COPPER, OFFSET, STEP], 10.0, NO_CHANNEL)
+    assert new_names(without, full, others) == ["step_change"]
+    text = " ".join(sentences("outside temperature", without, full, others))
+    assert "a **new name**" in text
+    assert "taken by a name that the full log does not bear out" in text
+    assert new_names(without, full, {"2": result([STEP])}) == []  # another training set finds it with every channel
+
+
+def test_a_channel_that_nothing_reads_is_a_control(results):
+    from real_told import sentences
+
+    text = " ".join(sentences("steering", results["ztbus_1_no_steering"], results["ztbus_1"], {}))
+    assert "The run is a control." in text
+    assert "finds the same effects" in text
+    assert "leaves the test RMSE as it is" in text
+    assert "place of" not in text
+
+
+ADAPTER = {
+    "format": "csv",
+    "others": "drop",
+    "columns": {
+        "time_s": {"source": "t"},
+        "speed_mps": {"source": "v"},
+        "battery_power_w": {"source": "p"},
+        "ambient_temp_c": {"source": "temp", "unit": "K"},
+        "passengers": {"source": "people", "fill": "forward", "initial": 0},
+        "mass_kg": {"source": "passengers", "affine": [19500.0, 70.0]},
+    },
+}
+
+
+@pytest.fixture
+def log(tmp_path) -> tuple[Path, Path]:
+    n = 60
+    speed = 5.0 + np.sin(np.arange(n) / 5.0)
+    people = pd.Series(np.where(np.arange(n) % 20 == 5, 10.0, np.nan))
+    frame = pd.DataFrame({"t": np.arange(n), "v": speed, "p": 900.0 * speed, "temp": 283.0 + speed, "people": people})
+    frame["by_the_way"] = 1.0
+    frame.to_csv(tmp_path / "one.csv", index=False)
+    (tmp_path / "base.toml").write_text(tomli_w.dumps(ADAPTER))
+    return tmp_path / "one.csv", tmp_path / "base.toml"
+
+
+@pytest.mark.parametrize(
+    ("names", "gone"),
+    [(["ambient_temp_c"], {"ambient_temp_c"}), (["passengers"], {"passengers", "mass_kg"})],
+    ids=["temperature", "passengers and what is made from them"],
+)
+def test_a_withheld_channel_is_not_in_the_log(log, tmp_path, names, gone):
+    from real_withheld import compare_logs, write_adapter
+
+    file, base = log
+    adapter = write_adapter(base, names, tmp_path / "less" / "adapter.toml")
+    full, less = read_log(file, base), read_log(file, adapter)
+    assert set(full.segments.channels) - set(less.segments.channels) == gone
+    assert not gone & {c.name for c in less.columns}
+    told = compare_logs([file], base, adapter)
+    assert set(told["gone"]) == gone
+    assert told["rows"] == len(full)
+    assert {"battery_power_w", "speed_start_mps", "time_s"} <= set(told["same"])
+
+
+def test_withholding_that_changes_more_is_refused(log, tmp_path):
+    from real_withheld import compare_logs, without_columns, write_adapter
+
+    file, base = log
+    table = without_columns(ADAPTER, ["ambient_temp_c"])
+    table["columns"]["mass_kg"] = {"source": "passengers", "affine": [19000.0, 70.0]}
+    other = tmp_path / "other.toml"
+    other.write_text(tomli_w.dumps(table))
+    with pytest.raises(InputError, match="more than the columns withheld"):
+        compare_logs([file], base, other)
+    with pytest.raises(InputError, match="makes no column weather"):
+        without_columns(ADAPTER, ["weather"])
+    with pytest.raises(InputError, match='others = "drop"'):
+        without_columns({**ADAPTER, "others": "keep"}, ["ambient_temp_c"])
+    written = write_adapter(base, ["ambient_temp_c"], tmp_path / "a.toml")
+    before = written.stat().st_mtime_ns
+    assert write_adapter(base, ["ambient_temp_c"], written).stat().st_mtime_ns == before  # a run can resume
+
+
+def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, capsys):
+    import real_logs
+
+    monkeypatch.setattr(real_logs, "DATA", tmp_path / "none")
+    work, docs = tmp_path / "work", tmp_path / "docs"
+    for name in ("niro_1", "niro_2"):
+        (work / name).mkdir(parents=True)
+        (work / name / "diagnosis.json").write_text(json.dumps(results[name]))
+        config = {
+            "vehicle": "configs/vehicles/kia_niro.toml", "adapter": "configs/adapters/kia_niro.toml",
+            "asked_train": [name[-1]],
+        }  # fmt: skip
+        (work / name / "config.toml").write_text(tomli_w.dumps(config))
+    assert real_logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
+    assert "trained on trip" in (docs / "real_logs.md").read_text()
+    assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
+    (work / "niro_2").rename(work / "niro_3")
+    with pytest.raises(SystemExit, match="holds another run"):
+        real_logs.main(["--work", str(work), "--kept"])
