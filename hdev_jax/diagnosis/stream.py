@@ -3,8 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -14,8 +12,8 @@ from hdev_jax.diagnosis.facts import Facts, facts_of, merged
 from hdev_jax.diagnosis.look import View, scored
 from hdev_jax.diagnosis.sums import Ground
 from hdev_jax.diagnosis.whiten import estimate_noise
-from hdev_jax.inference import Calibration, clusters_of
-from hdev_jax.physics import Effect, Vehicle
+from hdev_jax.inference import Calibration, clusters_of, predict
+from hdev_jax.physics import Effect
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments, trip_slices
 
@@ -101,14 +99,9 @@ def survey(pieces: Iterable[Piece], fit: Calibration, target: Target, *, chunk_r
         # a log of one chunk would do with fewer rows, but this may be the first of many
         shapes = Shapes(chunk_rows + 1, max(s.stop - s.start for _, s in runs), chunk_rows)
         parts = chunks_of(segments, np.asarray(measured, dtype=float), shapes)
-        left = [c.residual - np.asarray(_predicted(fit.vehicle, c.segments, target))[: c.rows] for c in parts]
+        left = [c.residual - np.asarray(predict(fit.vehicle, c.segments, target))[: c.rows] for c in parts]
         kept.append((trip, np.asarray(segments.duration_s, dtype=float), np.concatenate(left)))
     if not kept:
         raise ValueError("a log of no pieces has no candidates; expected at least one piece of whole trips")
     trip, seconds, residual = (np.concatenate(column) for column in zip(*kept, strict=True))
     return Survey(merged(facts, seconds), trip, seconds, residual)
-
-
-@eqx.filter_jit
-def _predicted(vehicle: Vehicle, segments: Segments, target: Target) -> jax.Array:
-    return vehicle.predict(segments, target)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hdev_jax.diagnosis import look as looks
+from hdev_jax.diagnosis.candidates import plan_of
 from hdev_jax.diagnosis.chunks import Shapes, chunks_of, cut
 from hdev_jax.diagnosis.facts import MOST_STEPS, facts_of, merged
 from hdev_jax.diagnosis.problem import Problem, prepare
@@ -43,9 +44,8 @@ def looked(problem: Problem, chunk_rows: int, block_sd: float = 0.0) -> looks.Vi
     effects = [LIBRARY[k] for k in EFFECTS]
     rng, gears = np.random.default_rng(0), most_group(problem.segments)
     loop = looks.Loop(rows, problem.target, clusters, effects, 0.05, rng, gears, chunk_rows)
-    state = looks.Search(problem.vehicle, problem.table, fit)
     ground = loop.ground(fit, replace(loop.noise(fit), block_sd=block_sd))
-    return looks.scored(ground, looks.look(loop, state).source)
+    return looks.scored(ground, plan_of(fit.vehicle, effects, loop.facts, problem.target))
 
 
 def same(one: looks.View, other: looks.View) -> None:
