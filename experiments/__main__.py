@@ -19,16 +19,24 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="the run's folder")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (0: one for each core)")
     parser.add_argument("--tasks", type=Path, help="a folder for results of tasks that runs share")
+    parser.add_argument("--kept", action="store_true", help="run no task: tables of what --tasks holds")
+    parser.add_argument("--docs", type=Path, help="a folder for the tables as a page in Markdown, with its figures")
     options = parser.parse_args(argv)
     import jax
 
     from experiments.engine import run_config
+    from experiments.page import write_docs
 
     jax.config.update("jax_enable_x64", True)
     workers = options.workers or os.cpu_count() or 1
     try:
         with progress.shown():
-            run_config(options.config, options.set, out=options.out, workers=workers, kept=options.tasks)
+            runs = run_config(
+                options.config, options.set, out=options.out, workers=workers, kept=options.tasks,
+                fresh=not options.kept,
+            )  # fmt: skip
+            if options.docs:
+                write_docs(options.docs, options.config.stem, [Path(r["folder"]) for r in runs])
     except InputError as e:
         print(f"experiments: {e}", file=sys.stderr)
         return 2

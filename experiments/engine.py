@@ -32,17 +32,25 @@ __all__ = ["run_config", "run_tasks"]
 
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ("planted",)
+EVERY = tuple(sorted(p.name for p in Path(__file__).parent.glob("*.py")))
 FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
 Result = tuple[dict[str, Any], dict[str, Any]]
 
 
 def run_config(
-    path: str | Path, sets: Sequence[str] = (), *, out: str | Path, workers: int = 1, kept: str | Path | None = None
+    path: str | Path,
+    sets: Sequence[str] = (),
+    *,
+    out: str | Path,
+    workers: int = 1,
+    kept: str | Path | None = None,
+    fresh: bool = True,
 ) -> list[dict[str, Any]]:
     """Run a config, or each point of its sweep in a folder of its own under `out`. **Returns** their metrics.
 
     **Arguments:** `kept`, a folder for the results of tasks that other runs may share; without it a run keeps them in
-    its own folder until it is complete, and the points of a sweep share one under `out`.
+    its own folder until it is complete, and the points of a sweep share one under `out`; `fresh=False` runs no task
+    and reports on those that are kept (`metrics["tasks_left_out"]` says how many are not).
     """
     table = resolve(path, sets)
     points = list(expanded(table, path))
@@ -50,25 +58,32 @@ def run_config(
     for delta, config in points:
         folder = Path(out) if len(points) == 1 else Path(out) / config_digest(config, "")[:12]
         shared = Path(kept) if kept is not None else None if len(points) == 1 else Path(out) / "tasks"
-        found.append({"sweep": delta, "folder": str(folder), **_run_one(config, path, folder, workers, shared)})
+        run = _run_one(config, path, folder, workers, shared, fresh)
+        found.append({"sweep": delta, "folder": str(folder), **run})
     if len(points) > 1:
         with atomic_file(Path(out) / "sweep.json") as temporary:
             Path(temporary).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
     return found
 
 
-def _run_one(config: dict[str, Any], path: str | Path, out: Path, workers: int, kept: Path | None) -> dict[str, Any]:
+def _run_one(
+    config: dict[str, Any], path: str | Path, out: Path, workers: int, kept: Path | None, fresh: bool
+) -> dict[str, Any]:
     module = _module(config, path)
     parsed = typed(module.Config, config, path)
     started = time.monotonic()
-    resolved = {"config": parsed.model_dump(mode="json"), "sources": sources()}
+    resolved = {"config": parsed.model_dump(mode="json"), "sources": sources(EVERY), "fresh": fresh}
     with open_run(out, resolved, seed=config.get("seed")) as run:
         if not run.done:
             tasks = list(module.tasks(parsed))
             own = run.path(".tasks")
+            if not fresh:
+                tasks = [t for t in tasks if _place(module, t, kept or own).exists()]
             results = list(run_tasks(module, tasks, workers=workers, kept=kept or own))
             progress.step("tables and figures")
-            metrics = {**module.collect(parsed, results, run), "seconds": round(time.monotonic() - started, 1)}
+            left_out = sum(1 for _ in module.tasks(parsed)) - len(tasks)
+            cost = {"tasks_left_out": left_out, "seconds": round(time.monotonic() - started, 1)}
+            metrics = {**module.collect(parsed, results, run), **cost}
             write_page(run, metrics)
             shutil.rmtree(own, ignore_errors=True)
             run.path("metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
@@ -113,7 +128,7 @@ def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: i
 
 
 def _place(module: ModuleType, task: dict[str, Any], kept: Path) -> Path:
-    text = json.dumps([task, sources()], sort_keys=True)
+    text = json.dumps([task, sources(module.SOURCES)], sort_keys=True)
     return kept / module.__name__.rpartition(".")[2] / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
 
 
@@ -148,10 +163,9 @@ def _prepare_worker(compiled: str, threads: int) -> None:
 
 
 @cache
-def sources() -> str:
-    """Fingerprint of every source file that a result may depend on."""
+def sources(own: tuple[str, ...]) -> str:
+    """Fingerprint of every source file that a task's result may depend on: the package's, and the experiment's own."""
     digest = hashlib.sha256()
-    for folder in ("hdev_jax", "experiments"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
+    for path in [*sorted((ROOT / "hdev_jax").rglob("*.py")), *(ROOT / "experiments" / name for name in own)]:
+        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

@@ -2,12 +2,14 @@
 
 import importlib
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from experiments.config import expanded, resolve, typed
 from experiments.engine import run_config, run_tasks
+from experiments.page import write_docs
 from experiments.planted import Config, exact, tasks
 from experiments.tables import wilson
 from hdev_jax.errors import InputError
@@ -95,7 +97,9 @@ def test_intervals_of_shares():
 def test_many_tasks_on_two_workers_come_back_in_order(tmp_path, monkeypatch):
     """More tasks than a worker keeps its compiled programs for; an error of a task is the run's."""
     write(
-        tmp_path, "toy_experiment.py", "def run(task):\n    return {'square': task['n'] ** 2, 'by': 1 / task['by']}\n"
+        tmp_path,
+        "toy_experiment.py",
+        "SOURCES = ()\n\n\ndef run(task):\n    return {'square': task['n'] ** 2, 'by': 1 / task['by']}\n",
     )
     monkeypatch.syspath_prepend(tmp_path)
     toy = importlib.import_module("toy_experiment")
@@ -131,3 +135,13 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     again = once("b")
     assert again["rows"] == first["rows"]
     assert json.loads((tmp_path / "b" / "metrics.json").read_text())["rows"] == first["rows"]
+    sets = ["cases.single.logs=3", "cases.null.logs=2"]
+    (part,) = run_config(STUDIES / "planted_quick.toml", sets, out=tmp_path / "c", kept=tmp_path / "kept", fresh=False)
+    assert part["logs"] == 1, "the first log is the same one, whatever comes after it"
+    assert part["tasks_left_out"] == 4
+    write_docs(tmp_path / "docs", "planted", [tmp_path / "c"])
+    page = (tmp_path / "docs" / "planted.md").read_text()
+    assert "1 logs, all synthetic" in page
+    assert "4 more are in the config" in page
+    for name in re.findall(r"\]\((figures/[^)]*)\)", page):
+        assert (tmp_path / "docs" / name).stat().st_size > 200

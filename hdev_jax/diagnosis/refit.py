@@ -62,7 +62,11 @@ def _whitened(problem: Loop, state: Search, s: Score, noise: Noise) -> dict[str,
     table = state.table.plus(*_coefficients(s.candidate, effect, shapes=False))
     vehicle, rows = state.fit.vehicle.plus(effect), problem.rows
     predicted = np.asarray(predict(vehicle, rows.segments, problem.target))[: rows.rows]
-    start = replace(state.fit, vehicle=vehicle, table=table, values=table.values(vehicle), predicted=predicted)
+    values, nothing = table.values(vehicle), np.zeros((len(table.free), len(table.free)))
+    start = replace(
+        state.fit, vehicle=vehicle, table=table, values=values, predicted=predicted, sd=np.diag(nothing),
+        covariance=nothing,
+    )  # fmt: skip
     fit, error = settle(problem, start, noise)
     prefix = f"effects.{s.candidate.id}."
     found = {

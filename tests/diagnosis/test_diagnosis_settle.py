@@ -1,0 +1,130 @@
+"""Where candidates are scored from, what is known of a size, and how many trips would tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hdev_jax.diagnosis import look as looks
+from hdev_jax.diagnosis.candidates import Candidate
+from hdev_jax.diagnosis.evidence import Score, clusters_needed
+from hdev_jax.diagnosis.look import Verdict
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.refit import _contradicted
+from hdev_jax.diagnosis.settle import settle
+from hdev_jax.diagnosis.summary import _not_decidable, sized
+from hdev_jax.diagnosis.sums import Sums, evidence_of
+from hdev_jax.diagnosis.unexplained import Remainder
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import calibrate, cluster_rows, padded
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
+
+
+def calibrated(folder, seed: int):
+    """A log with slow noise and nothing missing, its loop, and the truth's values of what is calibrated."""
+    log = synthetic_log(seed=seed, trips=10, rows_per_trip=120, noise="ar1", ar_coefficient=0.97, noise_level=0.1)
+    files = log.write(folder / str(seed), truth=False)
+    problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
+    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    loop = looks.Loop(rows, problem.target, clusters, (), 0.05, np.random.default_rng(0), 4)
+    true = np.array([getattr(log.vehicle, c.path.rpartition(".")[2]) for c in fit.table.free])
+    return loop, fit, true
+
+
+def test_whitened_rows_know_coefficients_better_than_plain_ones(tmp_path):
+    plain, white = [], []
+    for seed in range(6):
+        loop, fit, true = calibrated(tmp_path, seed)
+        settled, error = settle(loop, fit, loop.noise(fit))
+        assert np.all(error < fit.sd)
+        plain.append((fit.values - true) / true)
+        white.append((settled.values - true) / true)
+        assert np.all(np.abs(settled.values - true) < 5 * error + 1e-3 * np.abs(true))
+    assert np.mean(np.square(white)) < 0.5 * np.mean(np.square(plain))
+
+
+def test_where_it_settles_no_step_is_left(tmp_path):
+    loop, fit, _ = calibrated(tmp_path, 1)
+    noise = loop.noise(fit)
+    settled, error = settle(loop, fit, noise)
+    step, _ = evidence_of(loop.ground(settled, noise)).step()
+    assert np.all(np.abs(step) < 0.05 * error)
+    assert np.all(np.isfinite(settled.predicted))
+
+
+def test_a_fit_of_nothing_settles_as_it_is(tmp_path):
+    loop, fit, _ = calibrated(tmp_path, 1)
+    table = fit.table.with_free(**{c.name: False for c in fit.table.free})
+    held = replace(fit, table=table, values=np.zeros(0), sd=np.zeros(0), covariance=np.zeros((0, 0)))
+    settled, error = settle(loop, held, loop.noise(fit))
+    assert settled is held
+    assert error.shape == (0,)
+
+
+def test_what_one_cluster_tells_is_no_better_known_than_its_rows_allow():
+    """The jackknife sees no spread where all clusters but one are silent about a column."""
+    rng = np.random.default_rng(0)
+    ids = np.repeat(np.arange(8), 50)
+    column = np.where(ids == 3, rng.normal(size=400), 1e-9 * rng.normal(size=400))
+    sums = Sums(2, 8, 8)
+    sums.add(np.c_[column, 2.0 * column + rng.normal(size=400)], ids)
+    _, error = sums.evidence(1, moved=np.zeros(1), prior_sd=np.array([1e3])).step()
+    assert error[0] >= 0.99 / np.sqrt(np.sum(column**2))
+
+
+@pytest.mark.parametrize("k", [1, 2])
+@pytest.mark.parametrize("p", [0.2, 0.01])
+def test_as_many_clusters_as_are_needed_and_no_more(k, p):
+    n = clusters_needed(p, k, 9, 1e-3)
+    assert n is not None
+    assert n > 9
+    statistic = stats.f.isf(p, k, 9 - k)
+
+    def at(m: int) -> float:
+        return float(stats.f.sf(statistic * m / 9, k, m - k))
+
+    assert at(n) <= 1e-3 < at(n - 1)
+
+
+def test_what_nothing_hints_at_is_out_of_reach():
+    assert clusters_needed(0.9, 1, 9, 1e-3) is None
+    assert clusters_needed(0.01, 2, 3, 1e-3) is None
+
+
+@pytest.mark.parametrize("clusters", [4, 8, 24])
+def test_the_interval_covers_what_it_says(clusters):
+    rng = np.random.default_rng(clusters)
+    hits = 0
+    for _ in range(2000):
+        x = rng.normal(size=clusters)
+        low, high = sized(float(np.mean(x)), float(np.std(x, ddof=1) / np.sqrt(clusters)), clusters)["interval_90"]
+        hits += low <= 0.0 <= high
+    assert hits / 2000 == pytest.approx(0.90, abs=0.02)
+
+
+def test_the_way_is_paid_for_by_the_rows_and_the_trips_are_asked_once():
+    way = Candidate(LIBRARY["auxiliary_power"], ("power_w",), (None,), (), "size", (0,))
+    score = Score(way, np.ones(1), 50.0, 1e-6, 2e-3, 40.0, 1.0)
+    assert score.over(14) == pytest.approx(2e-3)
+    assert replace(score, p_model=1e-3).over(14) == pytest.approx(2 * 14 * 1e-3)
+    assert replace(score, p_model=2e-3, plain=True).over(14) == pytest.approx(2 * 14 * 2e-3)
+
+
+@pytest.mark.parametrize(("white", "against"), [(-0.01, True), (0.01, False)])
+def test_a_slow_size_of_no_sign_among_the_rows_is_contradicted(white, against):
+    assert _contradicted(np.array([0.34]), np.array([white]), np.array([0.009])) is against
+    assert not _contradicted(np.array([0.34]), np.array([-0.01]), np.array([0.1]))  # they could not have seen it
+
+
+def test_between_trips_a_log_knows_no_more_than_it_has_trips():
+    left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, np.zeros(3))
+    hinted = Verdict("hvac_power", 2.0, 1.0, "not significant", needed=40, between=True)
+    inside = Verdict("headwind", 2.0, 1.0, "not significant", needed=30)
+    strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=14)
+    said = _not_decidable([hinted, inside, strong], left)
+    assert [(s["id"], s["clusters_needed"]) for s in said] == [("wet_road", 14), ("hvac_power", 40)]
+    assert [s["id"] for s in _not_decidable([hinted, inside, strong], replace(left, depends_on=()))] == ["wet_road"]
