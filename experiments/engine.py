@@ -88,22 +88,23 @@ def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: i
     todo = [i for i, p in enumerate(places) if not p.exists()]
     progress.step(f"{len(tasks)} tasks, {len(tasks) - len(todo)} done before")
     if workers > 1 and len(todo) > 1:
-        compiled = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
-        threads = max(1, (os.cpu_count() or 1) // workers)
-        spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled.name, threads))
-        try:
-            futures = {pool.submit(_call, module.__name__, tasks[i]): i for i in todo}
-            for future in progress.track(as_completed(futures), "running", total=len(todo)):
-                _keep(places[futures[future]], future.result())
-            pool.shutdown()
-            compiled.cleanup()
-        except BaseException:  # an interrupt keeps what is done and waits for nothing else
-            workers_now = list((getattr(pool, "_processes", None) or {}).values())
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in workers_now:
-                process.terminate()
-            raise
+        with tempfile.TemporaryDirectory(prefix="hdev-compiled-") as compiled:
+            threads = max(1, (os.cpu_count() or 1) // workers)
+            spawn = multiprocessing.get_context("spawn")
+            pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled, threads))
+            try:
+                futures = {pool.submit(_call, module.__name__, tasks[i]): i for i in todo}
+                for future in progress.track(as_completed(futures), "running", total=len(todo)):
+                    _keep(places[futures[future]], future.result())
+                pool.shutdown()
+            except BaseException:  # an interrupt keeps what is done and waits for nothing else
+                workers_now = list((getattr(pool, "_processes", None) or {}).values())
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in workers_now:
+                    process.terminate()
+                for process in workers_now:
+                    process.join()
+                raise
     else:
         for i in progress.track(todo, "running"):
             _keep(places[i], _call(module.__name__, tasks[i]))

@@ -12,7 +12,7 @@ from itertools import product
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from experiments.planted_figures import confusion_figure, false_figure, power_figure
@@ -38,7 +38,7 @@ class Case(Strict):
     """A block of logs: every effect set × size × number of trips × noise, `logs` of each."""
 
     name: str
-    effects: list[list[str]] = Field(default_factory=lambda: [[]])
+    effects: list[list[str]] | str = Field(default_factory=lambda: [[]])  # or the name of one of the config's sets
     sizes: list[float] = Field(default_factory=lambda: [1.0])
     trips: list[int] = Field(default_factory=lambda: [24])
     noises: list[Noise] = Field(default_factory=lambda: ["ar1"])
@@ -54,8 +54,20 @@ class Config(Strict):
 
     experiment: Literal["planted"]
     cases: dict[str, Case]
+    only: list[str] = Field(default_factory=list)  # cases to run; all where none is named
+    sets: dict[str, list[list[str]]] = Field(default_factory=dict)
     seed: int = 1000
     fdr: float = 0.05
+
+    @model_validator(mode="after")
+    def _sets_are_there(self) -> "Config":
+        for key, case in self.cases.items():
+            if isinstance(case.effects, str) and case.effects not in self.sets:
+                raise ValueError(
+                    f"cases.{key}.effects: one of {', '.join(self.sets)} is expected, found {case.effects!r}"
+                )
+        return self
+
     ar_coefficient: float = 0.97
     rivals: list[Rival] = Field(default_factory=list)
 
@@ -63,15 +75,18 @@ class Config(Strict):
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """One for each log. A log's seed counts on through the whole study, so that no two share their noise."""
     seed = config.seed
-    for case in config.cases.values():
-        for effects, size, trips, noise in product(case.effects, case.sizes, case.trips, case.noises):
+    for key, case in config.cases.items():
+        every = config.sets[case.effects] if isinstance(case.effects, str) else case.effects
+        for effects, size, trips, noise in product(every, case.sizes, case.trips, case.noises):
             for _ in range(case.logs):
+                seed += 1
+                if config.only and key not in config.only:
+                    continue
                 yield {
-                    "case": case.name, "effects": effects, "size": size, "trips": trips, "noise": noise, "seed": seed,
-                    "rows_per_trip": case.rows_per_trip, "entry": case.entry, "mode": case.mode,
+                    "case": case.name, "effects": effects, "size": size, "trips": trips, "noise": noise,
+                    "seed": seed - 1, "rows_per_trip": case.rows_per_trip, "entry": case.entry, "mode": case.mode,
                     "ar_coefficient": config.ar_coefficient, "fdr": config.fdr, "rivals": config.rivals,
                 }  # fmt: skip
-                seed += 1
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:

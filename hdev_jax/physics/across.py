@@ -135,7 +135,7 @@ def distance_since_start(segments: Segments) -> Float[Array, " row"]:
     return before - before[first] + 0.5 * d
 
 
-def time_since_braking(segments: Segments, threshold_pa: float = 2e4) -> Float[Array, " row"]:
+def time_since_braking(segments: Segments, threshold_pa: float = 2e3) -> Float[Array, " row"]:
     """Seconds from the end of the trip's last braked row to the middle of this one; 0 while braking and before."""
     first, _ = trip_bounds(segments)
     start, duration = jnp.asarray(segments.time_s), jnp.asarray(segments.duration_s)

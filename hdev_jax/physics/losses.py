@@ -31,7 +31,7 @@ class BrakeDrag(Effect):
     """Pads that do not let go: F·exp(−t/τ), t since the brake was released."""
 
     id: ClassVar = "brake_drag"
-    stage: ClassVar = "driveline"
+    stage: ClassVar = "road"  # at the wheel: the driveline carries it
     equation: ClassVar = "F·exp(−t_release/τ)"
     source: ClassVar = "Breuer and Bill, Bremsenhandbuch (residual torque)"
     needs: ClassVar = ("brake_pressure_pa",)
@@ -50,7 +50,7 @@ class BrakeDrag(Effect):
             return segments
         return segments.with_channels(**{TIME_SINCE_BRAKING: time_since_braking(segments)})
 
-    def drive(self, row, car, point):
+    def force(self, row, car):
         moving = row.speed_mps > 0.1
         since = row.channels[TIME_SINCE_BRAKING]
         return self.force_n * jnp.where(moving & (since > 0), jnp.exp(-since / self.tau_s), 0.0)

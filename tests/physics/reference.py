@@ -81,12 +81,12 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
         force += m * G * math.cos(theta) * car["c_rr"] * p["excess"][int(r["road_surface"])]
     if p := effects.get("cornering"):
         force += p["coefficient"] * m * (square * r["curvature_1pm"]) ** 2
+    if (p := effects.get("brake_drag")) and r["since_s"] is not None and v > 0.1:
+        force += p["force_n"] * math.exp(-r["since_s"] / p["tau_s"])
 
     # paper 1, equation 5
     force = force / car["efficiency"] if force > 0 else force * car["efficiency"]
     ratio = car["gear_ratios"][int(r["gear"]) - 1] * car["final_drive"] / car["wheel_radius_m"]
-    if (p := effects.get("brake_drag")) and r["since_s"] is not None and v > 0.1:
-        force += p["force_n"] * math.exp(-r["since_s"] / p["tau_s"])
     if p := effects.get("driveline_drag"):
         force += p["torque_nm"] * ratio
     if p := effects.get("gear_efficiency"):
