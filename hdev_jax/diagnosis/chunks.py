@@ -25,7 +25,7 @@ class Chunk:
     """
 
     segments: Segments
-    residual: Float[np.ndarray, " row"]
+    measured: Float[np.ndarray, " row"]
     at: slice
     first_trip: int
     trips: int
@@ -83,7 +83,7 @@ def cut(lengths: Sequence[int], most: int) -> list[tuple[int, int]]:
 
 
 def chunks_of(
-    segments: Segments, residual: Float[np.ndarray, " row"], shapes: Shapes, *, row: int = 0, trip: int = 0
+    segments: Segments, measured: Float[np.ndarray, " row"], shapes: Shapes, *, row: int = 0, trip: int = 0
 ) -> Iterator[Chunk]:
     """Chunks of these rows, which are whole trips and begin at the log's `row` and `trip`."""
     slices = [s for _, s in trip_slices(np.asarray(segments.trip))]
@@ -91,16 +91,17 @@ def chunks_of(
     for first, last in cut([s.stop - s.start for s in slices], shapes.chunk_rows):
         at = slice(slices[first].start, slices[last - 1].stop)
         part = jax.tree.map(lambda x, at=at: np.asarray(x)[at], bare)
-        fit = padded(part, residual[at], shapes.size(at.stop - at.start))
+        fit = padded(part, measured[at], shapes.size(at.stop - at.start))
         where = slice(row + at.start, row + at.stop)
-        yield Chunk(jax.tree.map(jnp.asarray, fit.segments), residual[at], where, trip + first, last - first)
+        yield Chunk(jax.tree.map(jnp.asarray, fit.segments), measured[at], where, trip + first, last - first)
 
 
-def chunks_of_fit(rows: Fit, residual: Float[np.ndarray, " row"], shapes: Shapes) -> Iterable[Chunk]:
+def chunks_of_fit(rows: Fit, shapes: Shapes) -> Iterable[Chunk]:
     """Chunks of a log that is in memory; one that fits into a chunk is taken as it is padded already."""
+    measured = np.asarray(rows.measured)[: rows.rows]
     if rows.rows > shapes.chunk_rows:
         real = jax.tree.map(lambda x: np.asarray(x)[: rows.rows], rows.segments)
-        return chunks_of(real, residual, shapes)
+        return chunks_of(real, measured, shapes)
     trips = sum(1 for _ in trip_slices(np.asarray(rows.segments.trip)[: rows.rows]))
     whole = jax.tree.map(jnp.asarray, rows.segments)
-    return [Chunk(whole, residual, slice(0, rows.rows), 0, trips)]
+    return [Chunk(whole, measured, slice(0, rows.rows), 0, trips)]

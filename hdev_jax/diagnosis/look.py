@@ -1,7 +1,7 @@
 """One look at a vehicle and a log: what the fitted model leaves, and what every candidate would explain of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -117,10 +117,7 @@ class Loop:
         """What passes over these rows stand on, with this fit and noise."""
         lengths = [s.stop - s.start for _, s in trip_slices(self.trip)]
         shapes = Shapes(self.rows.rows, max(lengths), self.chunk_rows)
-        residual = self.measured - fit.predicted
-        return Ground(
-            lambda: chunks_of_fit(self.rows, residual, shapes), self.clusters, len(lengths), fit, self.target, noise
-        )
+        return Ground(lambda: chunks_of_fit(self.rows, shapes), self.clusters, len(lengths), fit, self.target, noise)
 
 
 @dataclass
@@ -197,9 +194,9 @@ def worth(gain: float, c: Candidate) -> float:
 def look(problem: Loop, state: Search, made: Source | None = None) -> View:
     """Whiten, gather and score everything once: the problem's effects, or candidates `made` elsewhere."""
     noise = problem.noise(state.fit)
-    fit, _ = settle(problem, state.fit, noise)
+    fit, _ = settle(ground := problem.ground(state.fit, noise))
     source = made or plan_of(fit.vehicle, problem.effects, problem.facts, problem.target)
-    return scored(problem.ground(fit, noise), source)
+    return scored(replace(ground, fit=fit), source)
 
 
 def scored(ground: Ground, source: Source) -> View:

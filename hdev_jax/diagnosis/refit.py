@@ -12,7 +12,7 @@ from hdev_jax.diagnosis.look import Found, Loop, Search, View, best_of, plausibl
 from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.sums import both_looks, distance_from_table, evidence_of
 from hdev_jax.diagnosis.whiten import Noise
-from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian, predict
+from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
@@ -60,14 +60,10 @@ def _whitened(problem: Loop, state: Search, s: Score, noise: Noise) -> dict[str,
     """
     effect = realised(s.candidate, s.beta, gears=problem.gears)
     table = state.table.plus(*_coefficients(s.candidate, effect, shapes=False))
-    vehicle, rows = state.fit.vehicle.plus(effect), problem.rows
-    predicted = np.asarray(predict(vehicle, rows.segments, problem.target))[: rows.rows]
+    vehicle = state.fit.vehicle.plus(effect)
     values, nothing = table.values(vehicle), np.zeros((len(table.free), len(table.free)))
-    start = replace(
-        state.fit, vehicle=vehicle, table=table, values=values, predicted=predicted, sd=np.diag(nothing),
-        covariance=nothing,
-    )  # fmt: skip
-    fit, error = settle(problem, start, noise)
+    start = replace(state.fit, vehicle=vehicle, table=table, values=values, sd=np.diag(nothing), covariance=nothing)
+    fit, error = settle(problem.ground(start, noise))
     prefix = f"effects.{s.candidate.id}."
     found = {
         c.path.removeprefix(prefix): (float(x), float(e))

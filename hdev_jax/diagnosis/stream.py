@@ -1,7 +1,7 @@
-"""Every candidate scored on a log that does not fit into memory: two passes over pieces of it."""
+"""Every candidate scored on a log that does not fit into memory: a few passes over pieces of it."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +10,7 @@ from hdev_jax.diagnosis.candidates import plan_of
 from hdev_jax.diagnosis.chunks import CHUNK_ROWS, Chunk, Shapes, chunks_of
 from hdev_jax.diagnosis.facts import Facts, facts_of, merged
 from hdev_jax.diagnosis.look import View, scored
+from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.sums import Ground
 from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.inference import Calibration, clusters_of, predict
@@ -45,14 +46,14 @@ def look_through(
 ) -> View:
     """What a fitted vehicle leaves of a log that comes in pieces, and what every candidate would explain of it.
 
-    **Arguments:** `read`, called twice, gives the pieces in the order of their trips, each of whole trips with one and
-    the same set of channels (a few times `chunk_rows` rows suit it); `fit`, the vehicle calibrated on some of them;
-    `effects`, the candidates' classes.
+    **Arguments:** `read`, called up to nine times, gives the pieces in the order of their trips, each of whole trips
+    with one and the same set of channels (a few times `chunk_rows` rows suit it); `fit`, the vehicle calibrated on some
+    of them; `effects`, the candidates' classes.
 
     **Returns:** the same as `look` for a log in memory. Memory does not grow with the rows but for 24 bytes of each.
 
     **Raises:** `ValueError` where there are no rows, trips are not in order or lie in two pieces, channels differ, or
-    the second reading is not the first.
+    a later reading is not the first.
     """
     seen = survey(read(), fit, target, chunk_rows=chunk_rows)
     clusters = clusters_of(seen.trip, seen.seconds)
@@ -62,19 +63,20 @@ def look_through(
 
     def chunks() -> Iterator[Chunk]:
         row, trip = 0, 0
-        for segments, _ in read():
+        for segments, measured in read():
             n = len(segments)
             if not np.array_equal(seen.trip[row : row + n], np.asarray(segments.trip)):
                 raise ValueError(f"row {row} and after are other trips than when read first; `read` must repeat itself")
-            for chunk in chunks_of(segments, seen.residual[row : row + n], shapes, row=row, trip=trip):
+            for chunk in chunks_of(segments, np.asarray(measured, dtype=float), shapes, row=row, trip=trip):
                 yield chunk
                 trip += chunk.trips
             row += n
         if row != seen.facts.rows:
             raise ValueError(f"{row} rows, {seen.facts.rows} when read first; `read` must repeat itself")
 
-    source = plan_of(fit.vehicle, effects, seen.facts, target)
-    return scored(Ground(chunks, clusters, len(lengths), fit, target, noise), source)
+    ground = Ground(chunks, clusters, len(lengths), fit, target, noise)
+    ground = replace(ground, fit=settle(ground)[0])
+    return scored(ground, plan_of(ground.fit.vehicle, effects, seen.facts, target))
 
 
 def survey(pieces: Iterable[Piece], fit: Calibration, target: Target, *, chunk_rows: int = CHUNK_ROWS) -> Survey:
@@ -99,7 +101,7 @@ def survey(pieces: Iterable[Piece], fit: Calibration, target: Target, *, chunk_r
         # a log of one chunk would do with fewer rows, but this may be the first of many
         shapes = Shapes(chunk_rows + 1, max(s.stop - s.start for _, s in runs), chunk_rows)
         parts = chunks_of(segments, np.asarray(measured, dtype=float), shapes)
-        left = [c.residual - np.asarray(predict(fit.vehicle, c.segments, target))[: c.rows] for c in parts]
+        left = [c.measured - np.asarray(predict(fit.vehicle, c.segments, target))[: c.rows] for c in parts]
         kept.append((trip, np.asarray(segments.duration_s, dtype=float), np.concatenate(left)))
     if not kept:
         raise ValueError("a log of no pieces has no candidates; expected at least one piece of whole trips")

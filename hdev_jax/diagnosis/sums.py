@@ -15,7 +15,7 @@ from hdev_jax.diagnosis.candidates import Source
 from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.evidence import Evidence
 from hdev_jax.diagnosis.whiten import Noise, whiten
-from hdev_jax.inference import Calibration, Clusters, jacobian
+from hdev_jax.inference import Calibration, Clusters, jacobian, predict
 from hdev_jax.inference.calibrate import WEAK
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import trip_slices
@@ -48,7 +48,8 @@ class Ground:
         out = np.empty((len(chunk.segments), base + width + 1))
         out[:, :base] = jacobian(self.fit.vehicle, table, chunk.segments, self.target)
         write(out[:, base : base + width], chunk)
-        out[: chunk.rows, -1] = chunk.residual
+        predicted = np.asarray(predict(self.fit.vehicle, chunk.segments, self.target))
+        out[: chunk.rows, -1] = chunk.measured - predicted[: chunk.rows]
         out[chunk.rows :] = 0.0
         return out
 

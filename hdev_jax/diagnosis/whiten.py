@@ -9,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hdev_jax.inference import padded_rows
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Noise", "estimate_noise", "whiten"]
 
 MAX_ORDER = 24
-ORDERS = (2, 4, 8, 16, MAX_ORDER)  # that the filter is compiled for
-PIECE = 65_536  # rows filtered at a time
+ORDERS = (4, 12, MAX_ORDER)  # that the filter is compiled for; the rest of the coefficients are zero
+NARROW, WIDE = 2, 32  # columns that it takes at once
+PIECE = 65_536  # rows that it takes at once
 BLOCK_S = 600.0
 BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
@@ -132,7 +134,7 @@ def estimate_noise(
     assert best is not None
     noise = best[1]
     # scale by trip from what is white, shrunk by the number of rows: 50 rows are worth as much as the common scale
-    white = _filtered(residual[:, None], noise, _positions(trip))[:, 0]
+    white = _filtered(residual[:, None], noise, trip)[:, 0]
     rows = np.array([s.stop - s.start for s in slices])
     own = np.array([np.mean(white[s] ** 2) for s in slices])
     pooled = float(np.mean(white**2))
@@ -159,7 +161,7 @@ def _block_sd(noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: 
 def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices: list[slice]) -> float:
     """Gaussian log-likelihood with the levels integrated out."""
     position = np.minimum(_positions(trip), noise.order)
-    both = _filtered(residual[:, None], noise, position)
+    both = _filtered(residual[:, None], noise, trip)
     z, u = both[:, 0], both[:, 1]
     total = -np.sum(np.log(noise.scales[position])) - 0.5 * np.sum(z**2)
     for s in slices:
@@ -170,42 +172,43 @@ def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices
 
 
 def _filtered(
-    columns: Float[np.ndarray, "row k"], noise: Noise, position: Int[np.ndarray, " row"]
+    columns: Float[np.ndarray, "row k"], noise: Noise, trip: Int[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row k+1"]:
-    """Columns and a level of 1 through the autoregression's inverse, a piece of rows at a time.
+    """Columns, and a level of 1, less what the rows before predict of them, over the prediction's sd.
 
-    Rows, widths and orders are padded to a few, so that the filter is compiled a few times.
+    Rows, orders and widths come in a few shapes only: a program for each log, order and set of candidates would take
+    longer to compile than to run. Long logs are taken a piece of rows at a time.
     """
-    n, k = columns.shape
-    order = next(o for o in ORDERS if o >= noise.order)
-    extra = order - noise.order
-    coefficients = np.pad(noise.coefficients, ((0, extra), (0, extra)))
-    coefficients[noise.order :] = coefficients[noise.order]
-    scales = np.r_[noise.scales, np.full(extra, noise.scales[-1])]
+    (n, k), order = columns.shape, noise.order
+    lags = next(o for o in ORDERS if o >= order)
+    at = np.minimum(_positions(trip), order)
+    before, rows, size = (lags, PIECE, lags + PIECE) if n > PIECE else (0, n, padded_rows(n))
+    width = NARROW if k + 1 <= NARROW else WIDE
     out = np.empty((n, k + 1))
-    before, rows = (order, PIECE) if n > PIECE else (0, n)
-    width = k + 1 if k == 1 else k + 1 + (-(k + 1)) % 16
     for start in range(0, n, rows):
         low, stop = max(start - before, 0), min(start + rows, n)
-        here = slice(before - (start - low), before - start + stop)  # rows of the log in this piece
-        piece, place = np.zeros((before + rows, width)), np.zeros(before + rows, dtype=position.dtype)
-        piece[here, :k], piece[here, k], place[here] = columns[low:stop], 1.0, position[low:stop]
-        white = np.asarray(_filter(piece, coefficients, scales, place))
-        out[start:stop] = white[before : before + stop - start, : k + 1]
+        here = slice(before - (start - low), before - start + stop)  # where rows low to stop are in this piece
+        phi, inverse = np.zeros((size, lags)), np.ones(size)
+        phi[here, :order], inverse[here] = noise.coefficients[at[low:stop]], 1.0 / noise.scales[at[low:stop]]
+        for first in range(0, k + 1, width):
+            part = columns[low:stop, first : first + width]
+            wide = np.zeros((size, width))
+            wide[here, : part.shape[1]] = part
+            if k < first + width:
+                wide[here, k - first] = 1.0
+            white = np.asarray(_filter(wide, phi, inverse))[before : before + stop - start]
+            out[start:stop, first : first + width] = white[:, : k + 1 - first]
     return out
 
 
 @jax.jit
-def _filter(columns: Any, coefficients: Any, scales: Any, position: Any) -> Array:
-    order = coefficients.shape[1]
-    at = jnp.minimum(position, order)
-    phi = coefficients[at]
+def _filter(columns: Any, phi: Any, inverse: Any) -> Array:
     out = columns
-    for k in range(order):
+    for k in range(phi.shape[1]):
         back = jnp.concatenate([jnp.zeros_like(columns[: k + 1]), columns[: -(k + 1)]])
         # rows too early in their trip have a zero coefficient here, so nothing leaks from the trip before
         out = out - phi[:, k : k + 1] * back
-    return out / scales[at][:, None]
+    return out * inverse[:, None]
 
 
 def whiten(
@@ -220,7 +223,7 @@ def whiten(
     of 1 of the trip looks like; `Sums.evidence` takes those out by their variance.
     """
     k = columns.shape[1]
-    out = _filtered(columns, noise, _positions(trip))
+    out = _filtered(columns, noise, trip)
     for t, (_, s) in enumerate(trip_slices(trip)):
         out[s] /= noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
     if noise.block_sd > 0:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.candidates import plan_of
 from hdev_jax.diagnosis.chunks import Shapes, chunks_of, cut
 from hdev_jax.diagnosis.facts import MOST_STEPS, facts_of, merged
 from hdev_jax.diagnosis.problem import Problem, prepare
@@ -44,8 +43,10 @@ def looked(problem: Problem, chunk_rows: int, block_sd: float = 0.0) -> looks.Vi
     effects = [LIBRARY[k] for k in EFFECTS]
     rng, gears = np.random.default_rng(0), most_group(problem.segments)
     loop = looks.Loop(rows, problem.target, clusters, effects, 0.05, rng, gears, chunk_rows)
-    ground = loop.ground(fit, replace(loop.noise(fit), block_sd=block_sd))
-    return looks.scored(ground, plan_of(fit.vehicle, effects, loop.facts, problem.target))
+    state = looks.Search(problem.vehicle, problem.table, fit)
+    view = looks.look(loop, state)
+    ground = replace(view.ground, noise=replace(view.ground.noise, block_sd=block_sd))
+    return looks.scored(ground, view.source) if block_sd else view
 
 
 def same(one: looks.View, other: looks.View) -> None:
@@ -103,7 +104,9 @@ def test_a_stream_says_what_the_log_in_memory_says(per_piece, tmp_path):
             at = (problem.segments.trip >= first) & (problem.segments.trip < first + per_piece)
             yield problem.segments.take(at), problem.measured[at]
 
-    parts = look_through(read, whole.ground.fit, effects, problem.target, chunk_rows=200)
+    clusters, rows = cluster_rows(problem.segments), padded(problem.segments, problem.measured)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    parts = look_through(read, fit, effects, problem.target, chunk_rows=200)
     same(whole, replace(parts, ground=whole.ground))
     for name in ("coefficients", "scales", "trip_scale"):
         np.testing.assert_allclose(getattr(parts.ground.noise, name), getattr(whole.ground.noise, name), rtol=1e-6)
@@ -167,7 +170,7 @@ def test_chunks_count_their_rows_anew():
     for c in chunks:
         first = np.asarray(c.segments.channels["derived:first_row_of_trip"])[: c.rows]
         np.testing.assert_array_equal(first, np.repeat([0, 10, 20], 10))
-    np.testing.assert_array_equal(np.concatenate([c.residual for c in chunks]), np.arange(90.0))
+    np.testing.assert_array_equal(np.concatenate([c.measured for c in chunks]), np.arange(90.0))
 
 
 def test_long_trips_are_whitened_in_pieces(monkeypatch):

@@ -39,7 +39,7 @@ def test_whitened_rows_know_coefficients_better_than_plain_ones(tmp_path):
     plain, white = [], []
     for seed in range(6):
         loop, fit, true = calibrated(tmp_path, seed)
-        settled, error = settle(loop, fit, loop.noise(fit))
+        settled, error = settle(loop.ground(fit, loop.noise(fit)))
         assert np.all(error < fit.sd)
         plain.append((fit.values - true) / true)
         white.append((settled.values - true) / true)
@@ -50,7 +50,7 @@ def test_whitened_rows_know_coefficients_better_than_plain_ones(tmp_path):
 def test_where_it_settles_no_step_is_left(tmp_path):
     loop, fit, _ = calibrated(tmp_path, 1)
     noise = loop.noise(fit)
-    settled, error = settle(loop, fit, noise)
+    settled, error = settle(loop.ground(fit, noise))
     step, _ = evidence_of(loop.ground(settled, noise)).step()
     assert np.all(np.abs(step) < 0.05 * error)
     assert np.all(np.isfinite(settled.predicted))
@@ -60,7 +60,7 @@ def test_a_fit_of_nothing_settles_as_it_is(tmp_path):
     loop, fit, _ = calibrated(tmp_path, 1)
     table = fit.table.with_free(**{c.name: False for c in fit.table.free})
     held = replace(fit, table=table, values=np.zeros(0), sd=np.zeros(0), covariance=np.zeros((0, 0)))
-    settled, error = settle(loop, held, loop.noise(fit))
+    settled, error = settle(loop.ground(held, loop.noise(fit)))
     assert settled is held
     assert error.shape == (0,)
 
