@@ -150,14 +150,17 @@ def _call(module: str, task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _prepare_worker(compiled: str, threads: int) -> None:
-    """Double precision, a share of the cores, and one cache of compiled programs for all workers."""
+    """Double precision, a share of the cores, and a cache of compiled programs that outlives `FORGET_EVERY`.
+
+    A cache for each worker: JAX does not write an entry in one step.
+    """
     if threads == 1:
         os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = str(threads)
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", compiled)
+    jax.config.update("jax_compilation_cache_dir", str(Path(compiled) / str(os.getpid())))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 

@@ -51,6 +51,7 @@ class Case(Strict):
     wanted: float | None = None
     wanted_unexplained: float | None = None  # least share of logs in which something is called unexplained
     absorbed: bool = False
+    wanted_pooled: float | None = None  # the same over all settings of the case together
 
 
 class Config(Strict):
@@ -119,6 +120,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         "exact": exact(task["effects"], [n["class"] for n in named]),
         "verdict": summary["verdict"],
         "unexplained": summary["unexplained"]["significant"],
+        "not_decidable": [c["id"] for c in summary["not_decidable"]],
         "absorbed": sorted({a for p in summary["baseline"]["parameters"].values() for a in p["absorbs"]}),
         "why_not": {c["id"]: c["why_not"] for c in summary["candidates"] if c["id"] in task["effects"]},
         "sizes": sizes(synthetic, summary["effects"]),

@@ -20,6 +20,11 @@ def collect(config: "Config", results: list[tuple[dict[str, Any], dict[str, Any]
     done = [(t, r) for t, r in results if "skipped" not in r]
     skipped = [{"seed": t["seed"], "effects": t["effects"], "why": r["skipped"]} for t, r in results if "skipped" in r]
     rows = [_row(config, name, group) for name, group in grouped(done)]
+    for case in config.cases.values():
+        group = [(t, r) for t, r in done if t["case"] == case.name]
+        if case.wanted_pooled is not None and group:
+            row = _row(config, f"{case.name}, all together", group)
+            rows.append({**row, "wanted": case.wanted_pooled, "met": row["as_asked"] >= case.wanted_pooled})
     write_tables(run, "planted", rows, f"Planted effects, synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
     power_figure(run, done, config.rivals)
     false_figure(run, done, config.rivals)
@@ -83,6 +88,7 @@ def _row(config: "Config", setting: str, group: list) -> dict[str, Any]:
         "named_exactly_no_class": alone / n if named else None,
         "something_false": false / n,
         "called_absorbed": absorbed / n if case.absorbed else None,
+        "called_not_decidable": sum(bool(r["not_decidable"]) and not r["named"] for _, r in group) / n,
         "called_unexplained": unexplained / n,
         "unexplained_wanted": case.wanted_unexplained,
         "mean_class": float(np.mean([len(x["class"]) for _, r in group for x in r["named"]] or [0.0])),

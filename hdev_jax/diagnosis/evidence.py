@@ -13,9 +13,10 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
+from hdev_jax.diagnosis.significance import wald
 from hdev_jax.segments import trip_slices
 
-__all__ = ["ABSORBED", "Evidence", "Score", "adjusted", "clusters_needed", "wald"]
+__all__ = ["ABSORBED", "Evidence", "Score"]
 
 ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
 
@@ -42,16 +43,6 @@ class Score:
     def p(self) -> float:
         """Both tests have to agree; twice that, since whitened and plain rows are both looked at."""
         return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
-
-    def over(self, ways: int) -> float:
-        """p of the best of so many ways to have the effect.
-
-        The way is chosen by its likelihood, so its own p bears the choice; the clusters are asked about that one way
-        alone. Where only clusters speak, they have chosen it.
-        """
-        if self.plain:
-            return min(1.0, ways * self.p)
-        return min(1.0, max(2.0 * ways * self.p_model, self.p_cluster))
 
 
 @dataclass(frozen=True)
@@ -95,6 +86,7 @@ class Evidence:
             out, shrink = self.grams.copy(), self._shrink(v)
             for g, part in trip_slices(self.home):
                 out[g] -= (self.levels[part] * shrink[part, None]).T @ self.levels[part]
+            self._kept.clear()  # one variance at a time: each is as large as all Gram matrices
             self._kept[v] = out
         return self._kept[v]
 
@@ -167,12 +159,13 @@ class Evidence:
         likelihood, x = self._fit(totals, at)
         v = int(np.argmax(likelihood))
         beta = x[v, self.base :]
-        full, base = self._jackknife(at, v), self._jackknife(np.empty(0, int), v)
-        left_out = self._loss(full, np.r_[np.arange(self.base), at], v)
-        left_out_base = self._loss(base, np.arange(self.base), v)
+        own = int(np.argmax(self._fit(totals, np.empty(0, int))[0]))  # the base at the variance that suits the base
+        full, base = self._jackknife(at, v), self._jackknife(np.empty(0, int), own)
+        left_out = float(np.sum(self._loss(full, np.r_[np.arange(self.base), at], v))) + self.cost[v]
+        left_out_base = float(np.sum(self._loss(base, np.arange(self.base), own))) + self.cost[own]
         p_cluster = wald(beta, full[:, self.base :]) if g > k + 1 else 1.0
         return Score(
-            candidate, beta, gain, p_model, p_cluster, float(np.sum(left_out_base - left_out)),
+            candidate, beta, gain, p_model, p_cluster, float(left_out_base - left_out),
             self.left(totals, candidate.columns),
         )  # fmt: skip
 
@@ -285,41 +278,3 @@ class Evidence:
         grams, levels = self.grams[:, index[:, None], index[None, :]], self.levels[:, index]
         small = replace(self, grams=grams, levels=levels)
         return small, replace(candidate, columns=tuple(range(len(candidate.columns))))
-
-
-def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
-    """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F)."""
-    g, k = left_out.shape
-    if g <= k + 1:
-        return 1.0
-    spread = left_out - beta
-    covariance = (g - 1) / g * spread.T @ spread
-    d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    w = float((beta / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (beta / d))
-    return float(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
-
-
-def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
-    """How many clusters would bring a Wald test of `k` numbers from `p` down to `level`, its size staying as it is.
-
-    **Returns:** None where twenty times as many would not do.
-    """
-    if clusters <= k + 1:
-        return None
-    statistic = float(stats.f.isf(p, k, clusters - k))
-    more = np.arange(clusters, 20 * clusters + 1)
-    enough = stats.f.sf(statistic * more / clusters, k, more - k) <= level
-    return int(more[np.argmax(enough)]) if enough.any() else None
-
-
-def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:
-    """q-values that bound the share of false discoveries (Benjamini and Hochberg 1995)."""
-    every = np.asarray(p, dtype=float)
-    if not len(every):
-        return every
-    order = np.argsort(every)
-    ranked = every[order] * len(every) / (np.arange(len(every)) + 1)
-    q = np.minimum.accumulate(ranked[::-1])[::-1]
-    out = np.empty_like(q)
-    out[order] = np.minimum(q, 1.0)
-    return out

@@ -7,9 +7,10 @@ import numpy as np
 
 from hdev_jax.diagnosis.candidates import Candidate, Source, plan_of
 from hdev_jax.diagnosis.chunks import CHUNK_ROWS, Shapes, chunks_of_fit
-from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score, adjusted, clusters_needed
+from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.facts import Facts, facts_of
 from hdev_jax.diagnosis.settle import settle
+from hdev_jax.diagnosis.significance import adjusted, clusters_needed, effective_number
 from hdev_jax.diagnosis.sums import Ground, both_looks
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
@@ -130,7 +131,7 @@ class View:
     source: Source
     slow: np.ndarray
     best: dict[str, Score]
-    ways: dict[str, int]
+    ways: dict[str, float]
     q: dict[str, float]
     left_out: dict[str, str]
     absorbs: dict[str, list[str]]
@@ -153,8 +154,8 @@ class View:
         """Clusters that would do for a candidate that looks right but is not told from chance by those there are."""
         if self.q[s.candidate.id] <= fdr or s.p > HINT or s.candidate.id in self.reasons or not plausible(s):
             return None
-        level = fdr / len(self.best)
-        return clusters_needed(s.over(self.ways[s.candidate.id]), len(s.beta), self.evidence.count, level)
+        level = fdr / (2.0 * len(self.best) * self.ways[s.candidate.id])  # before it is corrected as q is
+        return clusters_needed(max(s.p_model, s.p_cluster), len(s.beta), self.evidence.count, level)
 
 
 def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
@@ -208,27 +209,29 @@ def scored(ground: Ground, source: Source) -> View:
         left_out[id_] = "does nothing on this log"
     absorbs, absorbed_by = _absorption(evidence, ground.fit.table, best)
     ids = list(best)
-    ps = [best[i].over(ways[i]) if i not in absorbed_by else 1.0 for i in ids]
+    ps = [min(1.0, best[i].p * ways[i]) if i not in absorbed_by else 1.0 for i in ids]
     q = dict(zip(ids, adjusted(ps), strict=True))
     return View(evidence, plain, ground, source, slow, best, ways, q, left_out, absorbs, absorbed_by)
 
 
 def best_of(
     evidence: Evidence, plain: Evidence, candidates: Sequence[Candidate], slow: np.ndarray
-) -> tuple[dict[str, Score], dict[str, int]]:
-    """The best plausible way to have each effect, and how many ways were tried."""
+) -> tuple[dict[str, Score], dict[str, float]]:
+    """The best plausible way to have each effect, and how many independent ways were tried."""
     totals = evidence.totals()
     before = evidence.base_likelihood(totals)
-    ways: dict[str, int] = {}
+    tried: dict[str, int] = {}
     ranked: dict[str, list[tuple[float, Candidate]]] = {}
     for c in candidates:
         if min(totals[0, evidence.base + k, evidence.base + k] for k in c.columns) <= 1e-20:
             continue
         gain, _ = evidence.gain(totals, c.columns, before)
-        ways[c.id] = ways.get(c.id, 0) + 1
+        tried[c.id] = tried.get(c.id, 0) + 1
         ranked.setdefault(c.id, []).append((worth(gain, c), c))
-    best = {}
+    best, ways = {}, {}
     for id_, entries in ranked.items():
+        at = evidence.base + np.unique([k for _, c in entries for k in c.columns])
+        ways[id_] = min(float(tried[id_]), effective_number(totals[0][np.ix_(at, at)]))
         looks = [_first_plausible([evidence.score(c) for _, c in _leading(entries)])]
         scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
         if scores:

@@ -1,6 +1,6 @@
 """Joint refits: the vehicle with a candidate, every free coefficient fitted anew, and whether it stands."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,12 +36,12 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
     refined = _refined(problem, s, view) if try_plain else s
-    new = _tried(problem, state, refined, {}) if try_plain else None
-    if new is None and c.kind == "size" and not s.plain and np.all(np.abs(plain - white) <= AGREES * plain_sd):
-        # rows of equal weight do not bear it out, but leave room for what the whitened rows say: that is then what is
-        # known of it beforehand
-        known = _whitened(problem, state, refined, view.ground.noise)
-        new = _tried(problem, state, refined, known) if known else None
+    new = _tried(problem, state, refined) if try_plain else None
+    grouped = any(g is not None for g in c.groups)
+    room = bool(np.all(np.abs(plain - white) <= AGREES * plain_sd))
+    if new is None and c.kind == "size" and not (s.plain or grouped) and room:
+        # rows of equal weight do not bear it out, but leave room for what the whitened rows say
+        new = _tried(problem, state, refined, view.ground.noise)
     return None if new is None else (new, _gain(problem, state, new.fit, view))
 
 
@@ -53,39 +53,46 @@ def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) ->
     return bool(np.all((np.abs(plain) > SEEN * white_sd) & (plain * white <= 0)))
 
 
-def _whitened(problem: Loop, state: Search, s: Score, noise: Noise) -> dict[str, tuple[float, float]]:
-    """Sizes and standard errors by whitened rows, every coefficient fitted with them; empty where that fails.
-
-    One linear step is not enough: the coefficients that it starts from have been fitted without the effect.
-    """
-    effect = realised(s.candidate, s.beta, gears=problem.gears)
-    table = state.table.plus(*_coefficients(s.candidate, effect, shapes=False))
-    vehicle = state.fit.vehicle.plus(effect)
-    values, nothing = table.values(vehicle), np.zeros((len(table.free), len(table.free)))
-    start = replace(state.fit, vehicle=vehicle, table=table, values=values, sd=np.diag(nothing), covariance=nothing)
-    fit, error = settle(problem.ground(start, noise))
-    prefix = f"effects.{s.candidate.id}."
-    found = {
-        c.path.removeprefix(prefix): (float(x), float(e))
-        for c, x, e in zip(table.free, fit.values, error, strict=True)
-        if c.path.startswith(prefix)
-    }
-    return found if all(np.isfinite(e) for _, e in found.values()) else {}
-
-
-def _tried(problem: Loop, state: Search, s: Score, known: Mapping[str, tuple[float, float]]) -> Search | None:
-    """The state with the candidate in a joint fit, its sizes with what is known of them; None where it fails."""
+def _tried(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -> Search | None:
+    """The state with the candidate in a joint fit; None where it fails. With `noise`, its sizes are borrowed from rows
+    whitened by it."""
     c = s.candidate
     effect = realised(c, s.beta, gears=problem.gears)
-    if known and any(g is not None for g in c.groups):
-        return None
-    rows = _coefficients(c, effect, shapes=not known)
-    rows = tuple(replace(r, **_prior(known.get(r.path.rpartition(".")[2]))) for r in rows)
-    table = state.table.plus(*rows)
-    fit = calibrate(state.fit.vehicle.plus(effect), table, problem.rows, problem.target, problem.clusters)
+    rows = _coefficients(c, effect, shapes=noise is None)
+    if noise is not None:
+        rows = tuple(replace(r, borrowed=r.free and r.path.rpartition(".")[2] in c.sizes) for r in rows)
+    table, vehicle = state.table.plus(*rows), state.fit.vehicle.plus(effect)
+    if any(r.borrowed for r in table.free):
+        told = borrow(problem, replace(state, vehicle=vehicle, table=table), noise or problem.noise(state.fit))
+        if told is None and noise is not None:
+            return None
+        table = told or table
+    fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
     if (not fit.converged and fit.steps < 5) or not _in_range(fit, c) or not _present(fit, c):
         return None
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
+
+
+def borrow(problem: Loop, state: Search, noise: Noise) -> ParameterTable | None:
+    """The state's table with what whitened rows say of its borrowed coefficients, all others fitted beside them.
+
+    One linear step is not enough: the coefficients that it starts from may have been fitted without the effect. None
+    where the steps do not settle.
+    """
+    values, nothing = state.table.values(state.vehicle), np.zeros((len(state.table.free), len(state.table.free)))
+    start = replace(
+        state.fit, vehicle=state.vehicle, table=state.table, values=values, sd=np.diag(nothing), covariance=nothing
+    )
+    fit, error = settle(problem.ground(start, noise))
+    told = {(c.path, c.group): (float(x), float(e))
+            for c, x, e in zip(state.table.free, fit.values, error, strict=True) if c.borrowed}  # fmt: skip
+    if not all(np.isfinite(e) for _, e in told.values()):
+        return None
+    rows = []
+    for c in state.table.rows:
+        value, sd = told.get((c.path, c.group), (c.value, c.sd))
+        rows.append(replace(c, value=value, sd=sd))
+    return ParameterTable(tuple(rows))
 
 
 def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) -> tuple[Coefficient, ...]:
@@ -93,10 +100,6 @@ def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) 
     groups = [str(g) for g in candidate.groups if g is not None]
     rows = effect_coefficients(effect, candidate.sizes, groups=groups, shapes=shapes)
     return tuple(replace(r, free=False) if _idle(candidate, r.path) else r for r in rows)
-
-
-def _prior(known: tuple[float, float] | None) -> dict[str, float]:
-    return {} if known is None else {"value": known[0], "sd": known[1]}
 
 
 def _refined(problem: Loop, s: Score, view: View) -> Score:

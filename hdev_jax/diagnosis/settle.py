@@ -35,12 +35,15 @@ def settle(ground: Ground) -> tuple[Calibration, Float[np.ndarray, " free"]]:
         misfit = evidence.misfit() + 0.5 * float(np.sum((moved / sd) ** 2))
         if k == 0:
             first = misfit
-        step, error = evidence.step()
-        if not (np.all(np.isfinite(step)) and np.isfinite(misfit) and misfit <= first + 1e-6 * abs(first)):
+        if not (np.isfinite(misfit) and misfit <= first + 1e-6 * abs(first)):
             return failed
-        if np.max(np.abs(step) / np.maximum(error, 1e-300)) < SETTLED:
+        step, error = evidence.step()
+        if not np.all(np.isfinite(step)):
+            return failed
+        there = _at(here, here.values + step)  # a coefficient at its bound stays there, and the others go on
+        if np.max(np.abs(there.values - here.values) / np.maximum(error, 1e-300)) < SETTLED:
             return here, error
-        here = _at(here, here.values + step)
+        here = there
     return failed
 
 

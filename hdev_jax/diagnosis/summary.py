@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.metrics import metrics
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder
-from hdev_jax.inference import Calibration, cluster_rows
+from hdev_jax.inference import Calibration, Coefficient, cluster_rows
 
 __all__ = ["baseline_block", "summarise"]
 
@@ -46,11 +46,16 @@ def sized(value: float, error: float, clusters: int) -> dict[str, Any]:
     return {"value": value, "sd": sd, "interval_90": [value - half, value + half]}
 
 
+def _error(row: Coefficient, error: float) -> float:
+    """A standard error; of what was borrowed no smaller than where it comes from, since both are the same rows."""
+    return max(error, row.sd) if row.borrowed and row.sd is not None else error
+
+
 def _effect_block(f: Found, fit: Calibration, before: float, after: float, clusters: int) -> dict[str, Any]:
     c = f.score.candidate
     prefix = f"effects.{f.id}."
     parameters = {
-        row.name.removeprefix(prefix): {**sized(float(v), float(s), clusters), "unit": row.unit}
+        row.name.removeprefix(prefix): {**sized(float(v), _error(row, float(s)), clusters), "unit": row.unit}
         for row, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
         if row.path.startswith(prefix)
     }
@@ -135,7 +140,7 @@ def summarise(
         "not_decidable": _not_decidable(state.verdicts, left),
         "verdict": verdict,
         "parameters_fitted": _fitted(state),
-        "clusters": {"kind": clusters.kind, "count": clusters.count},
+        "clusters": {"kind": clusters.kind, "count": clusters.count, "trips": len(split.train)},
         "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
         "notes": [*problem.notes, *_warnings(steps, state), *_odd_rows(problem, predicted[0])],
     }

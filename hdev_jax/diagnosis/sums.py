@@ -109,9 +109,12 @@ class Sums:
 
 
 def distance_from_table(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """How far the fitted coefficients are from their tables, and the tables' standard deviations."""
+    """How far the fitted coefficients are from their tables, and the tables' standard deviations.
+
+    What was borrowed from the log itself is no table's: it is as open as a coefficient without one.
+    """
     prior = np.array([c.value for c in fit.table.free])
-    sd = np.array([c.sd if c.sd is not None else WEAK * c.scale for c in fit.table.free])
+    sd = np.array([WEAK * c.scale if c.sd is None or c.borrowed else c.sd for c in fit.table.free])
     return fit.values - prior, sd
 
 
@@ -150,7 +153,9 @@ def both_looks(ground: Ground, source: Source) -> tuple[Evidence, Evidence, Bool
             between += np.sum(rows[s, base:-1], axis=0) ** 2 / (s.stop - s.start)
         rows_in_all += chunk.rows
     total = np.einsum("gii->i", plain.grams)
-    variance = float(total[-1]) / rows_in_all * ground.fit.inflation
+    # a log that is met exactly has no variance; nothing is worth more than a part in 10¹² of what was predicted
+    least = 1e-24 * float(np.mean(np.square(ground.fit.predicted)))
+    variance = max(float(total[-1]) / rows_in_all, least, 1e-300) * ground.fit.inflation
     return (
         white.evidence(base, moved=moved, prior_sd=sd, level_sd=ground.noise.level_sd),
         plain.evidence(base, moved=moved, prior_sd=sd, variance=variance),

@@ -102,7 +102,9 @@ def estimate_noise(
     are shrunk towards one common scale, as far as their number of rows allows.
     """
     slices = [s for _, s in trip_slices(trip)]
-    common = np.sqrt(np.mean(residual**2)) + 1e-300
+    common = float(np.sqrt(np.mean(residual**2)))
+    if common < 1e-150:  # met exactly: nothing is left to have a colour
+        return Noise(np.zeros((2, 1)), np.ones(2), 0.0, np.ones(len(slices)), 0.0)
     longest = max(s.stop - s.start for s in slices)
     order = int(max(1, min(MAX_ORDER, longest // 4)))
     # Autocovariance about zero: each lag with the number of pairs it has, so that short trips are not biased to white

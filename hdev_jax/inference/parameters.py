@@ -28,6 +28,8 @@ class Coefficient:
 
     `path` as in the sheet (`road.c_rr`, `effects.headwind.scale`); `group` is the place in a coefficient that has one
     value per vehicle or gear, `label` its name. `lower` and `upper` are the support; `scale` conditions the solver.
+    `borrowed`: value and sd are no table's but what whitened rows of the same log say. A calibration on rows of equal
+    weight takes them; evidence from whitened rows must not count them a second time.
     """
 
     path: str
@@ -40,6 +42,7 @@ class Coefficient:
     free: bool = True
     group: int | None = None
     label: str = ""
+    borrowed: bool = False
 
     @property
     def name(self) -> str:

@@ -178,9 +178,12 @@ def _suspects(data: ReportData) -> str:
     able, clusters = data.summary.get("not_decidable") or [], data.summary.get("clusters") or {}
     if not able:
         return ""
-    unit = "trips" if clusters.get("kind") == "trip" else "stretches of driving"
-    named = [f"{names.effect(c['id'])} (about {c['clusters_needed']} {unit} like these would tell)" for c in able]
-    return f"with {clusters.get('count')} {unit} for training this log cannot decide on {names.verbose_join(named)}"
+    count, by_trip = clusters.get("count", 1), clusters.get("kind") == "trip"
+    there = clusters.get("trips", count) if by_trip else count  # many trips share clusters
+    unit = "trips" if by_trip else "stretches of driving"
+    needed = [(names.effect(c["id"]), math.ceil(c["clusters_needed"] * there / count)) for c in able]
+    named = [f"{name} (about {many} {unit} like these would tell)" for name, many in needed]
+    return f"with {there} {unit} for training this log cannot decide on {names.verbose_join(named)}"
 
 
 def _unnamed(data: ReportData) -> str:

@@ -7,7 +7,8 @@ import pytest
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.evidence import Evidence, adjusted, wald
+from hdev_jax.diagnosis.evidence import Evidence
+from hdev_jax.diagnosis.significance import adjusted, wald
 from hdev_jax.diagnosis.sums import LEVELS, Sums
 from hdev_jax.inference import Clusters
 from hdev_jax.physics import LIBRARY

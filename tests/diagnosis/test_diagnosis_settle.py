@@ -7,12 +7,11 @@ import pytest
 from scipy import stats
 
 from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.evidence import Score, clusters_needed
 from hdev_jax.diagnosis.look import Verdict
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.refit import _contradicted
 from hdev_jax.diagnosis.settle import settle
+from hdev_jax.diagnosis.significance import clusters_needed, effective_number
 from hdev_jax.diagnosis.summary import _not_decidable, sized
 from hdev_jax.diagnosis.sums import Sums, evidence_of
 from hdev_jax.diagnosis.unexplained import Remainder
@@ -20,7 +19,6 @@ from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.physics import LIBRARY
 
 
 def calibrated(folder, seed: int):
@@ -106,12 +104,14 @@ def test_the_interval_covers_what_it_says(clusters):
     assert hits / 2000 == pytest.approx(0.90, abs=0.02)
 
 
-def test_the_way_is_paid_for_by_the_rows_and_the_trips_are_asked_once():
-    way = Candidate(LIBRARY["auxiliary_power"], ("power_w",), (None,), (), "size", (0,))
-    score = Score(way, np.ones(1), 50.0, 1e-6, 2e-3, 40.0, 1.0)
-    assert score.over(14) == pytest.approx(2e-3)
-    assert replace(score, p_model=1e-3).over(14) == pytest.approx(2 * 14 * 1e-3)
-    assert replace(score, p_model=2e-3, plain=True).over(14) == pytest.approx(2 * 14 * 2e-3)
+def test_ways_that_are_alike_are_one_test():
+    rng = np.random.default_rng(0)
+    apart = rng.normal(size=(4000, 6))
+    alike = apart[:, :1] + 0.01 * rng.normal(size=(4000, 6))
+    assert effective_number(apart.T @ apart) == pytest.approx(6.0, abs=0.1)
+    assert effective_number(alike.T @ alike) == pytest.approx(1.0, abs=0.1)
+    assert 3.0 < effective_number((half := np.c_[apart[:, :3], alike[:, :3]]).T @ half) < 5.0
+    assert effective_number(np.ones((1, 1))) == 1.0
 
 
 @pytest.mark.parametrize(("white", "against"), [(-0.01, True), (0.01, False)])

@@ -1,0 +1,61 @@
+"""What chance could do: tests with few clusters, many candidates, and many ways to have each."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+__all__ = ["adjusted", "clusters_needed", "effective_number", "wald"]
+
+
+def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
+    """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F)."""
+    g, k = left_out.shape
+    if g <= k + 1:
+        return 1.0
+    spread = left_out - beta
+    covariance = (g - 1) / g * spread.T @ spread
+    d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    w = float((beta / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (beta / d))
+    return float(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
+
+
+def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
+    """How many clusters would bring a Wald test of `k` numbers from `p` down to `level`, its size staying as it is.
+
+    **Returns:** None where twenty times as many would not do.
+    """
+    if clusters <= k + 1:
+        return None
+    statistic = float(stats.f.isf(p, k, clusters - k))
+    more = np.arange(clusters, 20 * clusters + 1)
+    enough = stats.f.sf(statistic * more / clusters, k, more - k) <= level
+    return int(more[np.argmax(enough)]) if enough.any() else None
+
+
+def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:
+    """q-values that bound the share of false discoveries (Benjamini and Hochberg 1995)."""
+    every = np.asarray(p, dtype=float)
+    if not len(every):
+        return every
+    order = np.argsort(every)
+    ranked = every[order] * len(every) / (np.arange(len(every)) + 1)
+    q = np.minimum.accumulate(ranked[::-1])[::-1]
+    out = np.empty_like(q)
+    out[order] = np.minimum(q, 1.0)
+    return out
+
+
+def effective_number(gram: Float[np.ndarray, "k k"]) -> float:
+    """How many independent tests columns amount to, by the eigenvalues of their correlations (Nyholt 2004).
+
+    One where all are alike, their number where none is like another. The same threshold at neighbouring values of a
+    grid is nearly the same test.
+    """
+    d = np.sqrt(np.diag(gram))
+    count = len(d)
+    if count < 2:
+        return float(count)
+    values = np.linalg.eigvalsh(gram / np.outer(d, d))
+    return float(1.0 + (count - 1) * (1.0 - np.var(values, ddof=1) / count))
