@@ -78,20 +78,26 @@ class Config(Strict):
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
-    """One for each log. A log's seed counts on through the whole study, so that no two share their noise."""
-    seed = config.seed
+    """One for each log. A log's seed counts on through the whole study, so that no two share their noise.
+
+    The first log of every setting comes first, then the second of each: a study that is stopped is a smaller study.
+    """
+    seed, every = config.seed, []
     for key, case in config.cases.items():
-        every = config.sets[case.effects] if isinstance(case.effects, str) else case.effects
-        for effects, size, trips, noise in product(every, case.sizes, case.trips, case.noises):
-            for _ in range(case.logs):
+        sets = config.sets[case.effects] if isinstance(case.effects, str) else case.effects
+        for effects, size, trips, noise in product(sets, case.sizes, case.trips, case.noises):
+            for k in range(case.logs):
                 seed += 1
                 if config.only and key not in config.only:
                     continue
-                yield {
+                task = {
                     "case": case.name, "effects": effects, "size": size, "trips": trips, "noise": noise,
                     "seed": seed - 1, "rows_per_trip": case.rows_per_trip, "entry": case.entry, "mode": case.mode,
                     "ar_coefficient": config.ar_coefficient, "fdr": config.fdr, "rivals": config.rivals,
                 }  # fmt: skip
+                every.append((k, task))
+    for _, task in sorted(every, key=lambda e: e[0]):
+        yield task
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
