@@ -68,6 +68,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
                 axes.plot(x, 100 * y, dashes, color=COLOURS[method], marker="o", ms=4,
                           label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
                 axes.fill_between(x, 100 * low, 100 * high, color=COLOURS[method], alpha=0.12, lw=0)
+                axes.vlines(x, 100 * low, 100 * high, color=COLOURS[method], lw=1)
     axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(0, 102),
              ylabel="named exactly [%]", title="Synthetic logs with one planted effect")  # fmt: skip
     sizes = sorted({t["size"] for t, _ in single})
@@ -116,8 +117,7 @@ def confusion_figure(run: Run, done: Done) -> None:
     for i, p in enumerate(planted):
         logs = [r for t, r in single if t["effects"][0] == p]
         for r in logs:
-            hit = [p if p in n["class"] else n["id"] for n in r["named"]] or ["nothing"]
-            for name in hit:
+            for name in {p if p in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
     fig = figure(0.32 * len(columns) + 2.2, 0.3 * len(planted) + 1.8)
     axes = fig.add_subplot()
