@@ -49,7 +49,8 @@ def write_page(run: Run, metrics: dict[str, Any]) -> None:
 
 def write_docs(docs: Path, name: str, folders: Sequence[Path]) -> None:
     """`docs/NAME.md`, its tables and figures, from complete runs; figures go to `docs/figures/NAME/`."""
-    lines = [f"# Study: {name}", "", f"Made by `python -m experiments configs/studies/{name}.toml --docs docs`.", ""]
+    command = f"python -m experiments configs/studies/{name}.toml --tasks DIR --out OUT --docs docs"
+    lines = [f"# Study: {name}", "", f"Made by `{command}`.", ""]
     for k, folder in enumerate(folders):
         metrics = json.loads((folder / "metrics.json").read_text())
         lines.append(f"{metrics['logs']} logs{', all synthetic' if metrics['synthetic'] else ''}.")

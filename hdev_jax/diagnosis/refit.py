@@ -63,7 +63,7 @@ def _tried(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
         rows = tuple(replace(r, borrowed=r.free and r.path.rpartition(".")[2] in c.sizes) for r in rows)
     table, vehicle = state.table.plus(*rows), state.fit.vehicle.plus(effect)
     if any(r.borrowed for r in table.free):
-        told = borrow(problem, replace(state, vehicle=vehicle, table=table), noise or problem.noise(state.fit))
+        told = _borrowed(problem, replace(state, vehicle=vehicle, table=table), noise or problem.noise(state.fit))
         if told is None and noise is not None:
             return None
         table = told or table
@@ -73,7 +73,7 @@ def _tried(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
 
 
-def borrow(problem: Loop, state: Search, noise: Noise) -> ParameterTable | None:
+def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | None:
     """The state's table with what whitened rows say of its borrowed coefficients, all others fitted beside them.
 
     One linear step is not enough: the coefficients that it starts from may have been fitted without the effect. None

@@ -32,7 +32,7 @@ def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> di
     return block
 
 
-def sized(value: float, error: float, clusters: int) -> dict[str, Any]:
+def _sized(value: float, error: float, clusters: int) -> dict[str, Any]:
     """A size with what is known of it from a few clusters: Student's t with `clusters` − 1 degrees of freedom.
 
     **Arguments:** `error`, the standard error jackknifed over clusters.
@@ -55,7 +55,7 @@ def _effect_block(f: Found, fit: Calibration, before: float, after: float, clust
     c = f.score.candidate
     prefix = f"effects.{f.id}."
     parameters = {
-        row.name.removeprefix(prefix): {**sized(float(v), _error(row, float(s)), clusters), "unit": row.unit}
+        row.name.removeprefix(prefix): {**_sized(float(v), _error(row, float(s)), clusters), "unit": row.unit}
         for row, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
         if row.path.startswith(prefix)
     }

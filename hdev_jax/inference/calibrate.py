@@ -108,23 +108,26 @@ def _solve(
     vehicle: Vehicle,
     structure: Any,
     target: Target,
-    fit: Fit,
+    segments: Segments,
+    measured: Any,
+    weight: Any,
     start: Any,
     scale: Any,
     prior: Any,
     prior_sd: Any,
 ) -> Any:
     def residuals(z: Array, args: Any) -> Array:
-        vehicle, fit = args
+        vehicle, segments, measured, weight = args
         theta = _to_support(z, start, scale, structure)
-        r = fit.weight * (insert(vehicle, structure, theta).predict(fit.segments, target) - fit.measured)
+        r = weight * (insert(vehicle, structure, theta).predict(segments, target) - measured)
         return jnp.concatenate([r, (theta - prior) / prior_sd])
 
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
     z0 = jnp.zeros_like(start)
-    sol = optx.least_squares(residuals, solver, z0, args=(vehicle, fit), max_steps=50, throw=False)
+    args = (vehicle, segments, measured, weight)
+    sol = optx.least_squares(residuals, solver, z0, args=args, max_steps=50, throw=False)
     theta = _to_support(sol.value, start, scale, structure)
-    predicted = insert(vehicle, structure, theta).predict(fit.segments, target)
+    predicted = insert(vehicle, structure, theta).predict(segments, target)
     return theta, predicted, sol.result, sol.stats["num_steps"]
 
 
@@ -193,9 +196,9 @@ def calibrate(
             sigma = float(np.sqrt(np.mean((base * (measured - p)) ** 2))) + 1e-12
         row_weight = np.zeros(np.shape(fit.weight)[0])
         row_weight[:rows] = base * np.sqrt(tail / inflation) / sigma
-        # its number of real rows left out: a log of another length must not be another program
-        weighted = Fit(fit.segments, fit.measured, row_weight, 0)
-        new, p, result, taken = _solve(vehicle, structure, target, weighted, jnp.asarray(theta), scale, prior, prior_sd)
+        rows_of = (fit.segments, fit.measured, row_weight)  # not `fit`, whose number of real rows would be compiled in
+        start = jnp.asarray(theta)
+        new, p, result, taken = _solve(vehicle, structure, target, *rows_of, start, scale, prior, prior_sd)
         if not (np.isfinite(sigma) and np.all(np.isfinite(new)) and np.all(np.isfinite(p))):
             message, converged = "left the finite numbers; start nearer or give a prior", False
             break

@@ -4,10 +4,9 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from hdev_jax.physics.across import TIME_SINCE_BRAKING, time_since_braking
 from hdev_jax.physics.effect import Effect, Parameter
 
-__all__ = ["BrakeDrag", "CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "IronLoss"]
+__all__ = ["CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "IronLoss"]
 
 
 class DrivelineDrag(Effect):
@@ -25,35 +24,6 @@ class DrivelineDrag(Effect):
 
     def drive(self, row, car, point):
         return self.torque_nm * car.driveline.ratio_radpm(row)
-
-
-class BrakeDrag(Effect):
-    """Pads that do not let go: F·exp(−t/τ), t since the brake was released."""
-
-    id: ClassVar = "brake_drag"
-    stage: ClassVar = "road"  # at the wheel: the driveline carries it
-    equation: ClassVar = "F·exp(−t_release/τ)"
-    source: ClassVar = "Breuer and Bill, Bremsenhandbuch (residual torque)"
-    needs: ClassVar = ("brake_pressure_pa",)
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (
-        Parameter("force_n", "N", 0.0, 300.0, 0.0, 2e4, least=5.0),
-        Parameter("tau_s", "s", 30.0, 20.0, 2.0, 600.0, kind="shape", grid=(10.0, 30.0, 90.0)),
-    )
-    mistaken_for: ClassVar = ("tyre_warmup",)
-    separated_by: ClassVar = "cruising just after braking and long after"
-    force_n: Any
-    tau_s: Any
-
-    def derive(self, segments):
-        if segments.has(TIME_SINCE_BRAKING):  # worked out before
-            return segments
-        return segments.with_channels(**{TIME_SINCE_BRAKING: time_since_braking(segments)})
-
-    def force(self, row, car):
-        moving = row.speed_mps > 0.1
-        since = row.channels[TIME_SINCE_BRAKING]
-        return self.force_n * jnp.where(moving & (since > 0), jnp.exp(-since / self.tau_s), 0.0)
 
 
 class GearEfficiency(Effect):

@@ -14,14 +14,12 @@ __all__ = [
     "ConstantHeadwind",
     "Crosswind",
     "Drafting",
-    "FrictionBrake",
     "Grade",
     "Headwind",
     "Inertia",
     "RoadGrade",
     "Rolling",
     "RotatingMass",
-    "StandstillHold",
     "air_density",
     "mean_square_speed",
 ]
@@ -256,49 +254,3 @@ class RoadGrade(Effect):
 
     def force(self, row, car):
         return self.scale * car.mass(row) * (row.channels["accel_mps2"] - row.accel_mps2)
-
-
-class FrictionBrake(Effect):
-    """What the drive is spared or must overcome by the friction brakes: + k·brake signal, while the vehicle moves.
-
-    The wheels need m·a + resistances; what the friction brakes take away the drive need not take: F_drive = that sum
-    + F_brake (less negative while braking).
-    """
-
-    id: ClassVar = "friction_brake"
-    stage: ClassVar = "road"
-    equation: ClassVar = "+k·brake"
-    source: ClassVar = "paper 2, eq. 7-9 (share of braking that is not regenerated)"
-    needs: ClassVar = ("brake_pressure_pa|brake_pedal_pct",)
-    entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("n_per_unit", "N per unit of the brake signal", 0.0, 1.0, 0.0, 1e4, least=1e-6),)
-    mistaken_for: ClassVar = ("mass_scale", "friction_blending")
-    separated_by: ClassVar = "braking hard and lightly"
-    n_per_unit: Any
-
-    def force(self, row, car):
-        brake = row.get("brake_pressure_pa", row.get("brake_pedal_pct", 0.0))
-        return self.n_per_unit * jnp.where(row.speed_mps > 0.1, jnp.maximum(brake, 0.0), 0.0)
-
-
-class StandstillHold(Effect):
-    """At rest the brakes hold the vehicle: of the forces that the road asks for, the drive gives only what is left.
-
-    Only a measured force or torque can show it: at rest the drive's power is zero anyway.
-    """
-
-    id: ClassVar = "standstill_hold"
-    stage: ClassVar = "road"
-    equation: ClassVar = "−s·ΣF·[v < 0.1 m/s]"
-    source: ClassVar = "statics: a force that does not move is carried by the brakes"
-    entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("share", "1", 0.0, 0.5, 0.0, 1.2, least=0.05),)
-    mistaken_for: ClassVar = ("rolling_speed",)
-    separated_by: ClassVar = "standing on a slope, with and without the brake"
-    order: ClassVar = 90
-    share: Any
-
-    def force(self, row, car):
-        others = (e for e in car.effects if e.overrides("force") and not isinstance(e, StandstillHold))
-        total = sum(e.force(row, car) for e in others)
-        return -self.share * jnp.where(row.speed_mps < 0.1, total, 0.0)

@@ -12,7 +12,7 @@ from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.refit import _contradicted
 from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.significance import clusters_needed, effective_number
-from hdev_jax.diagnosis.summary import _not_decidable, sized
+from hdev_jax.diagnosis.summary import _not_decidable, _sized
 from hdev_jax.diagnosis.sums import Sums, evidence_of
 from hdev_jax.diagnosis.unexplained import Remainder
 from hdev_jax.fleet import synthetic_log
@@ -99,7 +99,7 @@ def test_the_interval_covers_what_it_says(clusters):
     hits = 0
     for _ in range(2000):
         x = rng.normal(size=clusters)
-        low, high = sized(float(np.mean(x)), float(np.std(x, ddof=1) / np.sqrt(clusters)), clusters)["interval_90"]
+        low, high = _sized(float(np.mean(x)), float(np.std(x, ddof=1) / np.sqrt(clusters)), clusters)["interval_90"]
         hits += low <= 0.0 <= high
     assert hits / 2000 == pytest.approx(0.90, abs=0.02)
 
