@@ -188,7 +188,7 @@ def plan_of(
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []
     for c in effects:
-        if vehicle.has(c.id):
+        if vehicle.has(c.id) or c.searched:
             continue
         if why := unavailable(c, facts.sample, vehicle.entry):
             left_out[c.id] = why
@@ -244,11 +244,27 @@ def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
     return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
 
 
+def _by_trip(shapes: Sequence[tuple[str, float]]) -> dict[str, Grouped]:
+    """Shapes that were chosen for each trip (`phase[3]`), NaN for every other trip."""
+    by_name: dict[str, dict[int, float]] = {}
+    for key, value in shapes:
+        name, bracket, trip = key.partition("[")
+        if bracket:
+            by_name.setdefault(name, {})[int(trip.removesuffix("]"))] = value
+    out = {}
+    for name, by_trip in by_name.items():
+        values = np.full(max(by_trip) + 2, np.nan)  # ids past the end take the last
+        values[list(by_trip)] = list(by_trip.values())
+        out[name] = Grouped(jnp.asarray(values), "trip")
+    return out
+
+
 def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int = 1) -> Effect:
     """The effect with these coefficients as its sizes and the candidate's shapes: where a joint refit starts."""
     effect = at_null(candidate.effect, gears=gears)
     values: dict[str, Any] = {p.name: getattr(effect, p.name) for p in effect.parameters}
-    values.update({name: np.asarray(v, dtype=float) for name, v in candidate.shapes})
+    values.update({name: np.asarray(v, dtype=float) for name, v in candidate.shapes if "[" not in name})
+    values.update(_by_trip(candidate.shapes))
     for p in candidate.effect.parameters:
         if p.kind == "limit" and p.name not in candidate.sizes:
             values[p.name] = None  # not part of it: the effect skips what it costs

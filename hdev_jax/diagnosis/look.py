@@ -19,6 +19,7 @@ from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import trip_slices
 
 __all__ = [
+    "CLOSE",
     "LEFT_OUT",
     "Found",
     "Loop",
@@ -33,6 +34,8 @@ __all__ = [
 ]
 
 HINT = 0.1  # p, before any correction, from which on a candidate is not even hinted at
+CERTAIN = 1e-6  # p below which it does not matter how small it is
+CLOSE = 0.85  # of what the best is worth, for a candidate to be about as good
 LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
 
@@ -137,6 +140,7 @@ class View:
     absorbs: dict[str, list[str]]
     absorbed_by: dict[str, str]
     reasons: dict[str, str] = field(default_factory=dict)
+    sought: list[Verdict] = field(default_factory=list)  # on what is looked for elsewhere than in columns
 
     def verdicts(self, state: Search, fdr: float) -> list[Verdict]:
         """Why each candidate that the vehicle still lacks was not chosen."""
@@ -147,6 +151,7 @@ class View:
             why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
             between = bool(self.slow[list(s.candidate.columns)].all())
             out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, self._needed(s, fdr), between))
+        out += [v for v in self.sought if not state.vehicle.has(v.id)]
         out += [Verdict(id_, None, 1.0, f"not tried: {why}") for id_, why in self.left_out.items()]
         return out
 
@@ -232,13 +237,13 @@ def best_of(
     for id_, entries in ranked.items():
         at = evidence.base + np.unique([k for _, c in entries for k in c.columns])
         ways[id_] = min(float(tried[id_]), effective_number(totals[0][np.ix_(at, at)]))
-        looks = [_first_plausible([evidence.score(c) for _, c in _leading(entries)])]
+        looks = [_clearest([evidence.score(c) for _, c in _leading(entries)])]
         scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
         if scores:
-            looks.append(_first_plausible(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
+            looks.append(_clearest(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
         # what both looks see is told by the whitened rows, which see it better
         able = [s for s in looks if plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
-        best[id_] = min(able, key=lambda s: (s.p > 1e-6, s.p if s.p > 1e-6 else 0.0))
+        best[id_] = min(able, key=lambda s: (s.p > CERTAIN, s.p if s.p > CERTAIN else 0.0))
     return best, ways
 
 
@@ -254,8 +259,13 @@ def _falling(worth: float) -> float:
     return -float(f"{worth:.9g}")
 
 
-def _first_plausible(scores: list[Score]) -> Score:
-    return next((s for s in scores if plausible(s)), scores[0])
+def _clearest(scores: list[Score]) -> Score:
+    """The first that is plausible, or one that explains about as much with fewer doubts: a second size may blur it."""
+    able = [s for s in scores if plausible(s)]
+    if not able or able[0].p <= CERTAIN:
+        return (able or scores)[0]
+    bar = CLOSE * worth(able[0].gain, able[0].candidate)
+    return min((s for s in able if worth(s.gain, s.candidate) >= bar), key=lambda s: s.p, default=able[0])
 
 
 def _absorption(

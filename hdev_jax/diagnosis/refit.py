@@ -16,11 +16,14 @@ from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_co
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
-__all__ = ["grow", "is_size", "refit"]
+__all__ = ["grow", "is_size", "joined", "refit", "sharpened"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
-AGREES = 2.25  # standard errors between what plain rows say of a size and what whitened ones do
-SEEN = 12.0  # standard errors of whitened rows: a quarter of it would be three
+AGREES = 0.9878  # of Student's distribution between what plain rows say of a size and what whitened ones do: 2.25 sd
+KNOWN = 2.0  # times as well, from which on whitened rows are asked for a size rather than plain ones
+DROWNED = 0.25  # least share of a slow cause's size that weights which suit the noise inside trips leave of it
+LOUD = 1e-12  # p of the working model alone
+MOST_SHARPENED = 3
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
@@ -33,40 +36,50 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     if s.plain and _contradicted(plain, white, white_sd):
         return None
     borne_out = bool(np.any(np.abs(plain) > BORNE_OUT * plain_sd))
+    grouped = any(g is not None for g in c.groups)
+    apart = float(stats.t.ppf(AGREES, max(view.evidence.count - 1, 1)))
+    lends = c.kind == "size" and not (s.plain or grouped) and bool(np.all(np.abs(plain - white) <= apart * plain_sd))
+    better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
-    refined = _refined(problem, s, view) if try_plain else s
-    new = _tried(problem, state, refined) if try_plain else None
-    grouped = any(g is not None for g in c.groups)
-    room = bool(np.all(np.abs(plain - white) <= AGREES * plain_sd))
-    if new is None and c.kind == "size" and not (s.plain or grouped) and room:
-        # rows of equal weight do not bear it out, but leave room for what the whitened rows say
-        new = _tried(problem, state, refined, view.ground.noise)
+    refined = _refined(problem, s, view) if shaped or try_plain else s
+    # What rows of equal weight bear out is the luckier half of what they may say of a size; whitened rows that know it
+    # better are asked first. Where those cannot tell it apart, they come after, as far as plain rows leave room.
+    noise = view.ground.noise
+    ways = [noise] * better + [None] * try_plain + [noise] * (lends and not better)
+    tries = (joined(problem, state, refined, way) for way in ways)
+    new = next((t for t in tries if t is not None), None)
     return None if new is None else (new, _gain(problem, state, new.fit, view))
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:
-    """Whether whitened rows, which would have seen a size a quarter as large, see none of that sign.
+    """Whether whitened rows rule out even a quarter of the size, at two standard errors.
 
-    What rows of equal weight say of a slow column may be slow noise; weights that drown a cause leave it its sign.
+    What rows of equal weight say of a slow column may be slow noise; weights that drown a cause leave some of it.
     """
-    return bool(np.all((np.abs(plain) > SEEN * white_sd) & (plain * white <= 0)))
+    return bool(np.all(np.sign(plain) * white + 2.0 * white_sd < DROWNED * np.abs(plain)))
 
 
-def _tried(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -> Search | None:
+def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -> Search | None:
     """The state with the candidate in a joint fit; None where it fails. With `noise`, its sizes are borrowed from rows
-    whitened by it."""
+    whitened by it, and its shapes with them unless these rows do not settle them."""
     c = s.candidate
     effect = realised(c, s.beta, gears=problem.gears)
-    rows = _coefficients(c, effect, shapes=noise is None)
-    if noise is not None:
-        rows = tuple(replace(r, borrowed=r.free and r.path.rpartition(".")[2] in c.sizes) for r in rows)
-    table, vehicle = state.table.plus(*rows), state.fit.vehicle.plus(effect)
-    if any(r.borrowed for r in table.free):
-        told = _borrowed(problem, replace(state, vehicle=vehicle, table=table), noise or problem.noise(state.fit))
-        if told is None and noise is not None:
-            return None
-        table = told or table
+    vehicle = state.fit.vehicle.plus(effect)
+    table = told = None
+    for shapes in (True, False)[: 2 if noise is not None else 1]:
+        rows = _coefficients(c, effect, shapes=shapes)
+        if noise is not None:
+            rows = tuple(replace(r, borrowed=r.free) for r in rows)
+        table = state.table.plus(*rows)
+        if any(r.borrowed for r in table.free):
+            told = _borrowed(problem, replace(state, vehicle=vehicle, table=table), noise or problem.noise(state.fit))
+        if told is not None or not any(r.free and _is_shape(c, r) for r in rows):
+            break
+    if told is None and noise is not None:
+        return None
+    table = told or table
+    assert table is not None
     fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
     if (not fit.converged and fit.steps < 5) or not _in_range(fit, c) or not _present(fit, c):
         return None
@@ -130,6 +143,24 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
     return finest if finest is not None and finest.gain > s.gain and not finest.plain else s
 
 
+def sharpened(problem: Loop, view: View) -> View:
+    """The view with a second, finer look at what rows speak for loudly and clusters do not.
+
+    A threshold that lies between two points of its grid does too much in some trips and too little in others.
+    """
+    doubted = [
+        s for id_, s in view.best.items()
+        if view.q[id_] > problem.fdr and s.p_model < LOUD and not s.plain and s.candidate.shapes
+        and id_ not in view.absorbed_by
+    ]  # fmt: skip
+    for s in sorted(doubted, key=lambda s: -s.gain)[:MOST_SHARPENED]:
+        finer_one = _refined(problem, s, view)
+        if finer_one is not s and finer_one.p < s.p:
+            id_ = s.candidate.id
+            view.best[id_], view.q[id_] = finer_one, view.q[id_] * finer_one.p / s.p
+    return view
+
+
 def _present(fit: Calibration, candidate: Candidate) -> bool:
     """Whether a size stands in the joint refit too, where rows weigh the same, at 1 % with errors clustered."""
     if candidate.kind == "limit":
@@ -137,6 +168,10 @@ def _present(fit: Calibration, candidate: Candidate) -> bool:
     at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes
           and c.path.startswith(f"effects.{candidate.id}.")]  # fmt: skip
     return bool(np.any(np.abs(fit.values[at]) > BORNE_OUT * fit.sd[at]))
+
+
+def _is_shape(candidate: Candidate, row: Coefficient) -> bool:
+    return row.path.rpartition(".")[2] not in candidate.sizes
 
 
 def _idle(candidate: Candidate, path: str) -> bool:

@@ -7,9 +7,10 @@ import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.chunks import Chunk
+from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
-from hdev_jax.diagnosis.refit import grow, is_size, refit
+from hdev_jax.diagnosis.look import CLOSE, LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
+from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle, most_group
@@ -65,18 +66,26 @@ def search(
 def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) -> Search:
     """One look at all candidates, and the vehicle with the one that is taken; `finished` where none is."""
     tell(f"scoring candidates, step {step}")
-    view = look(problem, state)
+    view = sharpened(problem, look(problem, state))
     if step == 1:
         state = replace(state, absorbs=view.absorbs)
     choice = choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
     if choice is None and state.refused and step <= MOST_EFFECTS:
         choice = choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
+    if choice is None and step <= MOST_EFFECTS:
+        # last: what misses an effect that comes and goes with the traffic is not noise, and may have cycles
+        choice, why = add_cycle(problem, state)
+        view.sought += [why] if why is not None else []
     if choice is None:
         grown = grow(problem, state, tell)
         return replace(grown or state, verdicts=view.verdicts(state, problem.fdr), finished=grown is None)
     choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
     tell(f"added {choice.found[-1].id}")
-    state = prune(problem, choice, tell)
+    return _added(problem, prune(problem, choice, tell), view)
+
+
+def _added(problem: Loop, state: Search, view: View) -> Search:
+    """The state after an effect was added, with its fit on the trail."""
     trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
     return replace(state, verdicts=view.verdicts(state, problem.fdr), trail=trail)
 
@@ -101,7 +110,7 @@ def choose(
         if not able:
             break
         first = able[0]
-        bar = 0.85 * worth(first.gain, first.candidate)
+        bar = CLOSE * worth(first.gain, first.candidate)
         close = [
             s for s in able[:LEADERS] if s is first or (s.plain == first.plain and worth(s.gain, s.candidate) >= bar)
         ]

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy import special, stats
+from scipy import stats
 
+from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import Clusters
 from hdev_jax.segments import trip_slices
@@ -74,7 +75,7 @@ def remainder(
     tell("what is left: periods, change points, levels of trips")
     noise = estimate_noise(train.residual, train.trip, train.duration_s, levels=False)
     white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
-    period = _period(train)
+    period = _period(train, noise)
     steps = _change_point(white, train.trip)
     level = _levels(train, noise)
     parts, depends, sizes = [], [], [0.0]
@@ -169,71 +170,12 @@ def _safe(names: Sequence[str]) -> list[str]:
     return [f"f{i}" for i in range(len(names))]
 
 
-def _period(rows: Rows) -> tuple[float, float] | None:
-    """The strongest period of the residual, if noise with the spectrum around it could not have made it.
-
-    Periodograms of equal windows, averaged over trips whatever the phase; a peak is compared with the median of its
-    neighbours in frequency, where the continuous spectrum of any noise is smooth.
-    """
-    seconds = [float(np.sum(rows.duration_s[s])) for _, s in trip_slices(rows.trip)]
-    step = float(np.median(rows.duration_s))
-    window = int(np.median(seconds) / step)
-    while window >= 128 and sum(int(t / step / window + 0.5) for t in seconds) < 2:
-        window //= 2  # a single trip is its own repetition
-    if window < 64:
+def _period(rows: Rows, noise: Noise) -> tuple[float, float] | None:
+    """Period and amplitude of a cycle that noise with the spectrum around it could not have made."""
+    hit = strongest_period(rows.residual, Clocked.of(rows.trip, rows.duration_s, noise))
+    if hit is None or hit.p > LEVEL or hit.amplitude**2 / 2 < LEAST_SHARE * np.mean(rows.residual**2):
         return None
-    window = min(window, 1 << 15)
-    taper = np.hanning(window)
-    total, count = np.zeros(window // 2 + 1), 0
-    for _, s in trip_slices(rows.trip):
-        clock = np.cumsum(rows.duration_s[s])
-        even = np.interp(np.arange(0.0, clock[-1], step), clock, rows.residual[s] - np.mean(rows.residual[s]))
-        for start in range(0, len(even) - window // 2, window):
-            part = even[start : start + window]
-            if len(part) < window // 2:
-                break
-            part = np.pad(part, (0, window - len(part)))
-            total += np.abs(np.fft.rfft(part * taper)) ** 2
-            count += 1
-    if count < 2:
-        return None
-    power = total / count
-    low, high = 3, len(power) // 4  # three cycles or more in a window; nothing within four samples
-    best: tuple[float, int] | None = None
-    bias, spread = float(special.digamma(count) - np.log(count)), float(special.polygamma(1, count))
-    for k in range(low, high):
-        wide = max(6, k // 3)
-        if power[k] < max(power[k - 1], power[k + 1]):  # a side lobe of its neighbour
-            continue
-        # a smooth spectrum, falling as a power of frequency at most: its logarithm is linear in that of frequency
-        where = np.r_[np.arange(max(2, k - wide), max(k - 1, 2)), np.arange(k + 2, min(k + 2 + wide, len(power)))]
-        x = np.log(where)
-        design = np.stack([x - x.mean(), np.ones(len(x))], axis=1)
-        # the logarithm of a mean of `count` exponentials is low by `bias`; the Hann taper makes neighbours alike, so
-        # the line is known less well than its points say: the floor is taken two standard errors up
-        line = np.linalg.lstsq(design, np.log(power[where] + 1e-300) - bias, rcond=None)[0]
-        at = np.array([np.log(k) - x.mean(), 1.0])
-        se = np.sqrt(2.0 * spread * at @ np.linalg.inv(design.T @ design) @ at)
-        floor = float(np.exp(line @ at + 2.0 * se))
-        ratio = power[k] / max(floor, 1e-300)
-        if best is None or ratio > best[0]:
-            best = (ratio, k)
-    if best is None:
-        return None
-    # an average of `count` exponential variables; the Hann taper leaves about as many
-    p = float(stats.gamma.sf(best[0] * count, count)) * (high - low)
-    if p > LEVEL or best[0] < 3.0:
-        return None
-    k = best[1]
-    # between two lines of the spectrum the Hann taper splits a cycle; where it is from how (Grandke 1983)
-    side = k + 1 if power[k + 1] > power[k - 1] else k - 1
-    ratio = float(np.sqrt(power[side] / power[k]))
-    offset = np.clip((2 * ratio - 1) / (1 + ratio), 0.0, 0.5) * (side - k)
-    lost = np.sinc(offset) / (1 - offset**2)  # of the taper's spectrum at that distance from its centre
-    amplitude = 2.0 * np.sqrt(power[k]) / np.sum(taper) / lost
-    if amplitude**2 / 2 < LEAST_SHARE * np.mean(rows.residual**2):
-        return None
-    return float(window * step / (k + offset)), float(amplitude)
+    return hit.period_s, hit.amplitude
 
 
 def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[Rows], float]] | None:

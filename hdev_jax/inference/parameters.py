@@ -131,7 +131,7 @@ def effect_coefficients(
     rows = []
     for p in effect.parameters:
         leaf = getattr(effect, p.name)
-        if leaf is None:
+        if leaf is None or (isinstance(leaf, Grouped) and leaf.by == "trip"):  # what is chosen trip by trip is held
             continue
         free = p.name in sizes or (shapes and p.kind == "shape" and bool(p.grid) and len(p.grid) > 1)
         values = leaf.values if isinstance(leaf, Grouped) else [leaf]

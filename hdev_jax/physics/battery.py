@@ -104,7 +104,7 @@ class RegenLimit(Effect):
     source: ClassVar = "charge limit of the battery management"
     parameters: ClassVar = (
         Parameter("power_w", "W", OFF_W, 5e3, 500.0, OFF_W, kind="limit",
-                  grid=_ladder(1e4, 3.5e5, 14)),
+                  grid=_ladder(1e4, 3.5e5, 27)),
     )  # fmt: skip
     mistaken_for: ClassVar = ("friction_blending",)
     separated_by: ClassVar = "hard braking from speed, battery full"

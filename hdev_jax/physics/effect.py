@@ -99,6 +99,7 @@ class Effect(eqx.Module):
     mistaken_for: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
     order: ClassVar[int] = 0  # limits come after what they limit
+    searched: ClassVar[str] = ""  # where it is looked for, if its columns are not known before it is found
 
     def derive(self, segments: Segments) -> Segments:
         """The same measurements with the channels that this effect computes by trip (distance since the start, …)."""

@@ -130,18 +130,23 @@ class CabinWarmup(Effect):
 
 
 class PeriodicLoad(Effect):
-    """A load that switches on and off from the start of the trip: P while cos(2π(t/T + φ)) > cos(πD)."""
+    """A load that switches on and off: P while cos(2π(t/T + φ)) > cos(πD).
+
+    φ may differ from trip to trip; where it is not known (NaN), as on a trip that nobody has fitted, the load is its
+    mean P·D.
+    """
 
     id: ClassVar = "periodic_load"
     stage: ClassVar = "battery"
-    equation: ClassVar = "P·[cos 2π(t/T + φ) > cos πD]"
+    equation: ClassVar = "P·[cos 2π(t/T + φ) > cos πD], φ by trip"
     source: ClassVar = "thermostat with hysteresis"
     parameters: ClassVar = (
         Parameter("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
-        Parameter("period_s", "s", 900.0, 300.0, 60.0, 7200.0, kind="shape", grid=(600.0, 1200.0, 1500.0)),
-        Parameter("duty", "1", 0.5, 0.2, 0.05, 0.95, kind="shape", grid=(0.5,)),
-        Parameter("phase", "1", 0.0, 0.25, -1.0, 1.0, kind="shape", grid=(-0.25, 0.0, 0.25, 0.5)),
+        Parameter("period_s", "s", 900.0, 300.0, 20.0, 7200.0, kind="shape", grid=(600.0, 1200.0, 1500.0)),
+        Parameter("duty", "1", 0.5, 0.2, 0.05, 0.95, kind="shape", grid=(0.3, 0.5, 0.7)),
+        Parameter("phase", "1", float("nan"), 0.25, -1.0, 1.0, kind="choice"),
     )
+    searched: ClassVar = "spectrum"
     mistaken_for: ClassVar = ("standstill_load",)
     separated_by: ClassVar = "an hour at standstill"
     power_w: Any
@@ -150,9 +155,22 @@ class PeriodicLoad(Effect):
     phase: Any
 
     def power(self, row, car, point):
-        t = row.time_s + 0.5 * row.duration_s
-        wave = jnp.cos(2 * jnp.pi * (t / self.period_s + self.phase)) - jnp.cos(jnp.pi * self.duty)
-        return self.power_w * jax.nn.sigmoid(wave / 0.05)  # 5 % of an edge, so that period and phase have a slope
+        return self.power_w * self.on(row.time_s, row.duration_s)
+
+    def on(self, start_s: Any, duration_s: Any) -> Any:
+        """Share of an interval that the load is on; `start_s` since the trip's start [s]; any shape.
+
+        The mean of the square wave, not its value somewhere inside: continuous in period, duty and phase.
+        """
+        known = jnp.logical_not(jnp.isnan(self.phase))
+        lag = jnp.where(known, self.phase, 0.0) + 0.5 * self.duty
+
+        def periods_on(time_s: Any) -> Any:
+            x = time_s / self.period_s + lag
+            return self.duty * jnp.floor(x) + jnp.minimum(x - jnp.floor(x), self.duty)
+
+        share = (periods_on(start_s + duration_s) - periods_on(start_s)) * self.period_s / duration_s
+        return jnp.where(known, share, self.duty)
 
 
 class StandstillLoad(Effect):

@@ -1,0 +1,134 @@
+"""The strongest cycle of a residual, whatever its phase in each trip, and whether noise could have made it."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import stats
+
+from hdev_jax.diagnosis.whiten import Noise, whiten
+from hdev_jax.segments import trip_slices
+
+__all__ = ["Clocked", "Period", "strongest_period"]
+
+LONGEST_S = 32_768.0  # of a window in rows' median durations: a cycle that keeps in step longer is seen by half of it
+CYCLES = 3.0  # least number in a window
+SAMPLES = 4.0  # least number in a cycle
+SIDE = 24  # independent frequencies on either side that say how high the noise stands there
+LEAST_RATIO = 1.5  # of a peak to the noise around it
+
+
+@dataclass(frozen=True)
+class Period:
+    """A peak of the spectrum: its period [s], its amplitude in the residual's unit, and p over all frequencies."""
+
+    period_s: float
+    amplitude: float
+    p: float
+
+
+@dataclass(frozen=True)
+class Clocked:
+    """Rows of a log with their noise: what whitens columns and takes each trip's level off them.
+
+    `clock_s` is the middle of each row since the start of its trip, `worth` what a level of 1 is on it.
+    """
+
+    clock_s: Float[np.ndarray, " row"]
+    duration_s: Float[np.ndarray, " row"]
+    trip: Int[np.ndarray, " row"]
+    worth: Float[np.ndarray, " row"]
+    noise: Noise
+
+    @classmethod
+    def of(cls, trip: Int[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"], noise: Noise) -> "Clocked":
+        """Rows whose clock is the sum of the durations before them."""
+        clock = np.concatenate([np.cumsum(duration_s[s]) - 0.5 * duration_s[s] for _, s in trip_slices(trip)])
+        return cls(clock, duration_s, trip, np.ones(len(trip)), noise)
+
+    @property
+    def slices(self) -> list[slice]:
+        """Rows of each trip."""
+        return [s for _, s in trip_slices(self.trip)]
+
+    def whitened(self, columns: Float[np.ndarray, "row k"]) -> Float[np.ndarray, "row k"]:
+        """Columns as white noise of variance 1 would be met, without the level of each trip."""
+        both = whiten(np.column_stack([columns, self.worth]), self.noise, self.trip, self.duration_s)
+        out, level = both[:, :-2], both[:, -2]
+        for s in self.slices:
+            out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
+        return out
+
+
+def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Period | None:
+    """The peak that stands out most of the noise around it; None where the trips are too short for a cycle.
+
+    Periodograms of the whitened residual in windows of equal length, added up whatever the phase (Bartlett 1948): at
+    each frequency a sum of as many exponential variables as there are windows, times the level of the noise there,
+    which is the median of its neighbours and no less than 1.
+    """
+    seconds = [float(np.sum(rows.duration_s[s])) for s in rows.slices]
+    step = float(np.median(rows.duration_s))
+    window = min(float(np.median(seconds)), LONGEST_S * step)
+    while window >= 128 * step and sum(int(t / window + 0.5) for t in seconds) < 2:
+        window /= 2  # a single trip is its own repetition
+    if window < 64 * step:
+        return None
+    white = rows.whitened(residual[:, None])[:, 0]
+    size = 1 << int(np.ceil(np.log2(2 * window / step)))  # twice as fine as the window tells apart
+    power, count = np.zeros(size // 2 + 1), 0
+    pieces = [w for s in rows.slices for w in _windows(rows.clock_s, s, window)]
+    for piece in pieces:
+        clock = rows.clock_s[piece] - rows.clock_s[piece.start]
+        even = np.bincount((clock / step).astype(int), white[piece], minlength=size)[:size]
+        power += np.abs(np.fft.rfft(even)) ** 2 / (piece.stop - piece.start)
+        count += 1
+    if count < 2:
+        return None
+    frequency = np.fft.rfftfreq(size, step)
+    inside = np.flatnonzero((frequency >= CYCLES / window) & (frequency <= 1 / (SAMPLES * step)))
+    if not len(inside):
+        return None
+    per = round(size * step / window)  # points of the grid to an independent frequency
+    level = np.array([_level(power, int(k), per, count) for k in inside])
+    k = int(inside[np.argmax(power[inside] / level)])
+    ratio = float(np.max(power[inside] / level)) / count
+    p = float(stats.gamma.sf(ratio * count, count)) * len(inside) / per if ratio >= LEAST_RATIO else 1.0
+    period, amplitude = _refined(residual, rows, pieces, float(frequency[k]), 1 / (size * step))
+    return Period(period, amplitude, min(p, 1.0))
+
+
+def _windows(clock: np.ndarray, trip: slice, window: float) -> list[slice]:
+    """Rows of each window of a trip; what is left at its end counts where it is half of one."""
+    total = float(clock[trip.stop - 1])
+    edges = np.arange(0.0, total, window)
+    starts = trip.start + np.searchsorted(clock[trip], edges)
+    parts = [slice(int(a), int(b)) for a, b in pairwise([*starts, trip.stop])]
+    return [p for p in parts if p.stop - p.start > 8 and clock[p.stop - 1] - clock[p.start] > 0.45 * window]
+
+
+def _level(power: np.ndarray, k: int, per: int, count: int) -> float:
+    """How high white noise of variance 1 stands at a frequency, by the median of those around it; at least 1."""
+    low, high = max(per, k - SIDE * per), min(len(power), k + SIDE * per + 1)
+    near = np.r_[power[low : max(k - 2 * per, low)], power[min(k + 2 * per + 1, high) : high]]
+    return max(1.0, float(np.median(near)) / float(stats.gamma.median(count))) if len(near) > SIDE else 1.0
+
+
+def _refined(
+    residual: np.ndarray, rows: Clocked, pieces: list[slice], frequency: float, width: float
+) -> tuple[float, float]:
+    """Period and amplitude (root mean square over windows) by least squares on whitened rows near a frequency."""
+    white = rows.whitened(residual[:, None])[:, 0]
+    best = (-1.0, 0.0, 0.0)
+    for f in frequency + width * np.linspace(-1, 1, 9):
+        angle = 2 * np.pi * f * rows.clock_s
+        columns = rows.whitened(np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        gain, square = 0.0, []
+        for s in pieces:
+            x = np.linalg.lstsq(columns[s], white[s], rcond=None)[0]
+            gain += float(white[s] @ columns[s] @ x)
+            square.append(float(x @ x))
+        if gain > best[0]:
+            best = gain, float(1.0 / f), float(np.sqrt(np.mean(square)))
+    return best[1], best[2]
