@@ -126,7 +126,9 @@ def on_cluster(jobs: Sequence[Job], address: str, keys: Sequence[str]) -> Iterat
         pairs = zip(jobs, keys, strict=True)
         futures = [client.submit(on_worker, job, expected[job[0]], key=f"hdev-{k}", pure=False) for job, k in pairs]
         index = {f.key: i for i, f in enumerate(futures)}
-        for future in distributed.as_completed(futures):
+        for future in distributed.as_completed(futures, loop=client.loop):
+            if future.status in ("cancelled", "lost"):
+                raise ClusterError(f"--scheduler {address}: the scheduler is gone; start it, and the same command goes on")
             outcome = _outcome(future)
             if isinstance(outcome, ClusterError | ImportError):
                 raise ClusterError(f"--scheduler {address}: {outcome}") from outcome
