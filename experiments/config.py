@@ -21,7 +21,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hdev_jax.errors import InputError
 
-__all__ = ["CONFIGS", "Strict", "artefact", "changes", "every_config", "expanded", "listed", "resolve", "typed"]
+__all__ = [
+    "CONFIGS",
+    "Strict",
+    "artefact",
+    "changes",
+    "every_config",
+    "expanded",
+    "listed",
+    "resolve",
+    "shown",
+    "typed",
+]
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 C = TypeVar("C", bound=BaseModel)
@@ -60,13 +71,21 @@ def listed(path: str | Path) -> list[Path] | None:
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.as_posix())]
+    return [
+        (int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.with_suffix("").as_posix())
+    ]
 
 
 def artefact(path: str | Path) -> str:
     """What a config is called: its place under `configs/` without the ending (`paper2/table8`), elsewhere its name."""
     plain = Path(path).resolve().with_suffix("")
     return plain.relative_to(CONFIGS).as_posix() if plain.is_relative_to(CONFIGS) else plain.name
+
+
+def shown(path: str | Path) -> str:
+    """A config's place as a page names it: from the checkout on where it lies in it, on no machine in particular."""
+    inside = Path(path).resolve().is_relative_to(CONFIGS)
+    return f"configs/{artefact(path)}.toml" if inside else Path(path).as_posix()
 
 
 def resolve(path: str | Path, sets: Sequence[str] = (), *, tiny: bool = False) -> dict[str, Any]:

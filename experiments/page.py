@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.compare import comparison, told
+from experiments.config import shown
 from experiments.tables import cells, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
@@ -96,7 +97,7 @@ def write_docs(docs: Path, config: str | Path, folders: Sequence[Path], sets: Se
     **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with. Figures go to `docs/figures/NAME/`.
     """
     name = Path(config).stem
-    kind, every = _kind(Path(config)), " ".join([Path(config).as_posix(), *(f"--set {s}" for s in sets)])
+    kind, every = _kind(Path(config)), " ".join([shown(config), *(f"--set {s}" for s in sets)])
     lines = [f"# {kind}: {name}", "", f"Made by `python -m experiments {every} --tasks DIR --out OUT --docs docs`.", ""]
     for k, folder in enumerate(folders):
         metrics = json.loads((folder / "metrics.json").read_text())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.compare import comparison
-from experiments.config import artefact, changes
+from experiments.config import artefact, changes, shown
 from experiments.engine import Plan, Where, claim_folder, compute, plan, run_config, unfinished
 from experiments.log import Log
 from experiments.page import Section, of_run, write_html
@@ -113,7 +113,7 @@ def _write_index(home: Path, came: Outcomes) -> None:
 def _summary(came: Outcomes) -> Section:
     rows = [
         {
-            "artefact": _title(run), "config": _shown(path), "data": run["data"],
+            "artefact": _title(run), "config": shown(path), "data": run["data"],
             "at least as good": f"{run['better_than_paper']} of {run['of']}" if run["of"] else None,
             "seconds": run["seconds"],
         }
@@ -131,9 +131,5 @@ def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:
     """The command of a run, and what its config changes in the one that it extends."""
     sets = "".join(f" --set {k}={v}" for k, v in delta.items())
     changed = [f"{k} = {new!r:.60} (there {old!r:.60})" for k, (old, new) in changes(path).items()]
-    lines = [f"python -m experiments {_shown(path)}{sets} --out DIR"]
+    lines = [f"python -m experiments {shown(path)}{sets} --out DIR"]
     return [*lines, f"Changes in the config that it extends: {'; '.join(changed)}."] if changed else lines
-
-
-def _shown(path: Path) -> str:
-    return f"configs/{artefact(path)}.toml" if "/" in artefact(path) else str(path)

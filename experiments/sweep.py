@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.compare import numbers
+from experiments.config import shown
 from experiments.page import Section, write_html
 from experiments.tables import cells, markdown, tex
 from hdev_jax.rundir import atomic_file
@@ -23,7 +24,7 @@ def write_sweep(out: Path, config: str | Path, found: Sequence[Mapping[str, Any]
     """
     rows = sweep_rows(found)
     keys = list(found[0]["sweep"])
-    caption = f"{config}: {len(found)} runs over {', '.join(keys)}"
+    caption = f"{shown(config)}: {len(found)} runs over {', '.join(keys)}"
     tables = [(caption, cells(rows, 4))]
     if "seed" in keys and (spread := over_seeds(rows, found)):
         tables.append(("Mean ± standard deviation over the seeds", cells(spread)))
@@ -37,7 +38,7 @@ def write_sweep(out: Path, config: str | Path, found: Sequence[Mapping[str, Any]
             temporary.write_text(text, encoding="utf-8")
     links = [(_point(r["sweep"]), f"{Path(r['folder']).name}/report.html") for r in found]
     synthetic = all(r["synthetic"] for r in found)
-    write_html(out / "report.html", f"Sweep of {config}", [Section("", synthetic, links=links, tables=tables)])
+    write_html(out / "report.html", f"Sweep of {shown(config)}", [Section("", synthetic, links=links, tables=tables)])
 
 
 def _point(delta: Mapping[str, Any]) -> str:

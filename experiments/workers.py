@@ -128,7 +128,9 @@ def on_cluster(jobs: Sequence[Job], address: str, keys: Sequence[str]) -> Iterat
         index = {f.key: i for i, f in enumerate(futures)}
         for future in distributed.as_completed(futures, loop=client.loop):
             if future.status in ("cancelled", "lost"):
-                raise ClusterError(f"--scheduler {address}: the scheduler is gone; start it, and the same command goes on")
+                raise ClusterError(
+                    f"--scheduler {address}: the scheduler is gone; start it, and the same command goes on"
+                )
             outcome = _outcome(future)
             if isinstance(outcome, ClusterError | ImportError):
                 raise ClusterError(f"--scheduler {address}: {outcome}") from outcome
