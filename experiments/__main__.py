@@ -69,7 +69,7 @@ def _run_one(options: argparse.Namespace) -> int:
 
 
 def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
-    from experiments.engine import Where
+    from experiments.compute import Where
     from experiments.paper import against, run_list
     from experiments.tables import cells
 

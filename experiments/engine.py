@@ -7,8 +7,9 @@ An experiment is a module with
 - `run(task)`: plain values;
 - `collect(config, results, run)`: writes tables and figures into the run's folder and returns its metrics;
 - `SOURCES`: the files beside it, by name, that a task's result depends on;
-- if it likes, `together(task)` and `run_together(tasks)`: tasks of the same key (None: alone) are run in one call, for
-  small models that are faster in one program by `vmap`. A task's result is kept under the task alone, either way.
+- if it likes, `together(task)` and `run_together(tasks)`: tasks of the same key (None: none) are run in one call, for
+  small models that are faster in one program by `vmap`. A task's result is kept under the task alone, either way;
+- if it likes, `alone(task)`: true for a task that measures time. Those run last, one by one, in this process.
 
 What is done is not done again, what was killed resumes, and two runs share what they share: a task's result is kept
 under the fingerprint of the task and of its sources, a run under that of its resolved config, its tasks and sources.
@@ -20,7 +21,7 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -28,33 +29,17 @@ from typing import Any
 
 from experiments import store
 from experiments.compare import check
+from experiments.compute import Asked, Where, compute
 from experiments.config import artefact, expanded, resolve, typed
 from experiments.log import Log
 from experiments.page import write_page
 from experiments.sweep import write_sweep
-from experiments.workers import Job, Outcome, in_turn, on_cluster, on_cores
-from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import config_digest, is_complete, open_run
 
-__all__ = ["Plan", "Where", "claim_folder", "compute", "plan", "run_config", "run_tasks", "unfinished"]
+__all__ = ["Plan", "claim_folder", "plan", "run_config", "unfinished"]
 
 MARK = ".hdev-runs"  # a folder of several runs, which another command may add to
-Result = tuple[dict[str, Any], Any]
-
-
-@dataclass(frozen=True)
-class Where:
-    """Where tasks run: in this process, in so many `workers`, or on the Dask cluster at `scheduler`."""
-
-    workers: int = 1
-    scheduler: str | None = None
-
-    def start(self, jobs: Sequence[Job], keys: Sequence[str]) -> Iterator[tuple[int, Outcome]]:
-        """The jobs' outcomes as they come."""
-        if self.scheduler is not None:
-            return on_cluster(jobs, self.scheduler, keys)
-        return on_cores(jobs, min(self.workers, len(jobs))) if self.workers > 1 and len(jobs) > 1 else in_turn(jobs)
 
 
 @dataclass(frozen=True)
@@ -68,6 +53,11 @@ class Plan:
     left_out: int
     resolved: dict[str, Any] = field(repr=False)
     delta: dict[str, Any]
+
+    @property
+    def asked(self) -> Asked:
+        """What is to be computed for it."""
+        return Asked(self.name, self.module, self.tasks)
 
 
 def run_config(
@@ -103,7 +93,7 @@ def run_config(
     todo = unfinished(plans, Path(out))
     log = Log(Path(out) / "log.txt")
     log.say(f"{path}: {len(plans)} runs, {len(plans) - len(todo)} done before")
-    if failed := compute(todo, where, shared, log):
+    if failed := compute([p.asked for p in todo], where, shared, log):
         raise next(iter(failed.values()))
     folders = [folder_of(p, Path(out)) for p in plans]
     found = [
@@ -176,17 +166,19 @@ def finish(plan: Plan, out: Path, where: Where, kept: Path | None, *, replace: b
                 f"{plan.name}: {len(plan.tasks)} tasks of {plan.module.__name__}, sources {plan.resolved['sources']}"
             )
             kept = kept or run.path(".checkpoints", "tasks")
-            if failed := compute([plan], where, kept, log):
+            if failed := compute([plan.asked], where, kept, log):
                 raise next(iter(failed.values()))
             log.say("tables and figures")
             started = time.monotonic()
             places = [store.place(plan.module, t, kept) for t in plan.tasks]
             results = [store.read(p) for p in places]
-            metrics = plan.module.collect(
-                plan.config, [(t, r) for t, (r, _) in zip(plan.tasks, results, strict=True)], run
-            )
-            seconds = sum(s for _, s in results) + time.monotonic() - started
-            metrics |= {"tasks_left_out": plan.left_out, "seconds": round(seconds, 1)}
+            pairs = [(t, r["result"]) for t, r in zip(plan.tasks, results, strict=True)]
+            metrics = plan.module.collect(plan.config, pairs, run)
+            metrics |= {
+                "tasks_left_out": plan.left_out,
+                "tasks_in_one_program": sum(r["together"] > 1 for r in results),
+                "seconds": round(sum(r["seconds"] for r in results) + time.monotonic() - started, 1),
+            }
             check(metrics)
             text = json.dumps(metrics, indent=1, allow_nan=False) + "\n"
             write_page(run, metrics)
@@ -203,75 +195,3 @@ def _environment(where: Where) -> dict[str, Any]:
         commit = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
         return {"commit": commit, "workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}
     return {"workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}
-
-
-def compute(
-    plans: Iterable[Plan], where: Where, kept: Path, log: Log, *, keep_going: bool = False
-) -> dict[str, Exception]:
-    """Run the tasks of all plans that are not in the store `kept`, each once.
-
-    **Returns** the exception of each plan (by its name) that a task of stopped; without `keep_going` the first ends it.
-    """
-    todo: dict[Path, tuple[ModuleType, dict[str, Any]]] = {}
-    wanted: dict[Path, list[str]] = {}
-    asked = 0
-    for p in plans:
-        for task in p.tasks:
-            asked += 1
-            at = store.place(p.module, task, kept)
-            if not at.exists():
-                todo[at] = (p.module, task)
-                wanted.setdefault(at, []).append(p.name)
-    log.say(f"{asked} tasks, {asked - len(todo)} done before")
-    groups = _together(todo)
-    jobs: list[Job] = [(todo[g[0]][0].__name__, [todo[at][1] for at in g]) for g in groups]
-    failed: dict[str, Exception] = {}
-    if not jobs:
-        return failed
-    with contextlib.closing(_started(where, jobs, [_name(g) for g in groups])) as outcomes:
-        for i, outcome in progress.track(outcomes, "running", total=len(jobs)):
-            names = " ".join(at.stem for at in groups[i])
-            if isinstance(outcome, Exception):
-                log.say(f"{names}: {type(outcome).__name__}: {outcome}", shown=False)
-                failed |= {n: outcome for at in groups[i] for n in wanted[at] if n not in failed}
-                if not keep_going:
-                    break
-                continue
-            results, seconds = outcome
-            for at, result in zip(groups[i], results, strict=True):
-                store.keep(at, todo[at][1], result, seconds / len(results))
-            how = f", {len(results)} tasks in one call" if len(results) > 1 else ""
-            log.say(f"{names}: {seconds:.2f} s{how}", shown=False)
-    return failed
-
-
-def _started(where: Where, jobs: Sequence[Job], keys: Sequence[str]) -> Generator[tuple[int, Outcome], None, None]:
-    """As a generator, so that an error of the reader stops the workers."""
-    yield from where.start(jobs, keys)
-
-
-def _together(todo: dict[Path, tuple[ModuleType, dict[str, Any]]]) -> list[list[Path]]:
-    """The tasks that an experiment runs in one call, side by side; the others alone."""
-    groups: dict[Any, list[Path]] = {}
-    for at, (module, task) in todo.items():
-        ask: Callable[[dict[str, Any]], Any] | None = getattr(module, "together", None)
-        key = ask(task) if ask is not None else None
-        groups.setdefault(at if key is None else (module.__name__, key), []).append(at)
-    return list(groups.values())
-
-
-def _name(group: Sequence[Path]) -> str:
-    """A job's name: that of its task, or one for all of them."""
-    return group[0].stem if len(group) == 1 else hashlib.sha256("".join(at.stem for at in group).encode()).hexdigest()
-
-
-def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: int, kept: Path) -> Iterator[Result]:
-    """`(task, result)` in the order of the tasks; those that are kept are read, the others run, `workers` at once.
-
-    **Raises:** what a task raises.
-    """
-    some = Plan(module.__name__, module, None, list(tasks), 0, {}, {})
-    if failed := compute([some], Where(workers), kept, Log(None)):
-        raise next(iter(failed.values()))
-    for task in tasks:
-        yield task, store.read(store.place(module, task, kept))[0]

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +27,7 @@ h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made
 </style></head><body>
 <h1>{{ title }}</h1>
 {% for s in sections %}
-{% if sections | length > 1 and s.title %}<h2 id="{{ s.title }}">{{ s.title }}</h2>{% endif %}
+{% if sections | length > 1 and s.title %}<h2 id="{{ s.anchor }}">{{ s.title }}</h2>{% endif %}
 {% if s.synthetic %}<p><span class="tag">synthetic</span></p>{% endif %}
 {% for line in s.made %}<p class="made">{{ line }}</p>{% endfor %}
 {% if s.told %}<p>{{ s.told | join(" ") }}</p>{% endif %}
@@ -53,6 +54,11 @@ class Section:
     links: Sequence[tuple[str, str]] = ()
     tables: Sequence[tuple[str, list[list[str]]]] = field(default_factory=list)
     figures: Sequence[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def anchor(self) -> str:
+        """Where links within the page lead."""
+        return re.sub(r"[^\w.]+", "-", self.title).strip("-")
 
 
 def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = (), home: Path | None = None) -> Section:

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.compare import comparison
+from experiments.compute import Where, compute
 from experiments.config import artefact, changes, shown
-from experiments.engine import Plan, Where, claim_folder, compute, plan, run_config, unfinished
+from experiments.engine import Plan, claim_folder, plan, run_config, unfinished
 from experiments.log import Log
 from experiments.page import Section, of_run, write_html
 from experiments.tables import cells
@@ -54,7 +55,7 @@ def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bo
             planned += unfinished(plans, home / artefact(path))
             of[artefact(path)] = path
     log.say(f"{len(configs)} configs, {len({p.name for p in planned})} of them to run")
-    for name, why in compute(planned, where, store, log, keep_going=True).items():
+    for name, why in compute([p.asked for p in planned], where, store, log, keep_going=True).items():
         _blame(came, of[name], why, log)
     for name, path in of.items():
         if path not in came.refused and path not in came.broken:
@@ -89,31 +90,33 @@ def _blame(came: Outcomes, path: Path, error: Exception, log: Log) -> None:
 
 
 def against(came: Outcomes) -> list[dict[str, Any]]:
-    """A line for each number of the papers: artefact, name, quantity, paper, ours, ratio, why there is none."""
-    runs = [run for every in came.made.values() for run in every]
-    return [{"artefact": _title(run), **line} for run in runs for line in comparison(run)]
+    """A line for each number of the papers: config, name, quantity, paper, ours, ratio, why there is none."""
+    pairs = [(path, run) for path, every in came.made.items() for run in every]
+    return [{"config": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
 
 
-def _title(run: Mapping[str, Any]) -> str:
-    """The artefact, and of a sweep the point of the grid."""
+def _title(path: Path, run: Mapping[str, Any]) -> str:
+    """What the config is called, and of a sweep the point of the grid."""
     point = ", ".join(f"{k} = {v}" for k, v in run["sweep"].items())
-    return f"{run['artefact']} ({point})" if point else run["artefact"]
+    return f"{artefact(path)} ({point})" if point else artefact(path)
 
 
 def _write_index(home: Path, came: Outcomes) -> None:
-    sections = [_summary(came)]
+    parts: list[Section] = []
     for path, runs in came.made.items():
+        if runs[0]["sweep"]:
+            page = f"{artefact(path)}/report.html"
+            parts.append(Section(artefact(path), links=[("the sweep as a table over its runs", page)]))
         for run in runs:
-            folder = Path(run["folder"])
-            part = of_run(folder, run, made=_made(path, run["sweep"]), home=home)
-            sections.append(dataclasses.replace(part, title=_title(run)))
-    write_html(home / "index.html", "Every table and figure", sections)
+            part = of_run(Path(run["folder"]), run, made=_made(path, run["sweep"]), home=home)
+            parts.append(dataclasses.replace(part, title=_title(path, run)))
+    write_html(home / "index.html", "Every table and figure", [_summary(came, parts), *parts])
 
 
-def _summary(came: Outcomes) -> Section:
+def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
     rows = [
         {
-            "artefact": _title(run), "config": shown(path), "data": run["data"],
+            "config": _title(path, run), "data": run["data"],
             "at least as good": f"{run['better_than_paper']} of {run['of']}" if run["of"] else None,
             "seconds": run["seconds"],
         }
@@ -122,14 +125,17 @@ def _summary(came: Outcomes) -> Section:
     lines = against(came)
     tables = [("Runs", cells(rows))] if rows else []
     tables += [("Paper against ours", cells(lines, 4))] if lines else []
-    links = [(_title(run), f"#{_title(run)}") for runs in came.made.values() for run in runs]
     told = [] if came.made else ["No config of the list has been run."]
-    return Section("", told=[*told, *(f"Not made: {why}." for why in came.reasons())], links=links, tables=tables)
+    told += [f"Not made: {why}." for why in came.reasons()]
+    return Section("", told=told, links=[(p.title, f"#{p.anchor}") for p in parts], tables=tables)
 
 
 def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:
     """The command of a run, and what its config changes in the one that it extends."""
-    sets = "".join(f" --set {k}={v}" for k, v in delta.items())
-    changed = [f"{k} = {new!r:.60} (there {old!r:.60})" for k, (old, new) in changes(path).items()]
-    lines = [f"python -m experiments {shown(path)}{sets} --out DIR"]
+    point = ", ".join(f"{k} = {v}" for k, v in delta.items())
+    lines = [f"python -m experiments {shown(path)} --out DIR{f': the run at {point}' if point else ''}"]
+    changed = [
+        f"{k} = {new!r:.60} ({'not there' if old is None else f'there {old!r:.60}'})"
+        for k, (old, new) in changes(path).items()
+    ]
     return [*lines, f"Changes in the config that it extends: {'; '.join(changed)}."] if changed else lines

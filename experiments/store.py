@@ -49,18 +49,22 @@ def place(module: ModuleType, task: dict[str, Any], store: Path) -> Path:
     return store / module.__name__.rpartition(".")[2] / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
 
 
-def keep(at: Path, task: dict[str, Any], result: Any, seconds: float) -> None:
-    """Write a task's result beside the task itself and what it took; in one step, so that runs may share a store."""
+def keep(at: Path, task: dict[str, Any], result: Any, seconds: float, together: int) -> None:
+    """Write a task's result, the task itself, what it took and how many ran in one program with it.
+
+    In one step, so that runs may share a store. **Raises:** `ValueError` where a number is NaN or infinite.
+    """
     at.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(at) as temporary:
-        text = json.dumps({"task": task, "seconds": round(seconds, 3), "result": result}, allow_nan=False)
+        text = json.dumps(
+            {"task": task, "seconds": round(seconds, 3), "together": together, "result": result}, allow_nan=False
+        )
         Path(temporary).write_text(text)
 
 
-def read(at: Path) -> tuple[Any, float]:
-    """A kept result, and the seconds that it took."""
-    kept = json.loads(at.read_text())
-    return kept["result"], kept["seconds"]
+def read(at: Path) -> dict[str, Any]:
+    """What is kept: `task`, `result`, `seconds`, `together`."""
+    return json.loads(at.read_text())
 
 
 def sources(module: ModuleType, *, collect: bool = False) -> str:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.store import sources
+from hdev_jax import progress
 
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
@@ -121,10 +122,19 @@ def on_cluster(jobs: Sequence[Job], address: str, keys: Sequence[str]) -> Iterat
         client = distributed.Client(at, timeout=PATIENCE, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as e:
         raise ClusterError(f"--scheduler {address}: no scheduler answers there ({type(e).__name__})") from e
+
+    def there(job: Job, expected: str) -> tuple[list[Any], float]:
+        # inside, so that it travels by value: a worker that lacks the module can say so, and is not brought down
+        from experiments.workers import on_worker
+
+        return on_worker(job, expected)
+
     expected = {name: sources(importlib.import_module(name)) for name in dict.fromkeys(j[0] for j in jobs)}
     try:
+        now = len(client.nthreads())  # pyright: ignore[reportArgumentType]
+        progress.step(f"{now} workers at {address}; more may come")
         pairs = zip(jobs, keys, strict=True)
-        futures = [client.submit(on_worker, job, expected[job[0]], key=f"hdev-{k}", pure=False) for job, k in pairs]
+        futures = [client.submit(there, job, expected[job[0]], key=f"hdev-{k}", pure=False) for job, k in pairs]
         index = {f.key: i for i, f in enumerate(futures)}
         for future in distributed.as_completed(futures, loop=client.loop):
             if future.status in ("cancelled", "lost"):
@@ -132,8 +142,11 @@ def on_cluster(jobs: Sequence[Job], address: str, keys: Sequence[str]) -> Iterat
                     f"--scheduler {address}: the scheduler is gone; start it, and the same command goes on"
                 )
             outcome = _outcome(future)
-            if isinstance(outcome, ClusterError | ImportError):
-                raise ClusterError(f"--scheduler {address}: {outcome}") from outcome
+            if isinstance(outcome, distributed.KilledWorker):
+                outcome = ClusterError(f"--scheduler {address}: every worker that took it was killed (out of memory?)")
+            elif isinstance(outcome, ClusterError | ImportError):
+                why = f"a worker says: {outcome}; start it in this checkout, with the same packages"
+                raise ClusterError(f"--scheduler {address}: {why}") from outcome
             yield index[future.key], outcome
             future.release()
     finally:
@@ -153,5 +166,5 @@ def on_worker(job: Job, expected: str) -> tuple[list[Any], float]:
             _prepare_worker(str(Path(worker.local_directory) / "hdev-compiled"), worker.state.nthreads)
             worker.hdev_prepared = True  # pyright: ignore[reportAttributeAccessIssue]
         if sources(importlib.import_module(job[0])) != expected:
-            raise ClusterError(f"worker {worker.address} has other sources of {job[0]}; start it from this checkout")
+            raise ClusterError(f"worker {worker.address} has other sources of {job[0]}")
         return call(job)

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from experiments import store
+from experiments.compute import Asked, Where, compute
 from experiments.config import CONFIGS, artefact, changes, every_config, expanded, listed, resolve, typed
 from experiments.data import MissingDataError
-from experiments.engine import run_config, run_tasks
+from experiments.engine import run_config
+from experiments.log import Log
 from experiments.page import write_docs
 from experiments.planted import Config, exact, tasks
 from experiments.tables import wilson
@@ -132,7 +135,10 @@ def test_every_config_runs_at_a_tiny_size(path, tmp_path, kept):
         pytest.skip(str(e))
     assert all(r["rows"] for r in runs)
     for folder in (Path(r["folder"]) for r in runs):
-        assert list((folder / "tables").glob("*.tex"))
+        for kinds in (("tables", "md", "tex"), ("figures", "png", "pdf")):
+            one, other = ({p.stem for p in (folder / kinds[0]).glob(f"*.{end}")} for end in kinds[1:])
+            assert one == other, "each in both formats"
+        assert [*folder.glob("tables/*.tex"), *folder.glob("figures/*.pdf")]
         assert (folder / "report.html").stat().st_size > 1000
 
 
@@ -170,8 +176,8 @@ def test_intervals_of_shares():
 
 
 @pytest.mark.slow
-def test_many_tasks_on_two_workers_come_back_in_order(tmp_path, monkeypatch):
-    """More tasks than a worker keeps its compiled programs for; an error of a task is the run's."""
+def test_many_tasks_on_two_workers_are_all_kept(tmp_path, monkeypatch):
+    """More tasks than a worker keeps its compiled programs for; an error of a task is the run's, and says of which."""
     write(
         tmp_path,
         "toy_experiment.py",
@@ -179,11 +185,13 @@ def test_many_tasks_on_two_workers_come_back_in_order(tmp_path, monkeypatch):
     )
     monkeypatch.syspath_prepend(tmp_path)
     toy = importlib.import_module("toy_experiment")
-    todo = [{"n": n, "by": 1} for n in range(90)]
-    found = list(run_tasks(toy, todo, workers=2, kept=tmp_path / "kept"))
-    assert [(t["n"], r["square"]) for t, r in found] == [(n, n * n) for n in range(90)]
-    with pytest.raises(ZeroDivisionError):
-        list(run_tasks(toy, [{"n": 1, "by": 0}, {"n": 2, "by": 0}], workers=2, kept=tmp_path / "kept"))
+    todo, kept, log = [{"n": n, "by": 1} for n in range(90)], tmp_path / "kept", Log(None)
+    assert compute([Asked("toy", toy, todo)], Where(workers=2), kept, log) == {}
+    assert [store.read(store.place(toy, t, kept))["result"]["square"] for t in todo] == [n * n for n in range(90)]
+    bad = [{"n": 1, "by": 0}, {"n": 2, "by": 0}]
+    failed = compute([Asked("toy", toy, bad)], Where(workers=2), kept, log)
+    assert isinstance(failed["toy"], ZeroDivisionError)
+    assert "in the task {" in failed["toy"].__notes__[-1]
 
 
 @pytest.mark.slow

@@ -104,10 +104,20 @@ def test_two_sweeps_share_what_they_share_and_each_is_a_table(tmp_path, config):
 def test_tasks_that_run_together_are_kept_alone(tmp_path, config):
     (metrics,) = run_config(config, ["together=true"], out=tmp_path / "a", kept=tmp_path / "kept")
     assert metrics["beside"] == 4
-    assert "4 tasks in one call" in (tmp_path / "a" / "log.txt").read_text()
+    assert metrics["tasks_in_one_program"] == 4
+    assert "4 tasks in one program" in (tmp_path / "a" / "log.txt").read_text()
+    assert "ran side by side in one program" in (tmp_path / "a" / "report.html").read_text()
     (more,) = run_config(config, ["together=true", "count=6"], out=tmp_path / "b", kept=tmp_path / "kept")
     assert more["rows"][0]["ours"]["total"] == 55.0
     assert len(list((tmp_path / "kept").rglob("*.json"))) == 6
+
+
+def test_tasks_that_measure_time_run_last_and_here(tmp_path, config):
+    (metrics,) = run_config(config, ["alone=[0, 2]"], out=tmp_path / "run", workers=2)
+    files = sorted((tmp_path / "diary").iterdir(), key=lambda p: p.stat().st_mtime_ns)
+    assert [p.name for p in files[2:]] == [f"0-{os.getpid()}", f"2-{os.getpid()}"]
+    assert not any(p.name.endswith(f"-{os.getpid()}") for p in files[:2])
+    assert metrics["rows"][0]["ours"]["total"] == 14.0
 
 
 def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path, config, capsys, monkeypatch):
@@ -124,8 +134,8 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     told = capsys.readouterr()
     assert "2 of 5 configs" in told.out
     assert [line.split()[:5] for line in told.out.splitlines() if " sum " in line] == [
-        ["toy/squares", "sum", "total", "10", "14"],
-        ["toy/squares", "sum", "total", "10", "7"],
+        ["toy", "sum", "total", "10", "14"],
+        ["toy2", "sum", "total", "10", "7"],
     ]
     why = [line for line in told.err.splitlines() if line.startswith("experiments:")]
     assert len(why) == 2, "one line for each reason"
@@ -135,7 +145,7 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     page = (tmp_path / "out" / "index.html").read_text()
     assert page.count("<img") == 2
     assert "not in the public data" in page
-    assert "by = 2.0 (there None)" in page
+    assert "by = 2.0 (not there)" in page
     assert "Not made: data, data2: no measured data" in page
     (tmp_path / "toy10.toml").unlink()
     assert main(command) == 2, "the data is not there"

@@ -5,13 +5,15 @@ import random
 import time
 from pathlib import Path
 
+from pydantic import Field
+
 from experiments.config import Strict
 from experiments.data import data_folder
 from experiments.figures import save_figure, styled
 from experiments.tables import write_tables
 from hdev_jax.report.canvas import figure
 
-__all__ = ["SOURCES", "Config", "collect", "run", "run_together", "tasks", "together"]
+__all__ = ["SOURCES", "Config", "alone", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = ()
 
@@ -33,13 +35,15 @@ class Config(Strict):
     wait_s: float = 0.0
     diary: str | None = None
     together: bool = False
+    alone: list[int] = Field(default_factory=list)
     needs: str | None = None
 
 
 def tasks(config):
     if config.needs:
         data_folder(config.needs)
-    shared = {"by": config.by, "noise": config.noise.scale, "seed": config.seed, "together": config.together}
+    shared = {"by": config.by, "noise": config.noise.scale, "seed": config.seed, "together": config.together,
+              "alone": config.alone}  # fmt: skip
     return [{"n": n, **shared, "wait_s": config.wait_s, "diary": config.diary} for n in range(config.count)]
 
 
@@ -53,6 +57,10 @@ def run(task):
 
 def together(task):
     return "all" if task["together"] else None
+
+
+def alone(task):
+    return task["n"] in task["alone"]
 
 
 def run_together(tasks):
