@@ -7,11 +7,14 @@ READY := $(VENV)/.ready
 CUT_OFF := $(VENV)/.installing
 PIP := $(PY) -m pip --disable-pip-version-check --no-input install -qq -c constraints.txt
 
-.PHONY: demo test lint types FORCE
+.PHONY: demo paper test lint types FORCE
 .DELETE_ON_ERROR:
 
 demo: $(READY)
 	@$(PY) -m hdev_jax.demo --out out/demo
+
+paper: $(READY)
+	@$(PY) -m experiments configs/paper.toml --out out/paper --workers 0 $(ARGS)
 
 test: $(READY)
 	@$(PY) -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
@@ -34,7 +37,7 @@ $(READY): pyproject.toml constraints.txt $(if $(wildcard $(PY)),,FORCE)
 	@touch $(CUT_OFF)
 	@echo "installing $$(grep -c == constraints.txt) pinned packages into $(VENV)/ (a few minutes the first time)"
 	@$(PIP) hatchling editables
-	@$(PIP) --no-build-isolation -e '.[test,dev,experiments]'
+	@$(PIP) --no-build-isolation -e '.[test,dev,experiments,fleet]'
 	@rm -f $(CUT_OFF)
 	@touch $@
 	@echo "$(VENV)/ is ready"

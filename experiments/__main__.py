@@ -1,8 +1,9 @@
-"""`python -m experiments CONFIG.toml [--set key=value …] --out DIR [--workers N]`."""
+"""`python -m experiments CONFIG.toml [--set key=value …] --out DIR [--workers N | --scheduler ADDRESS]`."""
 
 import argparse
 import os
 import sys
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 from hdev_jax import progress
@@ -12,39 +13,84 @@ __all__ = ["main"]
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Exit status 0: done; 2: the config is at fault, in one line; 130: interrupted, to be resumed."""
-    parser = argparse.ArgumentParser(prog="python -m experiments", description="Run one experiment from its config.")
-    parser.add_argument("config", type=Path, help="a TOML file under configs/")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a key (repeatable)")
-    parser.add_argument("--out", type=Path, required=True, help="the run's folder")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (0: one for each core)")
-    parser.add_argument("--tasks", type=Path, help="a folder for results of tasks that runs share")
-    parser.add_argument("--kept", action="store_true", help="run no task: tables of what --tasks holds")
-    parser.add_argument("--docs", type=Path, help="a folder for the tables as a page in Markdown, with its figures")
-    options = parser.parse_args(argv)
+    """Exit status 0: done; 2: the config, the data or the cluster is at fault, one line; 1: we are; 130: interrupted.
+
+    Of a list of configs, all that can run do.
+    """
+    options = _parser().parse_args(argv)
     import jax
 
-    from experiments.engine import run_config
-    from experiments.page import write_docs
+    from experiments.config import listed
+    from experiments.workers import ClusterError
 
     jax.config.update("jax_enable_x64", True)
-    workers = options.workers or os.cpu_count() or 1
     try:
         with progress.shown():
-            runs = run_config(
-                options.config, options.set, out=options.out, workers=workers, kept=options.tasks,
-                fresh=not options.kept,
-            )  # fmt: skip
-            if options.docs:
-                write_docs(options.docs, options.config.stem, [Path(r["folder"]) for r in runs])
-    except InputError as e:
+            configs = listed(options.config)
+            return _run_one(options) if configs is None else _run_list(options, configs)
+    except (InputError, ClusterError) as e:
         print(f"experiments: {e}", file=sys.stderr)
         return 2
+    except BrokenExecutor:
+        print("experiments: a worker was killed (out of memory?); the same command goes on from here", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("experiments: interrupted; the same command goes on from here", file=sys.stderr)
         return 130
-    print(f"{options.out}/metrics.json")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m experiments", description="Run one experiment from its config.")
+    parser.add_argument("config", type=Path, help="a TOML file under configs/, or a list of such: configs/paper.toml")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a key (repeatable)")
+    parser.add_argument("--out", type=Path, required=True, help="the run's folder")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, default=1, metavar="N", help="processes (0: one for each core)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="run on a Dask cluster: tcp://host:port, or its file")
+    parser.add_argument("--tasks", type=Path, help="a folder for results of tasks that runs share")
+    parser.add_argument("--kept", action="store_true", help="run no task: tables of what --tasks holds")
+    parser.add_argument("--tiny", action="store_true", help="as small as the config's table [tiny] says, to try it")
+    parser.add_argument("--docs", type=Path, help="a folder for the tables as a page in Markdown, with its figures")
+    return parser
+
+
+def _run_one(options: argparse.Namespace) -> int:
+    from experiments.engine import run_config
+    from experiments.page import write_docs
+
+    runs = run_config(
+        options.config, options.set, out=options.out, workers=_workers(options), scheduler=options.scheduler,
+        kept=options.tasks, fresh=not options.kept, tiny=options.tiny,
+    )  # fmt: skip
+    if options.docs:
+        write_docs(options.docs, options.config, [Path(r["folder"]) for r in runs], options.set)
+    print(options.out / ("sweep.json" if runs[0]["sweep"] else "metrics.json"))
     return 0
+
+
+def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
+    from experiments.compute import Where
+    from experiments.paper import against, run_list
+    from experiments.tables import cells
+
+    for name in ("set", "tasks", "kept", "docs"):
+        if getattr(options, name):
+            raise InputError(f"--{name}: is for one config; {options.config} is a list of {len(configs)}")
+    where = Where(_workers(options), options.scheduler)
+    came = run_list(configs, out=options.out, where=where, tiny=options.tiny)
+    if lines := against(came):
+        table = cells(lines, 4)
+        widths = [max(len(c) for c in column) for column in zip(*table, strict=True)]
+        for line in table:
+            print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+    print(f"{len(came.made)} of {len(configs)} configs: {options.out / 'index.html'}")
+    for why in came.reasons():
+        print(f"experiments: {why}", file=sys.stderr)
+    return 1 if came.broken else 2 if came.refused else 0
+
+
+def _workers(options: argparse.Namespace) -> int:
+    return options.workers or os.cpu_count() or 1
 
 
 if __name__ == "__main__":

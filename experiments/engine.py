@@ -1,40 +1,63 @@
-"""Running an experiment: its tasks on all cores, each once for all time, and what it makes of their results.
+"""Running an experiment: its tasks on all cores or a cluster, each once for all time, and what it makes of them.
 
-An experiment is a module with a `Config`, `tasks(config)` (plain dicts, each decides its result by itself),
-`run(task)` (plain values) and `collect(config, results, run)` (metrics, tables, figures). A task's result is kept
-under the fingerprint of the task and of the sources: what is done is not done again, what was killed resumes, and two
-runs share what they share.
+An experiment is a module with
+
+- `Config`, a `Strict` model, and `tasks(config)`: plain dicts, each decides its result by itself (a task that reads a
+  file has the file's fingerprint among its values, a task that draws has its seed);
+- `run(task)`: plain values;
+- `collect(config, results, run)`: writes tables and figures into the run's folder and returns its metrics;
+- `SOURCES`: the files beside it, by name, that a task's result depends on;
+- if it likes, `together(task)` and `run_together(tasks)`: tasks of the same key (None: none) are run in one call, for
+  small models that are faster in one program by `vmap`. A task's result is kept under the task alone, either way;
+- if it likes, `alone(task)`: true for a task that measures time. Those run last, one by one, in this process.
+
+What is done is not done again, what was killed resumes, and two runs share what they share: a task's result is kept
+under the fingerprint of the task and of its sources, a run under that of its resolved config, its tasks and sources.
 """
 
+import contextlib
 import hashlib
-import importlib
-import itertools
 import json
-import multiprocessing
-import os
-import shutil
-import tempfile
+import platform
+import subprocess
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from functools import cache
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from experiments.config import expanded, resolve, typed
+from experiments import store
+from experiments.compare import check
+from experiments.compute import Asked, Where, compute
+from experiments.config import artefact, expanded, resolve, typed
+from experiments.log import Log
 from experiments.page import write_page
-from hdev_jax import progress
+from experiments.sweep import write_sweep
 from hdev_jax.errors import InputError
-from hdev_jax.rundir import atomic_file, config_digest, open_run
+from hdev_jax.rundir import config_digest, is_complete, open_run
 
-__all__ = ["run_config", "run_tasks"]
+__all__ = ["Plan", "claim_folder", "plan", "run_config", "unfinished"]
 
-ROOT = Path(__file__).parents[1]
-EXPERIMENTS = ("planted",)
-EVERY = tuple(sorted(p.name for p in Path(__file__).parent.glob("*.py")))
-FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
-Result = tuple[dict[str, Any], dict[str, Any]]
+MARK = ".hdev-runs"  # a folder of several runs, which another command may add to
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run that is to be: the experiment, its typed config and tasks, and everything that decides its result."""
+
+    name: str
+    module: ModuleType
+    config: Any
+    tasks: list[dict[str, Any]]
+    left_out: int
+    resolved: dict[str, Any] = field(repr=False)
+    delta: dict[str, Any]
+
+    @property
+    def asked(self) -> Asked:
+        """What is to be computed for it."""
+        return Asked(self.name, self.module, self.tasks)
 
 
 def run_config(
@@ -43,132 +66,132 @@ def run_config(
     *,
     out: str | Path,
     workers: int = 1,
+    scheduler: str | None = None,
     kept: str | Path | None = None,
     fresh: bool = True,
+    tiny: bool = False,
+    replace: bool = False,
 ) -> list[dict[str, Any]]:
     """Run a config, or each point of its sweep in a folder of its own under `out`. **Returns** their metrics.
 
-    **Arguments:** `kept`, a folder for the results of tasks that other runs may share; without it a run keeps them in
-    its own folder until it is complete, and the points of a sweep share one under `out`; `fresh=False` runs no task
-    and reports on those that are kept (`metrics["tasks_left_out"]` says how many are not).
+    **Arguments:** `workers`, `scheduler`: see `Where`; `kept`, a folder for the results of tasks that other runs may
+    share; without it a run keeps them in its own folder until it is complete, and the points of a sweep share one under
+    `out`; `fresh=False` runs no task and reports on those that are kept (`metrics["tasks_left_out"]` says how many are
+    not); `tiny` makes the config as small as its table `[tiny]` says; `replace`: a run of another configuration in
+    `out` gives way.
+
+    **Raises:** `InputError` where the config or `out` is at fault; what a task raises.
     """
-    table = resolve(path, sets)
-    points = list(expanded(table, path))
-    found = []
-    for delta, config in points:
-        folder = Path(out) if len(points) == 1 else Path(out) / config_digest(config, "")[:12]
-        shared = Path(kept) if kept is not None else None if len(points) == 1 else Path(out) / "tasks"
-        run = _run_one(config, path, folder, workers, shared, fresh)
-        found.append({"sweep": delta, "folder": str(folder), **run})
-    if len(points) > 1:
-        with atomic_file(Path(out) / "sweep.json") as temporary:
-            Path(temporary).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
+    where = Where(workers, scheduler)
+    shared = Path(kept) if kept is not None else None
+    plans = plan(path, sets, tiny=tiny, kept=None if fresh else shared or Path(out) / "tasks")
+    if not plans[0].delta:
+        metrics = finish(plans[0], Path(out), where, shared, replace=replace)
+        return [{"sweep": {}, "folder": str(out), **metrics}]
+    claim_folder(out)
+    shared = shared or Path(out) / "tasks"
+    todo = unfinished(plans, Path(out))
+    log = Log(Path(out) / "log.txt")
+    log.say(f"{path}: {len(plans)} runs, {len(plans) - len(todo)} done before")
+    if failed := compute([p.asked for p in todo], where, shared, log):
+        raise next(iter(failed.values()))
+    folders = [folder_of(p, Path(out)) for p in plans]
+    found = [
+        {"sweep": p.delta, "folder": str(folder), **finish(p, folder, where, shared, replace=True)}
+        for p, folder in zip(plans, folders, strict=True)
+    ]
+    write_sweep(Path(out), path, found)
+    log.say("sweep.json, sweep.md, sweep.tex, report.html")
     return found
 
 
-def _run_one(
-    config: dict[str, Any], path: str | Path, out: Path, workers: int, kept: Path | None, fresh: bool
-) -> dict[str, Any]:
-    module = _module(config, path)
-    parsed = typed(module.Config, config, path)
-    started = time.monotonic()
-    resolved = {"config": parsed.model_dump(mode="json"), "sources": sources(EVERY), "fresh": fresh}
-    with open_run(out, resolved, seed=config.get("seed")) as run:
+def folder_of(plan: Plan, out: Path) -> Path:
+    """Where a run goes: `out` itself, or for a point of a sweep the folder in it that its content names."""
+    return out / config_digest(plan.resolved)[:12] if plan.delta else out
+
+
+def unfinished(plans: Iterable[Plan], out: Path) -> list[Plan]:
+    """Those whose run is not complete under `out`."""
+    return [p for p in plans if not is_complete(folder_of(p, out), p.resolved)]
+
+
+def claim_folder(out: str | Path) -> None:
+    """Make the folder `out` one of several runs. **Raises:** `InputError` where it holds something else."""
+    try:
+        folder = Path(out)
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()) and not (folder / MARK).exists():
+            raise InputError(f"--out {out}: holds other files; name a new or an empty folder")
+        (folder / MARK).touch()
+    except OSError as e:
+        raise InputError(f"--out {out}: cannot be written ({e.strerror or e}); name a folder that you may write") from e
+
+
+def plan(path: str | Path, sets: Sequence[str] = (), *, tiny: bool = False, kept: Path | None = None) -> list[Plan]:
+    """A config as runs that are to be: one, or one for each point of its sweep.
+
+    **Arguments:** `kept`: leave out the tasks whose result is not in this folder.
+
+    **Raises:** `InputError` where the config is at fault, or the measured data that its tasks need is not there.
+    """
+    plans = []
+    for delta, table in expanded(resolve(path, sets, tiny=tiny), path):
+        module = store.experiment(table.get("experiment"), path)
+        config = typed(module.Config, table, path, sets)
+        every = list(module.tasks(config))
+        tasks = [t for t in every if kept is None or store.place(module, t, kept).exists()]
+        resolved = {
+            "config": config.model_dump(mode="json"),
+            "sources": store.sources(module, collect=True),
+            "tasks": len(tasks),
+            "tasks_sha256": hashlib.sha256(json.dumps(tasks, sort_keys=True).encode()).hexdigest(),
+        }
+        plans.append(Plan(artefact(path), module, config, tasks, len(every) - len(tasks), resolved, delta))
+    return plans
+
+
+def finish(plan: Plan, out: Path, where: Where, kept: Path | None, *, replace: bool = False) -> dict[str, Any]:
+    """The run in its folder `out`, complete: what tasks are left, its tables and figures. **Returns** its metrics.
+
+    **Arguments:** `kept`, the store of tasks' results (None: in the run's folder until it is complete); `replace`: a
+    run of another configuration in `out` gives way to this one.
+
+    **Raises:** `InputError` where `out` holds something else; what a task raises.
+    """
+    seed = getattr(plan.config, "seed", None)
+    with open_run(out, plan.resolved, seed=seed, environment=_environment(where), replace=replace) as run:
         if not run.done:
-            tasks = list(module.tasks(parsed))
-            own = run.path(".tasks")
-            if not fresh:
-                tasks = [t for t in tasks if _place(module, t, kept or own).exists()]
-            results = list(run_tasks(module, tasks, workers=workers, kept=kept or own))
-            progress.step("tables and figures")
-            left_out = sum(1 for _ in module.tasks(parsed)) - len(tasks)
-            cost = {"tasks_left_out": left_out, "seconds": round(time.monotonic() - started, 1)}
-            metrics = {**module.collect(parsed, results, run), **cost}
+            log = Log(run.path(".checkpoints", "log.txt"))  # what stays there when the run is killed
+            log.say(
+                f"{plan.name}: {len(plan.tasks)} tasks of {plan.module.__name__}, sources {plan.resolved['sources']}"
+            )
+            kept = kept or run.path(".checkpoints", "tasks")
+            if failed := compute([plan.asked], where, kept, log):
+                raise next(iter(failed.values()))
+            log.say("tables and figures")
+            started = time.monotonic()
+            places = [store.place(plan.module, t, kept) for t in plan.tasks]
+            results = [store.read(p) for p in places]
+            pairs = [(t, r["result"]) for t, r in zip(plan.tasks, results, strict=True)]
+            metrics = plan.module.collect(plan.config, pairs, run)
+            metrics |= {
+                "tasks_left_out": plan.left_out,
+                "tasks_in_one_program": sum(r["together"] > 1 for r in results),
+                "seconds": round(sum(r["seconds"] for r in results) + time.monotonic() - started, 1),
+            }
+            check(metrics)
+            text = json.dumps(metrics, indent=1, allow_nan=False) + "\n"
             write_page(run, metrics)
-            shutil.rmtree(own, ignore_errors=True)
-            run.path("metrics.json").write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n")
+            run.path("metrics.json").write_text(text)
+            log.say(f"done, {metrics['seconds']} s in all tasks and here")
+            run.path("log.txt").write_bytes(log.path.read_bytes())
         return json.loads((run.work / "metrics.json").read_text())
 
 
-def _module(config: Mapping[str, Any], path: str | Path) -> ModuleType:
-    name = config.get("experiment")
-    if name not in EXPERIMENTS:
-        raise InputError(f"{path}, key experiment: one of {', '.join(EXPERIMENTS)} is expected, found {name!r}")
-    return importlib.import_module(f"experiments.{name}")
-
-
-def run_tasks(module: ModuleType, tasks: Sequence[dict[str, Any]], *, workers: int, kept: Path) -> Iterator[Result]:
-    """`(task, result)` in the order of the tasks; those that are kept are read, the others run, `workers` at once."""
-    places = [_place(module, task, kept) for task in tasks]
-    todo = [i for i, p in enumerate(places) if not p.exists()]
-    progress.step(f"{len(tasks)} tasks, {len(tasks) - len(todo)} done before")
-    if workers > 1 and len(todo) > 1:
-        with tempfile.TemporaryDirectory(prefix="hdev-compiled-") as compiled:
-            threads = max(1, (os.cpu_count() or 1) // workers)
-            spawn = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled, threads))
-            try:
-                futures = {pool.submit(_call, module.__name__, tasks[i]): i for i in todo}
-                for future in progress.track(as_completed(futures), "running", total=len(todo)):
-                    _keep(places[futures[future]], future.result())
-                pool.shutdown()
-            except BaseException:  # an interrupt keeps what is done and waits for nothing else
-                workers_now = list((getattr(pool, "_processes", None) or {}).values())
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in workers_now:
-                    process.terminate()
-                for process in workers_now:
-                    process.join()
-                raise
-    else:
-        for i in progress.track(todo, "running"):
-            _keep(places[i], _call(module.__name__, tasks[i]))
-    for task, place in zip(tasks, places, strict=True):
-        yield task, json.loads(place.read_text())
-
-
-def _place(module: ModuleType, task: dict[str, Any], kept: Path) -> Path:
-    text = json.dumps([task, sources(module.SOURCES)], sort_keys=True)
-    return kept / module.__name__.rpartition(".")[2] / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
-
-
-def _keep(place: Path, result: dict[str, Any]) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_file(place) as temporary:
-        Path(temporary).write_text(json.dumps(result, allow_nan=False))
-
-
-_calls = itertools.count(1)
-
-
-def _call(module: str, task: dict[str, Any]) -> dict[str, Any]:
-    if next(_calls) % FORGET_EVERY == 0:
-        import jax
-
-        jax.clear_caches()
-    return importlib.import_module(module).run(task)
-
-
-def _prepare_worker(compiled: str, threads: int) -> None:
-    """Double precision, a share of the cores, and a cache of compiled programs that outlives `FORGET_EVERY`.
-
-    A cache for each worker: JAX does not write an entry in one step.
-    """
-    if threads == 1:
-        os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = str(threads)
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", str(Path(compiled) / str(os.getpid())))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-@cache
-def sources(own: tuple[str, ...]) -> str:
-    """Fingerprint of every source file that a task's result may depend on: the package's, and the experiment's own."""
-    digest = hashlib.sha256()
-    for path in [*sorted((ROOT / "hdev_jax").rglob("*.py")), *(ROOT / "experiments" / name for name in own)]:
-        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
+def _environment(where: Where) -> dict[str, Any]:
+    """What decides speed, and which commit of the checkout runs, beside what every run records."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        git = ["git", "-C", str(store.HERE), "describe", "--always", "--dirty", "--abbrev=12"]
+        commit = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+        return {"commit": commit, "workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}
+    return {"workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}

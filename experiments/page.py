@@ -1,71 +1,127 @@
-"""A run's page: its table and its figures in one file that opens offline."""
+"""Pages: a run's tables and figures, or those of many runs, in one file that opens offline."""
 
 import base64
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hdev_jax.rundir import Run
+from experiments.compare import comparison, told
+from experiments.config import shown
+from experiments.tables import cells, read_markdown
+from hdev_jax.rundir import Run, atomic_file
 
-__all__ = ["write_docs", "write_page"]
+__all__ = ["Section", "of_run", "write_docs", "write_html", "write_page"]
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
 <style>
 body { font: 15px/1.5 system-ui, sans-serif; color: #1b1f24; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
-table { border-collapse: collapse; font-size: 13px; } td, th { padding: .3rem .6rem; border-bottom: 1px solid #d9dee3; }
-td { text-align: right; } td:first-child, th:first-child { text-align: left; } th { vertical-align: bottom; }
+table { border-collapse: collapse; font-size: 13px; margin-bottom: 1.2rem; }
+td, th { padding: .3rem .6rem; border-bottom: 1px solid #d9dee3; text-align: right; vertical-align: bottom; }
+td:first-child, th:first-child { text-align: left; } caption { text-align: left; font-weight: 600; padding: .3rem 0; }
 .scroll { overflow-x: auto; } img { max-width: 100%; margin: 1rem 0; } .tag { background: #fff3cd; padding: 0 .4rem; }
+h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made { color: #57606a; }
 </style></head><body>
-<h1>{{ title }}{% if synthetic %} <span class="tag">synthetic</span>{% endif %}</h1>
-<p>{{ metrics.logs }} logs, {{ metrics.seconds }} s.{% if metrics.tasks_left_out %}
-{{ metrics.tasks_left_out }} more were asked for and are not done.{% endif %}{% if metrics.missed %}
-Short of what is wanted: {{ metrics.missed | join("; ") }}.{% endif %}</p>
-{% for name, lines in tables %}<div class="scroll"><table><thead><tr>{% for h in lines[0] %}<th>{{ h }}</th>{% endfor
-%}</tr></thead><tbody>{% for line in lines[1:] %}<tr>{% for c in line %}<td>{{ c }}</td>{% endfor %}</tr>{% endfor
-%}</tbody></table></div>{% endfor %}
-{% for name, data in figures %}<img alt="{{ name }}" src="data:image/png;base64,{{ data }}">{% endfor %}
+<h1>{{ title }}</h1>
+{% for s in sections %}
+{% if sections | length > 1 and s.title %}<h2 id="{{ s.anchor }}">{{ s.title }}</h2>{% endif %}
+{% if s.synthetic %}<p><span class="tag">synthetic</span></p>{% endif %}
+{% for line in s.made %}<p class="made">{{ line }}</p>{% endfor %}
+{% if s.told %}<p>{{ s.told | join(" ") }}</p>{% endif %}
+{% if s.links %}<p>{% for name, to in s.links %}<a href="{{ to }}">{{ name }}</a> {% endfor %}</p>{% endif %}
+{% for caption, lines in s.tables %}<div class="scroll"><table><caption>{{ caption }}</caption><thead><tr>
+{% for h in lines[0] %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
+{% for line in lines[1:] %}<tr>{% for c in line %}<td>{{ c }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>{% endfor %}
+{% for name, data in s.figures %}<img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
+{% endfor %}
+{% endfor %}
 </body></html>
 """
 
 
-def write_page(run: Run, metrics: dict[str, Any]) -> None:
-    """`report.html` from the run's Markdown tables and PNG figures."""
+@dataclass(frozen=True)
+class Section:
+    """A part of a page: how it was `made`, what is `told` of it, tables (caption, lines), figures (name, PNG)."""
+
+    title: str
+    synthetic: bool = False
+    made: Sequence[str] = ()
+    told: Sequence[str] = ()
+    links: Sequence[tuple[str, str]] = ()
+    tables: Sequence[tuple[str, list[list[str]]]] = field(default_factory=list)
+    figures: Sequence[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def anchor(self) -> str:
+        """Where links within the page lead."""
+        return re.sub(r"[^\w.]+", "-", self.title).strip("-")
+
+
+def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = (), home: Path | None = None) -> Section:
+    """The part of a page for the run in `folder`: paper against ours, its own tables, its figures.
+
+    **Arguments:** `made`, lines on what made it; `home`, the folder of the page, for links to the run's files.
+    """
+    against = comparison(metrics)
+    tables = [("Paper against ours", cells(against, 4))] if against else []
+    tables += [read_markdown(path) for path in sorted((folder / "tables").glob("*.md"))]
+    images = sorted((folder / "figures").glob("*.png"))
+    names = ("report.html", "config.toml", "metrics.json", "log.txt")
+    links = [(n, (folder / n).relative_to(home).as_posix()) for n in names] if home is not None else []
+    return Section(
+        title=metrics["artefact"],
+        synthetic=metrics["synthetic"],
+        made=made,
+        told=[*told(metrics), f"{metrics['seconds']} s."],
+        links=links,
+        tables=tables,
+        figures=[(p.stem.replace("_", " "), base64.b64encode(p.read_bytes()).decode("ascii")) for p in images],
+    )
+
+
+def write_html(path: Path, title: str, sections: Sequence[Section]) -> None:
+    """A page of these parts. **Raises:** `InputError` where the file cannot be written."""
     from jinja2 import Environment, StrictUndefined
 
-    tables = []
-    for path in sorted(run.path("tables").glob("*.md")):
-        rows = [line for line in path.read_text().splitlines() if line.startswith("|") and not line.startswith("|---")]
-        tables.append((path.stem, [[c.strip() for c in line.strip("|").split("|")] for line in rows]))
-    images = sorted(run.path("figures").glob("*.png"))
-    figures = [(p.stem, base64.b64encode(p.read_bytes()).decode("ascii")) for p in images]
     page = Environment(autoescape=True, undefined=StrictUndefined).from_string(_PAGE)
-    text = page.render(
-        title=metrics["artefact"], synthetic=metrics["synthetic"], metrics=metrics, tables=tables, figures=figures
-    )
-    run.path("report.html").write_text(text, encoding="utf-8")
+    with atomic_file(path) as temporary:
+        temporary.write_text(page.render(title=title, sections=sections), encoding="utf-8")
 
 
-def write_docs(docs: Path, name: str, folders: Sequence[Path]) -> None:
-    """`docs/NAME.md`, its tables and figures, from complete runs; figures go to `docs/figures/NAME/`."""
-    command = f"python -m experiments configs/studies/{name}.toml --tasks DIR --out OUT --docs docs"
-    lines = [f"# Study: {name}", "", f"Made by `{command}`.", ""]
+def write_page(run: Run, metrics: dict[str, Any]) -> None:
+    """`report.html` of a run, from its metrics, Markdown tables and PNG figures."""
+    write_html(run.path("report.html"), metrics["artefact"], [of_run(run.work, metrics)])
+
+
+def write_docs(docs: Path, config: str | Path, folders: Sequence[Path], sets: Sequence[str] = ()) -> None:
+    """`docs/NAME.md`, NAME being the config's, its tables and figures, from complete runs of that config.
+
+    **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with. Figures go to `docs/figures/NAME/`.
+    """
+    name = Path(config).stem
+    kind, every = _kind(Path(config)), " ".join([shown(config), *(f"--set {s}" for s in sets)])
+    lines = [f"# {kind}: {name}", "", f"Made by `python -m experiments {every} --tasks DIR --out OUT --docs docs`.", ""]
     for k, folder in enumerate(folders):
         metrics = json.loads((folder / "metrics.json").read_text())
-        lines.append(f"{metrics['logs']} logs{', all synthetic' if metrics['synthetic'] else ''}.")
-        if metrics["tasks_left_out"]:
-            lines.append(f"{metrics['tasks_left_out']} more are in the config and were not run.")
-        if metrics["skipped"]:
-            lines.append(f"{len(metrics['skipped'])} could not be made as asked for.")
-        if metrics["missed"]:
-            lines.append(f"Short of what is wanted: {'; '.join(metrics['missed'])}.")
+        lines += told(metrics)
         for table in sorted((folder / "tables").glob("*.md")):
-            lines += ["", table.read_text().rstrip()]
+            lines += ["", table.read_text(encoding="utf-8").rstrip()]
         home = docs / "figures" / name
         home.mkdir(parents=True, exist_ok=True)
         for figure in sorted((folder / "figures").glob("*.png")):
             to = home / (figure.name if len(folders) == 1 else f"{k}_{figure.name}")
             to.write_bytes(figure.read_bytes())
             lines += ["", f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})"]
-    (docs / f"{name}.md").write_text("\n".join(lines) + "\n")
+    (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _kind(config: Path) -> str:
+    """What a page of a config in this folder is of: a study, paper 2, …"""
+    folder = config.resolve().parent.name
+    if folder.startswith("paper"):
+        return f"Paper {folder.removeprefix('paper')}".strip()
+    return "Study" if folder == "studies" else "Experiment"

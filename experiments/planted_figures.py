@@ -1,14 +1,14 @@
 """Figures of the planted study: power against size, false discoveries against noise, confusion between causes."""
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from experiments.figures import save_figure, styled
 from experiments.tables import wilson
 from hdev_jax.physics import LIBRARY
-from hdev_jax.report.canvas import figure, png, style, tidy
+from hdev_jax.report.canvas import figure, tidy
 from hdev_jax.rundir import Run
 
 __all__ = ["confusion_figure", "false_figure", "power_figure"]
@@ -28,22 +28,6 @@ def _named(result: dict[str, Any], method: str, planted: list[str]) -> tuple[boo
 
 def _methods(rivals: Sequence[str]) -> list[str]:
     return ["ours", *(r for r in rivals if r in COLOURS)]
-
-
-def styled(draw: Callable[..., None]) -> Callable[..., None]:
-    """The project's look while a figure is drawn and saved."""
-
-    @functools.wraps(draw)
-    def inside(*args: Any, **kwargs: Any) -> None:
-        with style():
-            draw(*args, **kwargs)
-
-    return inside
-
-
-def _save(run: Run, fig: Any, name: str) -> None:
-    run.path("figures", f"{name}.png").write_bytes(png(fig))
-    fig.savefig(run.path("figures", f"{name}.pdf"), metadata={"CreationDate": None, "Creator": None, "Producer": None})
 
 
 @styled
@@ -76,7 +60,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     axes.minorticks_off()
     tidy(axes)
     fig.legend(fontsize=7, loc="outside right center")
-    _save(run, fig, "power")
+    save_figure(run, fig, "power")
 
 
 @styled
@@ -101,7 +85,7 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     axes.set(ylabel="something named [%]", ylim=(0, 102), title="Synthetic logs with nothing missing")
     tidy(axes)
     fig.legend(fontsize=7, loc="outside right center")
-    _save(run, fig, "false_discoveries")
+    save_figure(run, fig, "false_discoveries")
 
 
 @styled
@@ -129,4 +113,4 @@ def confusion_figure(run: Run, done: Done) -> None:
                   color="white" if share[i, k] > 55 else "#222")  # fmt: skip
     axes.set(xlabel="named", ylabel="planted", title="Synthetic logs: what was named [%]")
     fig.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
-    _save(run, fig, "confusion")
+    save_figure(run, fig, "confusion")

@@ -1,6 +1,8 @@
 """Tables of a run: Markdown and LaTeX from the same rows; intervals of shares."""
 
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,13 @@ from scipy import stats
 
 from hdev_jax.rundir import Run
 
-__all__ = ["wilson", "write_tables"]
+__all__ = ["cells", "markdown", "read_markdown", "tex", "wilson", "write_tables"]
+
+_TEX = {
+    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--", "−": "$-$", "±": r"$\pm$", "µ": r"$\mu$",
+    "²": "$^2$", "³": "$^3$", "·": r"$\cdot$", "×": r"$\times$", "°": r"$^\circ$", "η": r"$\eta$", "λ": r"$\lambda$",
+}  # fmt: skip
 
 
 def wilson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
@@ -22,36 +30,47 @@ def wilson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
 
 
 def write_tables(run: Run, name: str, rows: Sequence[Mapping[str, Any]], caption: str) -> None:
-    """`tables/NAME.md` and `tables/NAME.tex`; columns as in the first row, empty ones left out."""
-    keys = [k for k in rows[0] if any(r[k] is not None for r in rows)] if rows else []
-    head, body = [k.replace("_", " ") for k in keys], [[_cell(r[k]) for k in keys] for r in rows]
-    lines = [f"{caption}.", "", f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    lines += [f"| {' | '.join(line)} |" for line in body]
-    run.path("tables", f"{name}.md").write_text("\n".join(lines) + "\n")
-    tex = [
-        r"\begin{tabular}{l" + "r" * (len(head) - 1) + "}",
-        r"\hline",
-        " & ".join(map(_tex, head)) + r" \\",
-        r"\hline",
-    ]
-    tex += [" & ".join(map(_tex, line)) + r" \\" for line in body]
-    tex += [r"\hline", r"\end{tabular}", f"% {caption}"]
-    run.path("tables", f"{name}.tex").write_text("\n".join(tex) + "\n")
+    """`tables/NAME.md` and `tables/NAME.tex`; columns as they first come in the rows, empty ones left out."""
+    lines = cells(rows)
+    run.path("tables", f"{name}.md").write_text(markdown(lines, caption), encoding="utf-8")
+    run.path("tables", f"{name}.tex").write_text(tex(lines, caption), encoding="utf-8")
 
 
-def _cell(x: Any) -> str:
+def cells(rows: Sequence[Mapping[str, Any]], digits: int = 3) -> list[list[str]]:
+    """The head and the rows as text, numbers to so many digits; a row that lacks a column has nothing there."""
+    keys = [k for k in dict.fromkeys(k for r in rows for k in r) if any(r.get(k) is not None for r in rows)]
+    return [[k.replace("_", " ") for k in keys], *([_cell(r.get(k), digits) for k in keys] for r in rows)]
+
+
+def markdown(lines: Sequence[Sequence[str]], caption: str) -> str:
+    """A table whose first line is its head, after its caption."""
+    head, *body = ([c.replace("|", r"\|") for c in line] for line in lines)
+    out = [f"{caption}.", "", f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    return "\n".join([*out, *(f"| {' | '.join(line)} |" for line in body)]) + "\n"
+
+
+def read_markdown(path: Path) -> tuple[str, list[list[str]]]:
+    """The caption of a table that we wrote, and its lines, the head first."""
+    every = path.read_text(encoding="utf-8").splitlines()
+    rows = [line[1:-1] for line in every if line.startswith("|") and not line.startswith("|---")]
+    caption = " ".join(line for line in every if line and not line.startswith("|"))
+    return caption, [[c.strip().replace(r"\|", "|") for c in re.split(r"(?<!\\)\|", row)] for row in rows]
+
+
+def tex(lines: Sequence[Sequence[str]], caption: str) -> str:
+    """The same as a `tabular`, with the caption as a comment."""
+    head, *body = (" & ".join("".join(_TEX.get(x, x) for x in c) for c in line) + r" \\" for line in lines)
+    out = [r"\begin{tabular}{l" + "r" * (len(lines[0]) - 1) + "}", r"\hline", head, r"\hline", *body, r"\hline"]
+    return "\n".join([*out, r"\end{tabular}", f"% {caption}"]) + "\n"
+
+
+def _cell(x: Any, digits: int) -> str:
     if x is None:
         return "–"
     if isinstance(x, bool):
         return "yes" if x else "no"
     if isinstance(x, float):
-        return f"{x:.3g}"
+        return f"{x:.{digits}g}"
     if isinstance(x, list | tuple):
-        return "–".join(_cell(v) for v in x)
+        return "–".join(_cell(v, digits) for v in x)
     return str(x)
-
-
-def _tex(text: str) -> str:
-    for a, b in (("\\", r"\textbackslash "), ("_", r"\_"), ("%", r"\%"), ("&", r"\&"), ("#", r"\#")):
-        text = text.replace(a, b)
-    return text

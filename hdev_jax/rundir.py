@@ -31,7 +31,7 @@ try:
 except ImportError:  # Windows: two runs on one folder are not kept apart there
     fcntl = None
 
-__all__ = ["Run", "atomic_file", "config_digest", "open_run"]
+__all__ = ["Run", "atomic_file", "config_digest", "is_complete", "open_run"]
 
 _CONFIG, _ENVIRONMENT, _CHECKPOINTS, _DIGEST = "config.toml", "environment.json", ".checkpoints", "config_sha256"
 
@@ -84,6 +84,8 @@ def open_run(
     *,
     seed: int | None = None,
     command: Sequence[str] | None = None,
+    environment: Mapping[str, Any] | None = None,
+    replace: bool = False,
 ) -> Iterator[Run]:
     """A run in the folder `out`; when the block ends without an exception, `out` is there and complete.
 
@@ -98,7 +100,8 @@ def open_run(
     leaves nothing, as the same command would fail again.
 
     **Arguments:** `config` is everything that decides the result, fingerprints of the input files included; a None in
-    it is left out. `seed` and `command` (default `sys.argv`) are recorded in `environment.json`.
+    it is left out. `seed`, `command` (default `sys.argv`) and what is in `environment` are recorded in
+    `environment.json`. `replace`: a run of another configuration in `out` stays until this one takes its place.
 
     **Raises:** `InputError` where `out` holds something else, is in use by another process or cannot be written.
     """
@@ -110,7 +113,7 @@ def open_run(
     target = Path(os.path.realpath(out))
     partial = target.with_name(target.name + ".partial")
     try:
-        done = _is_done(target, digest, out)
+        done = _is_done(target, digest, out, replace)
         lock = None if done else _claim(partial, digest, out)
     except OSError as e:
         raise InputError(f"--out {out}: cannot be written ({e.strerror or e}); name a folder that you may write") from e
@@ -119,9 +122,9 @@ def open_run(
         return
     try:
         started = time.time()
-        environment = _environment(seed, list(sys.argv if command is None else command), started)
-        environment["resumed"] = (partial / _CHECKPOINTS).is_dir()
-        _write_text(partial / _ENVIRONMENT, json.dumps({**environment, "pid": os.getpid()}, indent=2) + "\n")
+        recorded = _environment(seed, list(sys.argv if command is None else command), started)
+        recorded |= {**(environment or {}), "resumed": (partial / _CHECKPOINTS).is_dir()}
+        _write_text(partial / _ENVIRONMENT, json.dumps({**recorded, "pid": os.getpid()}, indent=2) + "\n")
         head = {"hdev": {"version": version, _DIGEST: digest}}
         _write_text(partial / _CONFIG, tomli_w.dumps({**head, **plain}))
         try:
@@ -130,15 +133,23 @@ def open_run(
             shutil.rmtree(partial, ignore_errors=True)
             raise
         shutil.rmtree(partial / _CHECKPOINTS, ignore_errors=True)
-        environment |= {"seconds": round(time.time() - started, 3), "files": sorted(_files(partial))}
-        _write_text(partial / _ENVIRONMENT, json.dumps(environment, indent=2) + "\n")
+        recorded |= {"seconds": round(time.time() - started, 3), "files": sorted(_files(partial))}
+        _write_text(partial / _ENVIRONMENT, json.dumps(recorded, indent=2) + "\n")
         try:
+            if replace and _stamp(target / _CONFIG) is not None:
+                shutil.rmtree(target)
             os.replace(partial, target)
         except OSError as e:
             raise InputError(f"--out {out}: changed during the run ({e.strerror}); the result is in {partial}") from e
     finally:
         if lock is not None:
             os.close(lock)
+
+
+def is_complete(out: str | os.PathLike[str], config: Mapping[str, Any]) -> bool:
+    """Whether `out` holds the complete result of this configuration: `open_run` would have nothing to do."""
+    target = Path(os.path.realpath(out))
+    return _stamp(target / _CONFIG) == config_digest(_plain(config)) and _has_all(target)
 
 
 def config_digest(config: Mapping[str, Any], version: str | None = None) -> str:
@@ -222,7 +233,7 @@ def _clear(partial: Path, digest: str, shown: str | os.PathLike[str]) -> None:
         shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
 
 
-def _is_done(target: Path, digest: str, shown: str | os.PathLike[str]) -> bool:
+def _is_done(target: Path, digest: str, shown: str | os.PathLike[str], replace: bool) -> bool:
     """Whether `target` is the complete result of this configuration; False where it is absent or empty."""
     if target == Path.cwd() or target.parent == target:
         raise InputError(f"--out {shown}: is the current folder; name a new one in it, such as --out result")
@@ -235,15 +246,23 @@ def _is_done(target: Path, digest: str, shown: str | os.PathLike[str]) -> bool:
     found = _stamp(target / _CONFIG)
     if found is None:
         raise InputError(f"--out {shown}: holds other files; name a new or an empty folder")
+    if found == digest and _has_all(target):
+        return True
+    if replace:
+        return False
     if found != digest:
         raise InputError(
             f"--out {shown}: holds a run of another configuration (see its {_CONFIG}); name another folder or remove it"
         )
+    raise InputError(f"--out {shown}: holds this run, but files of it are missing; remove the folder to run it again")
+
+
+def _has_all(target: Path) -> bool:
+    """Whether every file is there that the run wrote."""
     with contextlib.suppress(OSError, ValueError, KeyError):
         files = json.loads((target / _ENVIRONMENT).read_text())["files"]
-        if all((target / f).exists() for f in files):
-            return True
-    raise InputError(f"--out {shown}: holds this run, but files of it are missing; remove the folder to run it again")
+        return all((target / f).exists() for f in files)
+    return False
 
 
 def _stamp(config: Path) -> str | None:

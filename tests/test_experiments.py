@@ -3,12 +3,17 @@
 import importlib
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from experiments.config import expanded, resolve, typed
-from experiments.engine import run_config, run_tasks
+from experiments import store
+from experiments.compute import Asked, Where, compute
+from experiments.config import CONFIGS, artefact, changes, every_config, expanded, listed, resolve, typed
+from experiments.data import MissingDataError
+from experiments.engine import run_config
+from experiments.log import Log
 from experiments.page import write_docs
 from experiments.planted import Config, exact, tasks
 from experiments.tables import wilson
@@ -60,6 +65,83 @@ def test_a_config_at_fault_is_one_line_with_its_place(tmp_path, text, sets, word
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("base", "delta", "sets", "words"),
+    [
+        ("", "[noise]\nscal = 1.0\n", [], ["delta.toml, key noise.scal:", "did you mean scale?", "known keys: scale"]),
+        ("count = 1.5\n", "by = 2.0\n", [], ["base.toml, key count:", "integer", "1.5"]),
+        ("count = 1\n", "count = 1.5\n", [], ["delta.toml, key count:"]),
+        ("count = 1\n", "", ["count=x"], ["--set 'count=x', key count:", "'x'"]),
+        ("count = 1\n", "[sweep]\ncount = [1, 1.5]\n", [], ["delta.toml, key count:", "1.5"]),
+        ("count = 1\n", "[sweep]\ncount = { first = 0 }\n", [], ["delta.toml, table sweep", "first = 0, count = 16"]),
+        ("count = 1\n", "", ["count.x=3"], ["--set 'count.x=3': count is no table"]),
+        ("count = 1\n", 'ablates = ["by"]\ncount = 2\n', [], ["key ablates: names by, but", "changes count"]),
+        ("count = 1\n", 'ablates = ["count"]\ncount = 1\n', [], ["key ablates: names count", "changes nothing"]),
+        ("count = 1\n", 'ablates = "count"\ncount = 2\n', [], ["key ablates: a list of the keys", "'count'"]),
+    ],
+)
+def test_a_fault_is_told_where_it_was_made(tmp_path, base, delta, sets, words):
+    write(tmp_path, "base.toml", f'experiment = "toy_studies.squares"\n{base}')
+    path = write(tmp_path, "delta.toml", f'extends = "base.toml"\n{delta}')
+    with pytest.raises(InputError) as caught:
+        run_config(path, sets, out=tmp_path / "out")
+    line = str(caught.value)
+    assert all(w in line for w in words), line
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_delta_changes(tmp_path):
+    write(tmp_path, "base.toml", "a = 1\n[t]\nb = 2\nc = [1, 2]\n[tiny]\na = 0\n")
+    write(tmp_path, "delta.toml", 'extends = "base.toml"\nablates = ["t.c", "t.d"]\na = 1\n[t]\nc = [3]\nd = "x"\n')
+    last = write(tmp_path, "last.toml", 'extends = "delta.toml"\n[tiny]\na = 3\n')
+    assert changes(tmp_path / "base.toml") == {}
+    assert changes(tmp_path / "delta.toml") == {"t.c": ([1, 2], [3]), "t.d": (None, "x")}
+    assert changes(last) == {}, "an ablation's own word is not handed down, and what is tiny is of tests"
+    assert resolve(last, tiny=True) == {"a": 3, "t": {"b": 2, "c": [3], "d": "x"}}
+    with pytest.raises(InputError, match="extends"):
+        resolve(write(tmp_path, "alone.toml", 'ablates = ["a"]\na = 1\n'))
+
+
+def test_every_ablation_changes_exactly_the_keys_it_names():
+    for path in CONFIGS.rglob("*.toml"):
+        named = tomllib.loads(path.read_text(encoding="utf-8")).get("ablates")
+        if named is not None:
+            assert set(changes(path)) == set(named), path
+
+
+def test_a_list_of_configs_is_in_the_order_of_numbers(tmp_path):
+    for name in ("table10", "table2", "fig4", "_base", "table2_wide"):
+        write(tmp_path, f"{name}.toml", "a = 1\n")
+    every = listed(write(tmp_path, "list.toml", 'configs = ["fig4.toml", "[!l]*.toml"]\n'))
+    assert [p.stem for p in every or []] == ["fig4", "table2", "table2_wide", "table10"]
+    assert listed(tmp_path / "fig4.toml") is None
+    with pytest.raises(InputError, match="no such config fig5"):
+        listed(write(tmp_path, "list.toml", 'configs = ["fig5.toml"]\n'))
+    assert listed(CONFIGS / "paper.toml") is not None
+    assert artefact(STUDIES / "planted.toml") == "studies/planted"
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    return tmp_path_factory.mktemp("kept")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", every_config(), ids=artefact)
+def test_every_config_runs_at_a_tiny_size(path, tmp_path, kept):
+    try:
+        runs = run_config(path, out=tmp_path / "out", kept=kept, tiny=True)
+    except MissingDataError as e:
+        pytest.skip(str(e))
+    assert all(r["rows"] for r in runs)
+    for folder in (Path(r["folder"]) for r in runs):
+        for kinds in (("tables", "md", "tex"), ("figures", "png", "pdf")):
+            one, other = ({p.stem for p in (folder / kinds[0]).glob(f"*.{end}")} for end in kinds[1:])
+            assert one == other, "each in both formats"
+        assert [*folder.glob("tables/*.tex"), *folder.glob("figures/*.pdf")]
+        assert (folder / "report.html").stat().st_size > 1000
+
+
 @pytest.mark.parametrize("path", sorted(STUDIES.glob("*.toml")), ids=lambda p: p.stem)
 def test_every_study_is_a_config(path):
     config = typed(Config, resolve(path), path)
@@ -94,8 +176,8 @@ def test_intervals_of_shares():
 
 
 @pytest.mark.slow
-def test_many_tasks_on_two_workers_come_back_in_order(tmp_path, monkeypatch):
-    """More tasks than a worker keeps its compiled programs for; an error of a task is the run's."""
+def test_many_tasks_on_two_workers_are_all_kept(tmp_path, monkeypatch):
+    """More tasks than a worker keeps its compiled programs for; an error of a task is the run's, and says of which."""
     write(
         tmp_path,
         "toy_experiment.py",
@@ -103,11 +185,13 @@ def test_many_tasks_on_two_workers_come_back_in_order(tmp_path, monkeypatch):
     )
     monkeypatch.syspath_prepend(tmp_path)
     toy = importlib.import_module("toy_experiment")
-    todo = [{"n": n, "by": 1} for n in range(90)]
-    found = list(run_tasks(toy, todo, workers=2, kept=tmp_path / "kept"))
-    assert [(t["n"], r["square"]) for t, r in found] == [(n, n * n) for n in range(90)]
-    with pytest.raises(ZeroDivisionError):
-        list(run_tasks(toy, [{"n": 1, "by": 0}, {"n": 2, "by": 0}], workers=2, kept=tmp_path / "kept"))
+    todo, kept, log = [{"n": n, "by": 1} for n in range(90)], tmp_path / "kept", Log(None)
+    assert compute([Asked("toy", toy, todo)], Where(workers=2), kept, log) == {}
+    assert [store.read(store.place(toy, t, kept))["result"]["square"] for t in todo] == [n * n for n in range(90)]
+    bad = [{"n": 1, "by": 0}, {"n": 2, "by": 0}]
+    failed = compute([Asked("toy", toy, bad)], Where(workers=2), kept, log)
+    assert isinstance(failed["toy"], ZeroDivisionError)
+    assert "in the task {" in failed["toy"].__notes__[-1]
 
 
 @pytest.mark.slow
@@ -139,9 +223,10 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     (part,) = run_config(STUDIES / "planted_quick.toml", sets, out=tmp_path / "c", kept=tmp_path / "kept", fresh=False)
     assert part["logs"] == 1, "the first log is the same one, whatever comes after it"
     assert part["tasks_left_out"] == 4
-    write_docs(tmp_path / "docs", "planted", [tmp_path / "c"])
+    write_docs(tmp_path / "docs", STUDIES / "planted.toml", [tmp_path / "c"], sets)
     page = (tmp_path / "docs" / "planted.md").read_text()
     assert "1 logs, all synthetic" in page
     assert "4 more are in the config" in page
+    assert "planted.toml --set cases.single.logs=3 --set" in page
     for name in re.findall(r"\]\((figures/[^)]*)\)", page):
         assert (tmp_path / "docs" / name).stat().st_size > 200

@@ -1,0 +1,76 @@
+"""A run's metrics: what they must hold, and the paper's numbers beside ours."""
+
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any
+
+__all__ = ["check", "comparison", "numbers", "told"]
+
+KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
+
+
+def check(metrics: Mapping[str, Any]) -> None:
+    """**Raises:** `ValueError` where an experiment's metrics are not what every reader of `metrics.json` relies on."""
+    if missing := [k for k in KEYS if k not in metrics]:
+        raise ValueError(f"metrics lack {', '.join(missing)}")
+    for i, row in enumerate(metrics["rows"]):
+        if missing := [k for k in ("name", "paper", "ours") if k not in row]:
+            raise ValueError(f"rows[{i}] of the metrics lacks {', '.join(missing)}")
+        if row["ours"] is None and not row.get("reason"):
+            raise ValueError(f"rows[{i}] of the metrics, {row['name']}: ours is null without a reason")
+
+
+def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A line for each number that the paper has: `name, quantity, paper, ours, ratio, why_not`.
+
+    `ratio` is ours over the paper's, None where either is none or the paper's is 0; `why_not`, the reason where we have
+    no number.
+    """
+    lines = []
+    for row in metrics["rows"]:
+        ours = row["ours"] or {}
+        for quantity, paper in (row["paper"] or {}).items():
+            if _number(paper) is not None:
+                own = _number(ours.get(quantity))
+                ratio = own / paper if own is not None and paper else None
+                reason = None if own is not None else row.get("reason", "not computed")
+                lines.append(
+                    {
+                        "name": row["name"],
+                        "quantity": quantity,
+                        "paper": paper,
+                        "ours": own,
+                        "ratio": ratio,
+                        "why_not": reason,
+                    }
+                )
+    return lines
+
+
+def _number(x: Any) -> float | None:
+    return float(x) if isinstance(x, Real) and not isinstance(x, bool) else None
+
+
+def told(metrics: Mapping[str, Any]) -> list[str]:
+    """What a page says of a run before its tables: how much there is in it, what is missing, how it compares."""
+    said = []
+    if "logs" in metrics:
+        said.append(f"{metrics['logs']} logs{', all synthetic' if metrics['synthetic'] else ''}.")
+    elif metrics["synthetic"]:
+        said.append("Synthetic data.")
+    if metrics["tasks_left_out"]:
+        said.append(f"{metrics['tasks_left_out']} more are in the config and were not run.")
+    if metrics.get("tasks_in_one_program"):
+        said.append(f"{metrics['tasks_in_one_program']} of its tasks ran side by side in one program (vmap).")
+    if metrics.get("skipped"):
+        said.append(f"{len(metrics['skipped'])} could not be made as asked for.")
+    if metrics.get("missed"):
+        said.append(f"Short of what is wanted: {'; '.join(metrics['missed'])}.")
+    if metrics["of"]:
+        said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
+    return said
+
+
+def numbers(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The quantities that our side of the rows has, in the order in which they come."""
+    return list(dict.fromkeys(k for r in rows for k, v in (r["ours"] or {}).items() if _number(v) is not None))

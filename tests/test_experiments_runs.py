@@ -1,0 +1,203 @@
+"""Runs of the engine: what their folders hold, done once, resumed, shared; sweeps as tables; lists on one page."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from toy_studies import squares
+
+from experiments import store
+from experiments.__main__ import main
+from experiments.compare import check, comparison
+from experiments.engine import run_config
+from experiments.tables import read_markdown
+from hdev_jax.errors import InputError
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def config(tmp_path):
+    """A config of the toy study whose tasks leave a file in `diary/` when they run."""
+    (tmp_path / "diary").mkdir()
+    path = tmp_path / "toy.toml"
+    diary = json.dumps(str(tmp_path / "diary"))
+    path.write_text(f'experiment = "toy_studies.squares"\ncount = 4\ndiary = {diary}\n[tiny]\ncount = 1\n')
+    return path
+
+
+def ran(folder: Path) -> list[str]:
+    """The numbers whose tasks ran since the last call."""
+    return sorted((p.name.partition("-")[0], p.unlink())[0] for p in (folder / "diary").iterdir())
+
+
+def test_a_runs_folder_holds_everything_and_is_not_made_again(tmp_path, config):
+    out = tmp_path / "run"
+    (first,) = run_config(config, out=out)
+    assert ran(tmp_path) == ["0", "1", "2", "3"]
+    names = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    tables, figures = {f"tables/squares.{e}" for e in ("md", "tex")}, {f"figures/squares.{e}" for e in ("png", "pdf")}
+    files = {"config.toml", "environment.json", "metrics.json", "report.html", "log.txt"}
+    assert names == files | tables | figures
+    environment = json.loads((out / "environment.json").read_text())
+    assert {"commit", "workers", "seed", "packages", "python", "command"} <= set(environment)
+    assert "4 tasks, 0 done before" in (out / "log.txt").read_text()
+    assert read_markdown(out / "tables" / "squares.md")[0] == "Squares of numbers | and what divides them."
+    assert "1 of 1" in (out / "report.html").read_text()
+    assert run_config(config, out=out) == [first]
+    assert ran(tmp_path) == []
+    (again,) = run_config(out / "config.toml", out=tmp_path / "again")
+    assert again["rows"] == first["rows"], "what a run resolved is a config"
+    with pytest.raises(InputError, match="another configuration"):
+        run_config(config, ["by=2.0"], out=out)
+
+
+def test_what_was_killed_resumes(tmp_path, config, monkeypatch):
+    real = squares.run
+
+    def stopped(task):
+        if task["n"] == 2:
+            raise KeyboardInterrupt
+        return real(task)
+
+    monkeypatch.setattr(squares, "run", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_config(config, out=tmp_path / "run")
+    assert ran(tmp_path) == ["0", "1"]
+    monkeypatch.setattr(squares, "run", real)
+    (metrics,) = run_config(config, out=tmp_path / "run")
+    assert ran(tmp_path) == ["2", "3"]
+    assert metrics["rows"][0]["ours"]["total"] == 14.0
+    log = (tmp_path / "run" / "log.txt").read_text()
+    assert "4 tasks, 0 done before" in log
+    assert "4 tasks, 2 done before" in log
+
+
+def test_two_sweeps_share_what_they_share_and_each_is_a_table(tmp_path, config):
+    out, kept = tmp_path / "sweep", tmp_path / "kept"
+    found = run_config(config, ["sweep.by=[1.0, 2.0]", "sweep.seed={ first = 0, count = 3 }"], out=out, kept=kept)
+    assert len(ran(tmp_path)) == 4, "one process leaves one file for each number"
+    assert len(list(kept.rglob("*.json"))) == 6 * 4
+    assert [r["sweep"] for r in found] == [{"by": b, "seed": s} for b in (1.0, 2.0) for s in (0, 1, 2)]
+    assert json.loads((out / "sweep.json").read_text()) == found
+    lines = (out / "sweep.md").read_text().splitlines()
+    assert "| by | seed | name | total |" in lines
+    assert "| 2 | 0 | sum | 7 |" in lines
+    assert "| 2 | sum | 3 | 7 ± 0 |" in lines, "over the seeds"
+    assert r"\pm" in (out / "sweep.tex").read_text()
+    assert Path(found[0]["folder"]).name in (out / "report.html").read_text()
+    (tmp_path / "diary" / "mark").touch()
+    run_config(config, ["sweep.by=[2.0, 3.0]"], out=tmp_path / "other", kept=kept)
+    assert ran(tmp_path) == ["0", "1", "2", "3", "mark"]
+    assert len(list(kept.rglob("*.json"))) == 7 * 4, "by = 2, seed = 0 was there"
+    assert run_config(config, ["sweep.by=[2.0]"], out=out)[0]["folder"] not in {r["folder"] for r in found[:3]}
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").touch()
+    with pytest.raises(InputError, match="holds other files"):
+        run_config(config, ["sweep.by=[2.0]"], out=tmp_path / "full")
+
+
+def test_tasks_that_run_together_are_kept_alone(tmp_path, config):
+    (metrics,) = run_config(config, ["together=true"], out=tmp_path / "a", kept=tmp_path / "kept")
+    assert metrics["beside"] == 4
+    assert metrics["tasks_in_one_program"] == 4
+    assert "4 tasks in one program" in (tmp_path / "a" / "log.txt").read_text()
+    assert "ran side by side in one program" in (tmp_path / "a" / "report.html").read_text()
+    (more,) = run_config(config, ["together=true", "count=6"], out=tmp_path / "b", kept=tmp_path / "kept")
+    assert more["rows"][0]["ours"]["total"] == 55.0
+    assert len(list((tmp_path / "kept").rglob("*.json"))) == 6
+
+
+def test_tasks_that_measure_time_run_last_and_here(tmp_path, config):
+    (metrics,) = run_config(config, ["alone=[0, 2]"], out=tmp_path / "run", workers=2)
+    files = sorted((tmp_path / "diary").iterdir(), key=lambda p: p.stat().st_mtime_ns)
+    assert [p.name for p in files[2:]] == [f"0-{os.getpid()}", f"2-{os.getpid()}"]
+    assert not any(p.name.endswith(f"-{os.getpid()}") for p in files[:2])
+    assert metrics["rows"][0]["ours"]["total"] == 14.0
+
+
+def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path, config, capsys, monkeypatch):
+    monkeypatch.setenv("HDEV_DATA", str(tmp_path / "nowhere"))
+    (tmp_path / "toy2.toml").write_text('extends = "toy.toml"\nablates = ["by"]\nby = 2.0\n')
+    (tmp_path / "toy10.toml").write_text('extends = "toy.toml"\nby = 0.0\n')
+    (tmp_path / "data.toml").write_text('extends = "toy.toml"\nneeds = "kia_niro"\n')
+    (tmp_path / "data2.toml").write_text('extends = "data.toml"\nby = 3.0\n')
+    (tmp_path / "_base.toml").write_text("count = 3\n")
+    (tmp_path / "list.toml").write_text('configs = ["data*.toml", "toy*.toml", "_*.toml", "none*.toml"]\n')
+    command = [str(tmp_path / "list.toml"), "--out", str(tmp_path / "out")]
+    assert main(command) == 1, "a division by zero is our fault"
+    assert ran(tmp_path) == ["0", "1", "2", "3"]
+    told = capsys.readouterr()
+    assert "2 of 5 configs" in told.out
+    assert [line.split()[:5] for line in told.out.splitlines() if " sum " in line] == [
+        ["toy", "sum", "total", "10", "14"],
+        ["toy2", "sum", "total", "10", "7"],
+    ]
+    why = [line for line in told.err.splitlines() if line.startswith("experiments:")]
+    assert len(why) == 2, "one line for each reason"
+    assert why[0].startswith("experiments: data, data2: no measured data in")
+    assert all(w in why[0] for w in ("github.com/FMLabSouthampton", "set HDEV_DATA", "nowhere"))
+    assert why[1] == "experiments: toy10: ZeroDivisionError: float division by zero"
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert page.count("<img") == 2
+    assert "not in the public data" in page
+    assert "by = 2.0 (not there)" in page
+    assert "Not made: data, data2: no measured data" in page
+    (tmp_path / "toy10.toml").unlink()
+    assert main(command) == 2, "the data is not there"
+    assert ran(tmp_path) == []
+    config.write_text(config.read_text().replace("count = 4", "count = 5"))
+    assert main(command) == 2
+    assert ran(tmp_path) == ["4"], "a run of an older config gives way, and its tasks are kept"
+
+
+def test_the_list_of_the_papers_runs_as_it_is(tmp_path, capsys):
+    """Tiny, whatever of it is there; without any config it is an empty page."""
+    (tmp_path / "list.toml").write_text('configs = ["paper*/*.toml"]\n')
+    assert main([str(tmp_path / "list.toml"), "--out", str(tmp_path / "out")]) == 0
+    assert "0 of 0 configs" in capsys.readouterr().out
+    assert "No config of the list has been run" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_no_data_is_one_line_that_says_what_to_do(tmp_path, config, capsys, monkeypatch):
+    monkeypatch.setenv("HDEV_DATA", str(tmp_path))
+    assert main([str(config), "--set", "needs=kia_niro", "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(w in line for w in ("no measured data", "github.com/FMLabSouthampton", "HDEV_DATA"))
+
+
+def test_metrics_are_checked():
+    row = {"name": "a", "paper": {"rmse": 2.0, "text": "x", "pe": 1.0}, "ours": {"rmse": 1.0, "free_run": True}}
+    good = {"artefact": "a", "data": "d", "synthetic": False, "better_than_paper": 0, "of": 0, "rows": [row],
+            "seconds": 1.0, "tasks_left_out": 0}  # fmt: skip
+    check(good)
+    lines = comparison(good)
+    assert [(x["quantity"], x["ratio"], x["why_not"]) for x in lines] == [
+        ("rmse", 0.5, None), ("pe", None, "not computed"),
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match="lack data"):
+        check({k: v for k, v in good.items() if k != "data"})
+    with pytest.raises(ValueError, match="null without a reason"):
+        check({**good, "rows": [{**row, "ours": None}]})
+
+
+@pytest.mark.parametrize("name", store.experiments_here())
+def test_what_a_task_depends_on_is_what_its_modules_load(name):
+    """Every file of the package that importing the sources loads is in the fingerprint; none that they do not name."""
+    module = importlib.import_module(f"experiments.{name}")
+    starts = [store.HERE / source for source in module.SOURCES]
+    files = {store._name(p) for p in store.reached(starts, experiments=True)}
+    code = "import sys, importlib; importlib.import_module(sys.argv[1]); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code, f"experiments.{name}"], cwd=ROOT, capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    loaded = {m for m in done.stdout.split() if m.startswith(("hdev_jax.", "experiments."))}
+    reached = {f.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for f in files}
+    assert loaded <= reached
+    tasks_need = {store._name(p) for p in store.reached(starts, experiments=False)}
+    assert not tasks_need & {"hdev_jax/cli.py", "hdev_jax/demo.py", "experiments/page.py"}
