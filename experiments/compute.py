@@ -90,9 +90,10 @@ def compute(
                     break
                 continue
             results, seconds = outcome
+            at_once = len(group) if hasattr(group[0].module, "run_together") else 1
             for t, result in zip(group, results, strict=True):
-                store.keep(t.at, t.task, result, seconds / len(group), len(group))
-            how = f", {len(group)} tasks in one program" if len(group) > 1 else ""
+                store.keep(t.at, t.task, result, seconds / len(group), at_once)
+            how = f", {len(group)} tasks {'in one program' if at_once > 1 else 'in turn'}" if len(group) > 1 else ""
             log.say(f"{ids}: {seconds:.2f} s{how}", shown=False)
     return failed
 

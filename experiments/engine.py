@@ -7,8 +7,9 @@ An experiment is a module with
 - `run(task)`: plain values;
 - `collect(config, results, run)`: writes tables and figures into the run's folder and returns its metrics;
 - `SOURCES`: the files beside it, by name, that a task's result depends on;
-- if it likes, `together(task)` and `run_together(tasks)`: tasks of the same key (None: none) are run in one call, for
-  small models that are faster in one program by `vmap`. A task's result is kept under the task alone, either way;
+- if it likes, `together(task)`: tasks of the same key (None: none) are one job, run one after another in one process,
+  where they share what it compiled; or with `run_together(tasks)` in one call, for small models that are faster in one
+  program by `vmap`. A task's result is kept under the task alone, either way;
 - if it likes, `alone(task)`: true for a task that measures time. Those run last, one by one, in this process.
 
 What is done is not done again, what was killed resumes, and two runs share what they share: a task's result is kept

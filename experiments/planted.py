@@ -26,7 +26,7 @@ from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, at_null
 
-__all__ = ["SOURCES", "Case", "Config", "collect", "exact", "run", "tasks"]
+__all__ = ["SOURCES", "Case", "Config", "collect", "exact", "run", "tasks", "together"]
 
 SOURCES = ("planted.py", "rivals.py")  # that a log's result depends on, beside the package
 
@@ -78,26 +78,25 @@ class Config(Strict):
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
-    """One for each log. A log's seed counts on through the whole study, so that no two share their noise.
-
-    The first log of every setting comes first, then the second of each: a study that is stopped is a smaller study.
-    """
-    seed, every = config.seed, []
+    """One for each log. A log's seed counts on through the whole study, so that no two share their noise."""
+    seed = config.seed
     for key, case in config.cases.items():
         sets = config.sets[case.effects] if isinstance(case.effects, str) else case.effects
         for effects, size, trips, noise in product(sets, case.sizes, case.trips, case.noises):
-            for k in range(case.logs):
+            for _ in range(case.logs):
                 seed += 1
                 if config.only and key not in config.only:
                     continue
-                task = {
+                yield {
                     "case": case.name, "effects": effects, "size": size, "trips": trips, "noise": noise,
                     "seed": seed - 1, "rows_per_trip": case.rows_per_trip, "entry": case.entry, "mode": case.mode,
                     "ar_coefficient": config.ar_coefficient, "fdr": config.fdr, "rivals": config.rivals,
                 }  # fmt: skip
-                every.append((k, task))
-    for _, task in sorted(every, key=lambda e: e[0]):
-        yield task
+
+
+def together(task: dict[str, Any]) -> str:
+    """Logs of the same effects, whose programs are the same; of logs with nothing planted, those of the same noise."""
+    return "+".join((task["entry"], *(task["effects"] or (task["noise"], str(task["trips"])))))
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:

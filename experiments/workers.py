@@ -23,7 +23,7 @@ from hdev_jax import progress
 
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
-FORGET_EVERY = 40  # jobs: a process that compiles for ever runs out of memory maps
+FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
 PATIENCE = 30  # seconds for a scheduler to answer
 
 Job = tuple[str, list[dict[str, Any]]]
@@ -39,13 +39,18 @@ _one_at_a_time = threading.Lock()
 
 
 def call(job: Job) -> tuple[list[Any], float]:
-    """Run a job here: `run(task)`, or `run_together(tasks)` where there are several."""
+    """Run a job here: `run(task)`, or where there are several `run_together(tasks)`, if the experiment has that."""
     module, tasks = importlib.import_module(job[0]), job[1]
+
     # only where JAX is in use: an experiment may do without
-    if next(_calls) % FORGET_EVERY == 0 and (jax := sys.modules.get("jax")) is not None:
-        jax.clear_caches()
+    def run(task: dict[str, Any]) -> Any:
+        if next(_calls) % FORGET_EVERY == 0 and (jax := sys.modules.get("jax")) is not None:
+            jax.clear_caches()
+        return module.run(task)
+
     started = time.perf_counter()
-    results = [module.run(tasks[0])] if len(tasks) == 1 else module.run_together(tasks)
+    at_once = len(tasks) > 1 and hasattr(module, "run_together")
+    results = module.run_together(tasks) if at_once else [run(t) for t in tasks]
     if len(results) != len(tasks):
         raise ValueError(f"{job[0]}.run_together gave {len(results)} results for {len(tasks)} tasks")
     return results, time.perf_counter() - started
