@@ -61,16 +61,17 @@ def _case(config: "Config", task: dict[str, Any]) -> "Case":
 
 def _row(config: "Config", setting: str, group: list) -> dict[str, Any]:
     """What the table says of one setting, ours first."""
-    first = group[0][0]
-    n, planted = len(group), bool(first["effects"])
+    one = group[0][0]
+    n, planted = len(group), bool(one["effects"])
     in_library = all(k in LIBRARY for t, _ in group for k in t["effects"])
     exactly = sum(r["exact"] for _, r in group)
+    first = sum(r["exact"] and {x["id"] for x in r["named"]} == set(t["effects"]) for t, r in group)
     alone = sum(r["exact"] and all(len(x["class"]) == 1 for x in r["named"]) for _, r in group)
     false = sum(any(not set(x["class"]) & set(t["effects"]) for x in r["named"]) for t, r in group)
     pairs = [s for _, r in group for s in r["sizes"]]
     z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
     ratio = np.array([r["test_rmse"]["after"] / r["oracle_rmse"] for _, r in group if r["oracle_rmse"]])
-    case = _case(config, first)
+    case = _case(config, one)
     absorbed = sum(set(t["effects"]) <= set(r["absorbed"]) and not r["named"] for t, r in group)
     unexplained = sum(r["unexplained"] for _, r in group)
     named = planted and in_library and not case.absorbed
@@ -85,6 +86,7 @@ def _row(config: "Config", setting: str, group: list) -> dict[str, Any]:
         "wanted": case.wanted,
         "met": all(enough) if case.wanted is not None else None,
         "named_exactly": exactly / n if named else None,
+        "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,
         "something_false": false / n,
         "called_absorbed": absorbed / n if case.absorbed else None,

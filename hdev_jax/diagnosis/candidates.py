@@ -178,17 +178,19 @@ class Plan:
 
 
 def plan_of(
-    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: Target, grids: Grids | None = None
-) -> Plan:
+    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: Target, grids: Grids | None = None,
+    *, searched: bool = False,
+) -> Plan:  # fmt: skip
     """Every candidate that a log of these facts allows beside what the vehicle has.
 
     Effects of one row share a vehicle, a few with all of them at their null value, so that one compiled `jvp` serves
-    them all; what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name.
+    them all; what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name;
+    `searched` takes effects that are looked for otherwise too.
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []
     for c in effects:
-        if vehicle.has(c.id) or c.searched:
+        if vehicle.has(c.id) or (c.searched and not searched):
             continue
         if why := unavailable(c, facts.sample, vehicle.entry):
             left_out[c.id] = why

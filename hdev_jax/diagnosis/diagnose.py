@@ -24,7 +24,8 @@ from hdev_jax.physics.across import distance_since_start
 
 __all__ = ["Diagnosis", "diagnose"]
 
-MOST_SHADOWS = 2
+MOST_SHADOWS = 4
+SECONDS_PER_WH_OF_A_KW = 3.6
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 
@@ -143,15 +144,18 @@ def _described(
 def _shadow(
     problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, left: Remainder
 ) -> str | None:
-    """A found effect that reads no channel and explains less than the structure that is left: the mean of a cause
-    that the library does not hold is a constant load, but naming it so would be wrong."""
+    """A found effect that explains less than the structure that is left, and may be no more than its mean.
+
+    The mean of a cause that the library does not hold is a constant load, its mean in each trip looks like something
+    that differs between trips; naming it so would be wrong.
+    """
     if not left.significant:
         return None
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
-        reads_nothing = effect.id == "power_gain" or (effect.stage == "battery" and not effect.needs)
-        if reads_nothing and max(mse[k] - mse[k + 1], 0.0) < left.rms**2:
+        mean_of_it = f.between or effect.id == "power_gain" or (effect.stage == "battery" and not effect.needs)
+        if mean_of_it and max(mse[k] - mse[k + 1], 0.0) < left.mean**2:
             return f.id
     return None
 
@@ -212,10 +216,11 @@ def _remainder(
     def side(trips: Sequence[int]) -> Rows:
         at = problem.rows(trips)
         segments = problem.segments.take(at)
-        residual = (problem.measured - predicted)[at]
-        return Rows(
-            features[at], residual, cluster_rows(segments), np.asarray(segments.trip), np.asarray(segments.duration_s)
-        )
+        residual, seconds = (problem.measured - predicted)[at], np.asarray(segments.duration_s)
+        energy = problem.target == "energy_wh"  # a load in kW, whatever the rows' lengths
+        worth, unit = (seconds / SECONDS_PER_WH_OF_A_KW, "kW") if energy else (np.ones(len(seconds)), problem.unit)
+        trip = np.asarray(segments.trip)
+        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit)
 
     trip_names = problem.log.trip_names
     return remainder(side(split.train), side(split.test), names, problem.unit, trip_names, seed=seed, tell=tell)

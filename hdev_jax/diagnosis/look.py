@@ -41,7 +41,7 @@ LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chanc
 
 @dataclass(frozen=True)
 class Found:
-    """An effect that was added, and on what evidence."""
+    """An effect that was added, and on what evidence. `between`: it hardly changes inside a trip."""
 
     id: str
     score: Score
@@ -49,6 +49,7 @@ class Found:
     stability: float
     twins: tuple[str, ...]
     gain: float
+    between: bool = False
 
 
 @dataclass(frozen=True)
@@ -149,11 +150,16 @@ class View:
             if state.vehicle.has(id_):
                 continue
             why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
-            between = bool(self.slow[list(s.candidate.columns)].all())
-            out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, self._needed(s, fdr), between))
+            out.append(
+                Verdict(id_, float(s.gain), float(self.q[id_]), why, self._needed(s, fdr), self.between(s.candidate))
+            )
         out += [v for v in self.sought if not state.vehicle.has(v.id)]
         out += [Verdict(id_, None, 1.0, f"not tried: {why}") for id_, why in self.left_out.items()]
         return out
+
+    def between(self, candidate: Candidate) -> bool:
+        """Whether its columns hardly change inside a trip, so that only trips can tell it."""
+        return bool(self.slow[list(candidate.columns)].all())
 
     def _needed(self, s: Score, fdr: float) -> int | None:
         """Clusters that would do for a candidate that looks right but is not told from chance by those there are."""

@@ -10,6 +10,7 @@ from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import CLOSE, LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
+from hdev_jax.diagnosis.modes import add_mode
 from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
@@ -74,8 +75,10 @@ def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) 
         choice = choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
     if choice is None and step <= MOST_EFFECTS:
         # last: what misses an effect that comes and goes with the traffic is not noise, and may have cycles
-        choice, why = add_cycle(problem, state)
-        view.sought += [why] if why is not None else []
+        for add in (add_cycle, add_mode):
+            if choice is None:
+                choice, why = add(problem, state)
+                view.sought += [why] if why is not None else []
     if choice is None:
         grown = grow(problem, state, tell)
         return replace(grown or state, verdicts=view.verdicts(state, problem.fdr), finished=grown is None)
@@ -136,7 +139,7 @@ def choose(
                 view.reasons[c.id] = f"comes first in only {100 * stability:.0f} % of resampled sets of trips"
                 tell(f"turned down {c.id}: {view.reasons[c.id]}")
                 continue
-            found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain))
+            found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain), view.between(c))
             return replace(new, found=[*state.found, found])
     return None
 

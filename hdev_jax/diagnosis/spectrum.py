@@ -1,11 +1,11 @@
 """The strongest cycle of a residual, whatever its phase in each trip, and whether noise could have made it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import stats
+from scipy import special, stats
 
 from hdev_jax.diagnosis.whiten import Noise, whiten
 from hdev_jax.segments import trip_slices
@@ -15,13 +15,12 @@ __all__ = ["Clocked", "Period", "strongest_period"]
 LONGEST_S = 32_768.0  # of a window in rows' median durations: a cycle that keeps in step longer is seen by half of it
 CYCLES = 3.0  # least number in a window
 SAMPLES = 4.0  # least number in a cycle
-SIDE = 24  # independent frequencies on either side that say how high the noise stands there
 LEAST_RATIO = 1.5  # of a peak to the noise around it
 
 
 @dataclass(frozen=True)
 class Period:
-    """A peak of the spectrum: its period [s], its amplitude in the residual's unit, and p over all frequencies."""
+    """A peak of the spectrum: its period [s], its amplitude in units of `worth`, and p over all frequencies."""
 
     period_s: float
     amplitude: float
@@ -42,10 +41,13 @@ class Clocked:
     noise: Noise
 
     @classmethod
-    def of(cls, trip: Int[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"], noise: Noise) -> "Clocked":
+    def of(
+        cls, trip: Int[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"], worth: Float[np.ndarray, " row"],
+        noise: Noise,
+    ) -> "Clocked":  # fmt: skip
         """Rows whose clock is the sum of the durations before them."""
         clock = np.concatenate([np.cumsum(duration_s[s]) - 0.5 * duration_s[s] for _, s in trip_slices(trip)])
-        return cls(clock, duration_s, trip, np.ones(len(trip)), noise)
+        return cls(clock, duration_s, trip, worth, noise)
 
     @property
     def slices(self) -> list[slice]:
@@ -66,8 +68,13 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
 
     Periodograms of the whitened residual in windows of equal length, added up whatever the phase (Bartlett 1948): at
     each frequency a sum of as many exponential variables as there are windows, times the level of the noise there,
-    which is the median of its neighbours and no less than 1.
+    which its neighbours tell: the noise as estimated has the cycle in it, and is too high there.
     """
+    # An autoregression of a higher order predicts a strong cycle, and would take it out; so would levels of trips and
+    # of blocks a slow one. What one coefficient leaves of the noise's colour is smooth.
+    noise = rows.noise
+    first = {"coefficients": noise.coefficients[:2, :1], "scales": noise.scales[:2]}
+    rows = replace(rows, noise=replace(noise, **first, level_sd=0.0, block_sd=0.0))
     seconds = [float(np.sum(rows.duration_s[s])) for s in rows.slices]
     step = float(np.median(rows.duration_s))
     window = min(float(np.median(seconds)), LONGEST_S * step)
@@ -81,8 +88,9 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
     pieces = [w for s in rows.slices for w in _windows(rows.clock_s, s, window)]
     for piece in pieces:
         clock = rows.clock_s[piece] - rows.clock_s[piece.start]
-        even = np.bincount((clock / step).astype(int), white[piece], minlength=size)[:size]
-        power += np.abs(np.fft.rfft(even)) ** 2 / (piece.stop - piece.start)
+        weight = rows.worth[piece]
+        even = np.bincount((clock / step).astype(int), white[piece] * weight, minlength=size)[:size]
+        power += np.abs(np.fft.rfft(even)) ** 2 / float(weight @ weight)
         count += 1
     if count < 2:
         return None
@@ -91,10 +99,11 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
     if not len(inside):
         return None
     per = round(size * step / window)  # points of the grid to an independent frequency
-    level = np.array([_level(power, int(k), per, count) for k in inside])
-    k = int(inside[np.argmax(power[inside] / level)])
-    ratio = float(np.max(power[inside] / level)) / count
-    p = float(stats.gamma.sf(ratio * count, count)) * len(inside) / per if ratio >= LEAST_RATIO else 1.0
+    heights = power[inside] / np.array([_floor(power, int(k), per, count) for k in inside])
+    k, height = int(inside[np.argmax(heights)]), float(np.max(heights))
+    p = float(stats.gamma.sf(height, count)) * len(inside) / per if height >= LEAST_RATIO * count else 1.0
+    near = inside[np.abs(inside - k) <= 2 * per]  # a strong peak lifts the floor beneath itself least at its feet
+    k = int(near[np.argmax(power[near])])
     period, amplitude = _refined(residual, rows, pieces, float(frequency[k]), 1 / (size * step))
     return Period(period, amplitude, min(p, 1.0))
 
@@ -108,11 +117,21 @@ def _windows(clock: np.ndarray, trip: slice, window: float) -> list[slice]:
     return [p for p in parts if p.stop - p.start > 8 and clock[p.stop - 1] - clock[p.start] > 0.45 * window]
 
 
-def _level(power: np.ndarray, k: int, per: int, count: int) -> float:
-    """How high white noise of variance 1 stands at a frequency, by the median of those around it; at least 1."""
-    low, high = max(per, k - SIDE * per), min(len(power), k + SIDE * per + 1)
-    near = np.r_[power[low : max(k - 2 * per, low)], power[min(k + 2 * per + 1, high) : high]]
-    return max(1.0, float(np.median(near)) / float(stats.gamma.median(count))) if len(near) > SIDE else 1.0
+def _floor(power: np.ndarray, k: int, per: int, count: int) -> float:
+    """How high the noise stands at a place of the grid, two standard errors up, by independent frequencies around it.
+
+    A smooth spectrum, falling as a power of frequency at most: its logarithm is linear in that of frequency. The
+    logarithm of a sum of `count` exponential variables is digamma(count) on the average.
+    """
+    wide = max(6, k // per // 3)
+    near = np.r_[np.arange(-wide, -1), np.arange(2, wide + 1)] * per + k
+    near = near[(near >= 2 * per) & (near < len(power))]
+    x = np.log(near)
+    design = np.stack([x - x.mean(), np.ones(len(x))], axis=1)
+    line = np.linalg.lstsq(design, np.log(power[near] + 1e-300) - float(special.digamma(count)), rcond=None)[0]
+    at = np.array([np.log(k) - x.mean(), 1.0])
+    se = float(np.sqrt(special.polygamma(1, count) * at @ np.linalg.inv(design.T @ design) @ at))
+    return float(np.exp(line @ at + 2.0 * se))
 
 
 def _refined(
@@ -123,7 +142,7 @@ def _refined(
     best = (-1.0, 0.0, 0.0)
     for f in frequency + width * np.linspace(-1, 1, 9):
         angle = 2 * np.pi * f * rows.clock_s
-        columns = rows.whitened(np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        columns = rows.whitened(rows.worth[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
         gain, square = 0.0, []
         for s in pieces:
             x = np.linalg.lstsq(columns[s], white[s], rcond=None)[0]

@@ -30,6 +30,7 @@ class Remainder:
     depends_on: tuple[str, ...]
     signature: str
     rms: float  # of the structure seen, in the target's unit; 0 where none is
+    mean: float  # rms of what it may add on the average, which something else may have been named for
     correction: Float[np.ndarray, " test"]
     expression: str | None = None
 
@@ -42,19 +43,24 @@ class Remainder:
         start, between = (self.signature.rstrip("."), "; ") if self.significant else ("What is left", ": ")
         return replace(
             self, significant=True, depends_on=tuple(dict.fromkeys((*channels, *self.depends_on))),
-            signature=f"{start}{between}{words}.", rms=max(self.rms, rms), expression=formula,
+            signature=f"{start}{between}{words}.", rms=max(self.rms, rms), mean=max(self.mean, rms), expression=formula,
         )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Features, residual (measured − predicted), trips and clock of one side of the split."""
+    """Features, residual (measured − predicted), trips and clock of one side of the split.
+
+    `worth` is what a constant power (or force) of one `cycle_unit` is in each row's unit.
+    """
 
     features: Float[np.ndarray, "row feature"]
     residual: Float[np.ndarray, " row"]
     clusters: Clusters
     trip: np.ndarray
     duration_s: np.ndarray
+    worth: np.ndarray
+    cycle_unit: str
 
 
 def remainder(
@@ -78,17 +84,19 @@ def remainder(
     period = _period(train, noise)
     steps = _change_point(white, train.trip)
     level = _levels(train, noise)
-    parts, depends, sizes = [], [], [0.0]
+    parts, depends, sizes, means = [], [], [0.0], [0.0]
     if learned:
         sizes.append(float(np.sqrt(share * np.mean(test.residual**2))))
         depends += list(order)
         parts.append(f"{100 * share:.0f} % of it follows {', '.join(order)} in a way the library does not hold")
     if period is not None:
         seconds, amplitude = period
-        sizes.append(amplitude / np.sqrt(2.0))
+        sizes.append(_rms(train, amplitude))
+        # a load that goes up and down from nothing: its mean is up to twice its first harmonic
+        means.append(2.0 * np.sqrt(2.0) * sizes[-1])
         depends.append("time_s")
         clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
-        parts.append(f"a {clock} cycle of about {amplitude:.3g} {unit}")
+        parts.append(f"a {clock} cycle of about {amplitude:.3g} {train.cycle_unit}")
     if steps is not None:
         where, minutes = steps
         depends.append("time_s")
@@ -103,7 +111,9 @@ def remainder(
     rmse = float(np.sqrt(np.mean(test.residual**2)))
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
-    return Remainder(bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", max(sizes), correction)
+    rms, mean = max(sizes), max(*sizes, *means)
+    depends_on = tuple(dict.fromkeys(depends))
+    return Remainder(bool(parts), share, floor, depends_on, signature + ".", rms, mean, correction)
 
 
 def _colour(noise: Noise) -> str:
@@ -119,7 +129,7 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
     every = max(1, len(train.residual) // MOST_ROWS)  # neighbours say the same: a thinned log teaches as much
     train = Rows(
         train.features[::every], train.residual[::every], replace(train.clusters, ids=train.clusters.ids[::every]),
-        train.trip[::every], train.duration_s[::every],
+        train.trip[::every], train.duration_s[::every], train.worth[::every], train.cycle_unit,
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     fold = rng.permutation(np.arange(train.clusters.count) % 4)[train.clusters.ids]
@@ -170,10 +180,15 @@ def _safe(names: Sequence[str]) -> list[str]:
     return [f"f{i}" for i in range(len(names))]
 
 
+def _rms(rows: Rows, amplitude: float) -> float:
+    """Root mean square of a cycle in the residual's unit."""
+    return float(amplitude * np.sqrt(0.5 * np.mean(rows.worth**2)))
+
+
 def _period(rows: Rows, noise: Noise) -> tuple[float, float] | None:
     """Period and amplitude of a cycle that noise with the spectrum around it could not have made."""
-    hit = strongest_period(rows.residual, Clocked.of(rows.trip, rows.duration_s, noise))
-    if hit is None or hit.p > LEVEL or hit.amplitude**2 / 2 < LEAST_SHARE * np.mean(rows.residual**2):
+    hit = strongest_period(rows.residual, Clocked.of(rows.trip, rows.duration_s, rows.worth, noise))
+    if hit is None or hit.p > LEVEL or _rms(rows, hit.amplitude) ** 2 < LEAST_SHARE * np.mean(rows.residual**2):
         return None
     return hit.period_s, hit.amplitude
 

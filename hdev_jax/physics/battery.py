@@ -10,6 +10,7 @@ from hdev_jax.physics.effect import Effect, Parameter
 __all__ = [
     "BatteryResistance",
     "FrictionBlending",
+    "ModeChange",
     "RegenCutoff",
     "RegenLimit",
     "StepChange",
@@ -185,3 +186,42 @@ class StepChange(Effect):
         after = jnp.where(jnp.asarray(row.trip).astype(at_trip.dtype) >= at_trip - 0.5, 1.0, 0.0)
         weight = car.mass(row) * 9.80665 * row.speed_mps
         return after * (self.power_w + self.c_rr * weight + self.loss * jnp.abs(point.power_w))
+
+
+class ModeChange(Effect):
+    """A second mode that holds in some trips: a load, a rolling resistance, a loss, or regeneration that is weaker.
+
+    Which trips is sought, not declared; on a trip that nobody has fitted (`in_mode` NaN) it weighs as often as it was
+    seen.
+    """
+
+    id: ClassVar = "mode_change"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "z·(ΔP + Δc·m·g·v + Δg·|P| + Δr·max(−P, 0)), z of each trip 0 or 1"
+    source: ClassVar = "limp mode, weak regeneration, a second driver's setting"
+    parameters: ClassVar = (
+        Parameter("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
+        Parameter("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
+        Parameter("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
+        Parameter("regeneration", "1", 0.0, 0.1, -0.9, 0.9, least=0.005),
+        Parameter("share", "1", 0.5, 0.2, 0.0, 1.0, kind="choice"),
+        Parameter("in_mode", "1", float("nan"), 1.0, 0.0, 1.0, kind="choice"),
+    )
+    variants: ClassVar = (("regeneration",), ("loss",), ("c_rr",), ("power_w",))
+    searched: ClassVar = "trips"
+    mistaken_for: ClassVar = ("step_change", "mass_scale")
+    separated_by: ClassVar = "the same trip in either mode"
+    order: ClassVar = 20
+    power_w: Any
+    c_rr: Any
+    loss: Any
+    regeneration: Any
+    share: Any
+    in_mode: Any
+
+    def power(self, row, car, point):
+        z = jnp.where(jnp.isnan(self.in_mode), self.share, self.in_mode)
+        weight = car.mass(row) * 9.80665 * row.speed_mps
+        recovered = jnp.maximum(-point.power_w, 0.0)
+        losses = self.loss * jnp.abs(point.power_w) + self.regeneration * recovered
+        return z * (self.power_w + self.c_rr * weight + losses)

@@ -114,14 +114,14 @@ def test_ways_that_are_alike_are_one_test():
     assert effective_number(np.ones((1, 1))) == 1.0
 
 
-@pytest.mark.parametrize(("white", "against"), [(-0.01, True), (0.01, False)])
-def test_a_slow_size_of_no_sign_among_the_rows_is_contradicted(white, against):
+@pytest.mark.parametrize(("white", "against"), [(-0.01, True), (0.01, True), (0.08, False), (0.3, False)])
+def test_a_slow_size_of_which_the_rows_rule_out_a_quarter_is_contradicted(white, against):
     assert _contradicted(np.array([0.34]), np.array([white]), np.array([0.009])) is against
     assert not _contradicted(np.array([0.34]), np.array([-0.01]), np.array([0.1]))  # they could not have seen it
 
 
 def test_between_trips_a_log_knows_no_more_than_it_has_trips():
-    left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, np.zeros(3))
+    left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, 1.0, np.zeros(3))
     hinted = Verdict("hvac_power", 2.0, 1.0, "not significant", needed=40, between=True)
     inside = Verdict("headwind", 2.0, 1.0, "not significant", needed=30)
     strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=14)

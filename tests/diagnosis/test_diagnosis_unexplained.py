@@ -23,13 +23,22 @@ def residual(rng, trips: int, rows: int, *, rho: float = 0.0, cycles: float = 0.
     wave = np.sqrt(2) * np.sin(2 * np.pi * (cycles * clock + rng.random((trips, 1))))
     trip = np.repeat(np.arange(trips), rows)
     clusters = Clusters(trip, trips, "trip")
-    return Rows(np.zeros((trips * rows, 1)), (noise + size * wave).ravel(), clusters, trip, np.full(trips * rows, 2.0))
+    n = trips * rows
+    return Rows(np.zeros((n, 1)), (noise + size * wave).ravel(), clusters, trip, np.full(n, 2.0), np.ones(n), "kW")
+
+
+def _without_levels(rows):
+    return estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=False)
+
+
+def cycle_of(rows):
+    return _period(rows, _without_levels(rows))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.97])
 @pytest.mark.parametrize(("trips", "cycles", "size"), [(3, 5, 3.0), (3, 8.5, 3.0), (8, 4, 3.0), (12, 3, 3.0)])
 def test_a_cycle_is_found_with_its_period_and_size(rho, trips, cycles, size):
-    found = _period(residual(np.random.default_rng(1), trips, 300, rho=rho, cycles=cycles, size=size))
+    found = cycle_of(residual(np.random.default_rng(1), trips, 300, rho=rho, cycles=cycles, size=size))
     assert found is not None
     period, amplitude = found
     assert period == pytest.approx(600.0 / cycles, rel=0.03)
@@ -37,7 +46,7 @@ def test_a_cycle_is_found_with_its_period_and_size(rho, trips, cycles, size):
 
 
 def test_a_single_trip_is_its_own_repetition():
-    found = _period(residual(np.random.default_rng(2), 1, 3000, cycles=40, size=1.0))
+    found = cycle_of(residual(np.random.default_rng(2), 1, 3000, cycles=40, size=1.0))
     assert found is not None
     assert found[0] == pytest.approx(150.0, rel=0.02)
 
@@ -46,11 +55,7 @@ def test_a_single_trip_is_its_own_repetition():
 @pytest.mark.parametrize("trips", [1, 2, 3, 12])
 def test_noise_has_no_cycle(rho, trips):
     rng = np.random.default_rng(3)
-    assert sum(_period(residual(rng, trips, 300, rho=rho)) is not None for _ in range(40)) <= 1
-
-
-def _without_levels(rows):
-    return estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=False)
+    assert sum(cycle_of(residual(rng, trips, 300, rho=rho)) is not None for _ in range(40)) <= 1
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9, 0.97])
@@ -66,7 +71,7 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     rows = residual(rng, 8, 200)
     level = np.repeat(rng.normal(0, 2.0, 8), 200)
     trip, values = np.r_[rows.trip, 8, 8, 8], np.r_[rows.residual + level, 0.1, 0.0, -0.1]
-    short = Rows(np.zeros((1603, 1)), values, Clusters(trip, 9, "trip"), trip, np.full(1603, 2.0))
+    short = Rows(np.zeros((1603, 1)), values, Clusters(trip, 9, "trip"), trip, np.full(1603, 2.0), np.ones(1603), "kW")
     found = _levels(short, _without_levels(short))
     assert found is not None
     assert found[2] == pytest.approx(np.std(level), rel=0.3)

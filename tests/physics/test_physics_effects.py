@@ -150,7 +150,10 @@ def assert_finite(car: Vehicle, log: Segments) -> None:
     (reverse,) = jax.linear_transpose(forward, numbers)(jnp.ones(()))
     # each number on the scale of its own size, so that one direction sees them all
     rng = np.random.default_rng(0)
-    direction = jax.tree.map(lambda x: (np.abs(x) + 1e-3) * rng.choice([-1.0, 1.0], np.shape(x)), numbers)
+    # (what is not known, as a phase that nobody has fitted, has no size)
+    direction = jax.tree.map(
+        lambda x: (np.nan_to_num(np.abs(x)) + 1e-3) * rng.choice([-1.0, 1.0], np.shape(x)), numbers
+    )
     terms = np.concatenate([np.ravel(a * b) for a, b in zip(*map(jax.tree.leaves, (reverse, direction)), strict=True)])
     assert np.all(np.isfinite(terms))
     np.testing.assert_allclose(forward(direction), np.sum(terms), atol=1e-9 * np.sum(np.abs(terms)))
