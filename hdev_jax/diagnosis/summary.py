@@ -59,10 +59,10 @@ def _effect_block(f: Found, fit: Calibration, before: float, after: float, clust
         for row, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
         if row.path.startswith(prefix)
     }
-    chosen = {p.name: p for p in c.effect.parameters if p.kind == "choice"}
+    held = {p.name: p for p in c.effect.parameters if p.name not in parameters}
     for name, value in c.shapes:
-        if name in chosen:
-            parameters[name] = {"value": float(value), "sd": 0.0, "unit": chosen[name].unit}
+        if name in held:
+            parameters[name] = {"value": float(value), "sd": 0.0, "unit": held[name].unit}
     return {
         "id": f.id,
         "stage": c.effect.stage,
@@ -142,7 +142,12 @@ def summarise(
         "parameters_fitted": _fitted(state),
         "clusters": {"kind": clusters.kind, "count": clusters.count, "trips": len(split.train)},
         "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
-        "notes": [*problem.notes, *_warnings(steps, state), *_odd_rows(problem, predicted[0])],
+        "notes": [
+            *problem.notes,
+            *_warnings(steps, state),
+            *_by_trip(problem, state),
+            *_odd_rows(problem, predicted[0]),
+        ],
     }
 
 
@@ -199,6 +204,21 @@ def _warnings(steps: list[Calibration], state: Search) -> list[str]:
         if abs(p.get("prior_z", 0.0)) > FAR:
             held = f"; on this log it cannot be told from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
             out.append(f"{name} moved {p['prior_z']:+.1f} tabular sd to fit the declared model{held}")
+    return out
+
+
+def _by_trip(problem: Problem, state: Search) -> list[str]:
+    """What was sought for each trip: the phases of a cycle, the trips of a mode."""
+    out = []
+    for f in state.found:
+        told = [(n.partition("[")[2].removesuffix("]"), v) for n, v in f.score.candidate.shapes if "[" in n]
+        by_trip = [(problem.log.trip_names[int(t)], v) for t, v in told]
+        if f.id == "mode_change":
+            trips = ", ".join(t for t, v in by_trip if v > 0)
+            out.append(f"mode_change holds in {trips}; a trip that was not fitted gets its mean")
+        elif by_trip:
+            phases = ", ".join(f"{t} {v:+.2f}" for t, v in by_trip)
+            out.append(f"{f.id}: phase by trip {phases}; a trip that was not fitted gets the load's mean")
     return out
 
 
