@@ -15,6 +15,7 @@ __all__ = ["Clocked", "Period", "strongest_period"]
 LONGEST_S = 32_768.0  # of a window in rows' median durations: a cycle that keeps in step longer is seen by half of it
 CYCLES = 3.0  # least number in a window
 SAMPLES = 4.0  # least number in a cycle
+PLACES = 512
 LEAST_RATIO = 1.5  # of a peak to the noise around it
 
 
@@ -99,7 +100,7 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
     if not len(inside):
         return None
     per = round(size * step / window)  # points of the grid to an independent frequency
-    heights = power[inside] / np.array([_floor(power, int(k), per, count) for k in inside])
+    heights = power[inside] / _floors(power, inside, per, count)
     k, height = int(inside[np.argmax(heights)]), float(np.max(heights))
     p = float(stats.gamma.sf(height, count)) * len(inside) / per if height >= LEAST_RATIO * count else 1.0
     near = inside[np.abs(inside - k) <= 2 * per]  # a strong peak lifts the floor beneath itself least at its feet
@@ -115,6 +116,13 @@ def _windows(clock: np.ndarray, trip: slice, window: float) -> list[slice]:
     starts = trip.start + np.searchsorted(clock[trip], edges)
     parts = [slice(int(a), int(b)) for a, b in pairwise([*starts, trip.stop])]
     return [p for p in parts if p.stop - p.start > 8 and clock[p.stop - 1] - clock[p.start] > 0.45 * window]
+
+
+def _floors(power: np.ndarray, at: np.ndarray, per: int, count: int) -> np.ndarray:
+    """The floor at every place; in long windows at some of them, evenly spread in log frequency, and between them."""
+    some = at if len(at) <= PLACES else np.unique(np.geomspace(at[0], at[-1], PLACES).round().astype(int))
+    floors = [np.log(_floor(power, int(k), per, count)) for k in some]
+    return np.exp(np.interp(np.log(at), np.log(some), floors))
 
 
 def _floor(power: np.ndarray, k: int, per: int, count: int) -> float:
