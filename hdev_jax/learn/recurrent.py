@@ -15,11 +15,16 @@ from hdev_jax.learn.sources import Channels, Source
 
 __all__ = ["Recurrent", "RecurrentModel", "train_recurrent"]
 
+GAIN = 5.0
 CELLS = {"lstm": eqx.nn.LSTMCell, "gru": eqx.nn.GRUCell}
 
 
 class Recurrent(eqx.Module):
-    """One layer of cells and a linear read-out of the hidden state; float32, as it is trained."""
+    """One layer of cells and a linear read-out of the hidden state; float32, as it is trained.
+
+    The hidden state is bounded, power is not. Read out times `GAIN`, the state stays small, where it is nearly linear,
+    and a trip that goes further than the training trip is not cut off.
+    """
 
     cell: eqx.nn.LSTMCell | eqx.nn.GRUCell
     head: eqx.nn.Linear
@@ -43,7 +48,7 @@ class Recurrent(eqx.Module):
             return state, state[0] if isinstance(state, tuple) else state
 
         hidden = jax.lax.scan(step, first, x)[1]
-        return hidden @ self.head.weight[0] + (0.0 if self.head.bias is None else self.head.bias[0])
+        return GAIN * (hidden @ self.head.weight[0]) + (0.0 if self.head.bias is None else self.head.bias[0])
 
 
 @dataclass(frozen=True)
@@ -91,11 +96,13 @@ def train_recurrent(
     length: int = 128,
     burn_in: int = 32,
     rate: float = 0.02,
+    decay: float = 1e-2,
     huber: float = np.inf,
 ) -> RecurrentModel:
     """Adam with a cosine schedule from `rate` to 0 over `steps` batches of windows from random places of the trip.
 
-    **Arguments:** `length` rows of a window count, after `burn_in` that only fill the memory; `huber`, corner of the
+    **Arguments:** `length` rows of a window count, after `burn_in` that only fill the memory; `decay` of the
+    weights (Loshchilov and Hutter 2019), of the cell, not of the read-out, times the rate; `huber`, corner of the
     loss in the target's unit. Raises `InputError` for a trip shorter than a window.
     """
     import optax
@@ -111,8 +118,10 @@ def train_recurrent(
     corner = min(huber / float(scales[1].sd), 1e6)
     begin, draw = jax.random.split(key)
     network = Recurrent(kind, x.shape[1], units, key=begin)
-    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(rate, steps)))
     weights, static = eqx.partition(network, eqx.is_array)
+    cell_only = eqx.tree_at(lambda n: n.cell, jax.tree.map(lambda _: False, weights), jax.tree.map(lambda _: True, weights.cell))
+    schedule = optax.cosine_decay_schedule(rate, steps)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=decay, mask=cell_only))
 
     def loss(weights: Any, xs: Array, ys: Array) -> Array:
         error = jax.vmap(eqx.combine(weights, static))(xs)[:, burn_in:] - ys[:, burn_in:]

@@ -28,6 +28,14 @@ class Trip:
     def __len__(self) -> int:
         return len(self.target)
 
+    def part(self, first: int, last: int) -> "Trip":
+        """Rows `first` to `last`, the last not among them."""
+        rows = slice(first, last)
+        return Trip(
+            self.name, self.dt_s, {k: x[rows] for k, x in self.inputs.items()}, self.target[rows],
+            self.segments.take(np.arange(len(self))[rows]),
+        )  # fmt: skip
+
     def columns(self, names: Sequence[str]) -> Float[np.ndarray, "row column"]:
         """The inputs side by side. Raises `InputError` for one that the trip lacks."""
         if lacking := [n for n in names if n not in self.inputs]:
