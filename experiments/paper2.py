@@ -28,12 +28,12 @@ class Settings(Strict):
     kernel_order: int = 2
     outputs: int = 3
     lags: list[int] = Field(default_factory=lambda: [0, 1, 2])
-    units: int = 10
+    units: int = 5
     seen: Literal["inputs", "all"] = "inputs"
     linear: bool = True
     huber_kw: float = 0.4  # corner of Huber's loss; 0: squares
     ridge_size: float = 1e-6
-    ridge_slope: float = 1e-2
+    ridge_slope: float = 1e-3
     starts: int = 16
     steps: int = 120
     coarse_steps: int = 50
@@ -43,7 +43,7 @@ class Settings(Strict):
     cell: Literal["lstm", "gru"] = "lstm"
     length: int = 128
     rate: float = 0.02
-    decay: float = 1e-2
+    decay: float = 0.03
     model: Literal["tree", "boosted", "robust_linear", "support_vectors"] = "tree"
     trials: int = 12
 

@@ -136,11 +136,11 @@ def fit_many(
     solver = NormalLevenbergMarquardt(partial(_penalised, shape), rtol=rtol)
     corner = jnp.asarray(huber, dtype=starts.dtype)
 
-    def one(theta: Array, own: Array | None) -> Fitted:
+    def one(theta: Array, own: Array | None) -> tuple[Array, ...]:
         given = data if own is None else eqx.tree_at(lambda d: d.weight, data, own)
         sol = optx.least_squares(
             lambda t, _: t, solver, theta, args=(given, corner, ridge), max_steps=max_steps, throw=False
         )
-        return Fitted(sol.value, sol.stats["loss"], sol.stats["num_steps"], sol.result == optx.RESULTS.successful)
+        return sol.value, sol.stats["loss"], sol.stats["num_steps"], sol.result == optx.RESULTS.successful
 
-    return jax.vmap(one, in_axes=(0, None if weights is None else 0))(starts, weights)
+    return Fitted(*jax.vmap(one, in_axes=(0, None if weights is None else 0))(starts, weights))

@@ -174,7 +174,7 @@ def _drawn(shape: Shape, x: Array, y: Array, weight: Array, key: Array) -> Array
     slope = slope * jax.random.uniform(steepness, (shape.units, 1), minval=0.5, maxval=2.0)
     seen = x[:, jnp.array(shape.seen)]
     shift = -jnp.sum(slope * seen[jax.random.randint(row, (shape.units,), 0, x.shape[0])], axis=1)
-    unit = jax.nn.sigmoid(seen @ slope.T + shift)
+    unit = jax.nn.sigmoid(seen @ slope.T + shift[None, :])
     design = jnp.concatenate([jnp.ones((x.shape[0], 1)), x[:, : shape.linear], unit], axis=1)
     damp = jnp.concatenate([jnp.full(1 + shape.linear, 1e-9), jnp.full(shape.units, 2.5e-6)]) * x.shape[0]
     weighed = design * weight[:, None]

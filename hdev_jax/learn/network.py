@@ -54,10 +54,14 @@ def unpack(shape: Shape, theta: Float[Array, " parameter"]) -> Parts:
     return Parts(theta[0], theta[1:a], theta[a : a + n], theta[a + n : a + n + n * q].reshape(n, q), theta[a + n + n * q :])
 
 
+def _plus(x: Array, shift: Array) -> Array:
+    return x + shift.reshape((1,) * (x.ndim - 1) + shift.shape)
+
+
 def output(shape: Shape, theta: Float[Array, " parameter"], x: Float[Array, "*row column"]) -> Float[Array, "*row"]:
     """y = y₀ + X·L + Σ sᵢ·σ(X·Q·bᵢ + cᵢ) of regressors `x`, all normalised (equations 17-19)."""
     p = unpack(shape, theta)
-    unit = jax.nn.sigmoid(x[..., jnp.array(shape.seen, dtype=int)] @ p.slope.T + p.shift)
+    unit = jax.nn.sigmoid(_plus(x[..., jnp.array(shape.seen, dtype=int)] @ p.slope.T, p.shift))
     return p.offset + x[..., : shape.linear] @ p.linear + unit @ p.size
 
 
@@ -67,13 +71,13 @@ def direct(
     """The output, its gradient in the parameters with the regressors held, and its gradient in past outputs."""
     p = unpack(shape, theta)
     seen = x[:, jnp.array(shape.seen, dtype=int)]
-    unit = jax.nn.sigmoid(seen @ p.slope.T + p.shift)
-    steep = unit * (1 - unit) * p.size
+    unit = jax.nn.sigmoid(_plus(seen @ p.slope.T, p.shift))
+    steep = unit * (1 - unit) * p.size[None, :]
     slopes = (steep[:, :, None] * seen[:, None, :]).reshape(x.shape[0], shape.units * len(shape.seen))
     jac = jnp.concatenate([jnp.ones((x.shape[0], 1), x.dtype), x[:, : shape.linear], unit, slopes, steep], axis=1)
     back = jnp.zeros((x.shape[0], shape.feedback), x.dtype)
     kept = min(shape.feedback, shape.linear)
-    back = back.at[:, :kept].add(p.linear[:kept])
+    back = back.at[:, :kept].add(p.linear[None, :kept])
     if shape.fed_back:
         at = jnp.array([shape.seen[i] for i in shape.fed_back])
         back = back.at[:, at].add(steep @ p.slope[:, jnp.array(shape.fed_back)])
@@ -96,7 +100,7 @@ def free_run(
     base = p.offset + exogenous[..., : shape.linear - kept] @ p.linear[kept:]
     forward = tuple(i for i in range(len(shape.seen)) if i not in shape.fed_back)
     at = jnp.array([shape.seen[i] - back for i in forward], dtype=int)
-    into = exogenous[..., at] @ p.slope[:, jnp.array(forward, dtype=int)].T + p.shift
+    into = _plus(exogenous[..., at] @ p.slope[:, jnp.array(forward, dtype=int)].T, p.shift)
     if not shape.fed_back:
         base = base + jax.nn.sigmoid(into) @ p.size
     if back == 0:

@@ -1,7 +1,7 @@
 """LSTM and GRU (paper 2, section IV) in Equinox, trained by Adam on windows of a trip."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ class Recurrent(eqx.Module):
     head: eqx.nn.Linear
     memory: int = eqx.field(static=True)
 
-    def __init__(self, kind: Literal["lstm", "gru"], inputs: int, units: int, *, key: PRNGKeyArray):
+    def __init__(self, kind: str, inputs: int, units: int, *, key: PRNGKeyArray):
         if kind not in CELLS:
             raise InputError(f"recurrent cell {kind!r}: one of {', '.join(CELLS)}")
         first, second = jax.random.split(key)
@@ -85,7 +85,7 @@ def _run(network: Recurrent, x: Array) -> Array:
 
 
 def train_recurrent(
-    kind: Literal["lstm", "gru"],
+    kind: str,
     trip: Trip,
     *,
     key: PRNGKeyArray,
@@ -96,7 +96,7 @@ def train_recurrent(
     length: int = 128,
     burn_in: int = 32,
     rate: float = 0.02,
-    decay: float = 1e-2,
+    decay: float = 0.03,
     huber: float = np.inf,
 ) -> RecurrentModel:
     """Adam with a cosine schedule from `rate` to 0 over `steps` batches of windows from random places of the trip.
@@ -131,7 +131,7 @@ def train_recurrent(
     def learn(weights: Any, state: Any, keys: Array) -> Any:
         def one(carry: Any, key: Array) -> tuple[Any, None]:
             weights, state = carry
-            at = jax.random.randint(key, (batch, 1), 0, x.shape[0] - window + 1) + jnp.arange(window)
+            at = jax.random.randint(key, (batch, 1), 0, x.shape[0] - window + 1) + jnp.arange(window)[None, :]
             update, state = optimiser.update(jax.grad(loss)(weights, x[at], y[at]), state, weights)
             return (optax.apply_updates(weights, update), state), None
 

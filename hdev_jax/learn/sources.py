@@ -1,7 +1,7 @@
 """What a sequence model reads of a trip: logged channels, or the kernel's own terms of the machine stage."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ W_PER_KW = 1000.0
 PIECE = 8192  # rows: trips of any length share one compilation of the kernel
 
 
+@runtime_checkable
 class Source(Protocol):
     """Input columns `[row, column]` of a trip, and their names."""
 
