@@ -31,7 +31,15 @@ from hdev_jax.rundir import atomic_file, config_digest, open_run
 __all__ = ["run_config", "run_tasks"]
 
 ROOT = Path(__file__).parents[1]
-EXPERIMENTS = ("paper2", "paper2_figures", "paper2_online", "paper2_pedal", "paper2_selection", "paper2_trips", "planted")
+EXPERIMENTS = (
+    "paper2",
+    "paper2_figures",
+    "paper2_online",
+    "paper2_pedal",
+    "paper2_selection",
+    "paper2_trips",
+    "planted",
+)
 EVERY = tuple(sorted(p.name for p in Path(__file__).parent.glob("*.py")))
 FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
 Result = tuple[dict[str, Any], dict[str, Any]]

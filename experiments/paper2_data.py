@@ -18,7 +18,7 @@ SOURCE = "github.com/FMLabSouthampton/EV_EnergyConsumptionModel_v1_2024"
 
 @cache
 def kia_log(only: str = "") -> Log:
-    """The log of all trips, or of one (`only`): the accelerator pedal is in trip 1 alone. Rows as in the paper, untrimmed.
+    """The log of all trips, or of one (`only`): the pedal is in trip 1 alone. Rows as in the paper, untrimmed.
 
     Raises `InputError` without the data.
     """

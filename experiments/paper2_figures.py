@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from experiments.config import Strict
 from experiments.paper2 import Settings
@@ -25,12 +26,12 @@ class Config(Strict):
     experiment: str
     artefact: str
     caption: str
-    show: list[str] = []
-    order: list[str] = []
+    show: list[str] = Field(default_factory=list)
+    order: list[str] = Field(default_factory=list)
     model: str = "NARXP"
     models: dict[str, Settings]
-    window: list[float] = []
-    paper: dict[str, dict[str, float]] = {}
+    window: list[float] = Field(default_factory=list)
+    paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = 0
     train: str = "1"
     seed: int = 0
@@ -66,8 +67,8 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     prediction_figure(run, config.artefact, clock[inside], measured[inside], predicted[inside])
     worst = int(np.argmax(np.abs(predicted - measured)))
     ours = {
-        "fit_percent": found["step_fit"], "mse": found["step_mse"], "worst_error_kw": float(predicted[worst] - measured[worst]),
-        "worst_at_s": float(clock[worst]),
+        "fit_percent": found["step_fit"], "mse": found["step_mse"],
+        "worst_error_kw": float(predicted[worst] - measured[worst]), "worst_at_s": float(clock[worst]),
     }  # fmt: skip
     paper = config.paper.get(config.model)
     ratio = {k: ours[k] / paper[k] for k in ours if paper and paper.get(k)}

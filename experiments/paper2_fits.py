@@ -9,8 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.errors import InputError
-from hdev_jax.learn import Channels, KernelTerms, Narx, Structure, Trip
-from hdev_jax.learn import fit_prediction, fit_simulation, prepared, starts, with_theta
+from hdev_jax.learn import (
+    Channels,
+    KernelTerms,
+    Narx,
+    Structure,
+    Trip,
+    fit_prediction,
+    fit_simulation,
+    prepared,
+    starts,
+    with_theta,
+)
 from hdev_jax.learn.classical import search_classical
 from hdev_jax.learn.recurrent import train_recurrent
 from hdev_jax.learn.sequences import energy_kwh, mean_squared

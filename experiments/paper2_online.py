@@ -1,7 +1,7 @@
 """Paper 2's future work: the physics NARX identified row by row while the car is driven, against the one of trip 1.
 
-Both are one step ahead. *Frozen* has the coefficients of trip 1; *followed* goes on learning, a forgetting factor a row,
-chosen on trip 1 by its own errors before each row was seen. *Ageing* adds a share of the losses to a trip's measured
+Both are one step ahead. *Frozen* has the coefficients of trip 1; *followed* goes on learning with a memory that was
+chosen on trip 1, by its errors before each row was seen. *Ageing* adds a share of the losses to a trip's measured
 power, growing over the trip: losses are what the battery gives beyond the power at the shaft.
 """
 

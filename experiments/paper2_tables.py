@@ -72,10 +72,9 @@ def _ours(config: Any, result: dict[str, Any]) -> dict[str, Any]:
 def _line(name: str, key: str, paper: dict[str, float] | None, ours: dict[str, Any] | None) -> dict[str, Any]:
     theirs = None if paper is None else paper.get(key)
     own = None if ours is None else ours.get(key)
-    both = theirs and own is not None
     return {
         "model": name, "number": key, "paper": _digits(theirs), "ours": _digits(own),
-        "ratio": own / theirs if both else None,
+        "ratio": own / theirs if theirs and own is not None else None,
         "free run": _digits(ours["free_test_mean"]) if ours and key == "test_mean" else None,
         "parameters": ours["parameters"] if ours else None,
     }  # fmt: skip

@@ -31,7 +31,13 @@ class _LinearLeaves:
     def fit(self, x: np.ndarray, y: np.ndarray) -> "_LinearLeaves":
         import lightgbm as lgb
 
-        fixed = {"objective": "regression", "verbosity": -1, "num_threads": 1, "deterministic": True, "linear_tree": True}
+        fixed = {
+            "objective": "regression",
+            "verbosity": -1,
+            "num_threads": 1,
+            "deterministic": True,
+            "linear_tree": True,
+        }
         data = lgb.Dataset(x, y, params={"linear_tree": True, "verbosity": -1})
         self.booster = lgb.train({**fixed, **self.settings}, data, self.rounds)
         return self

@@ -109,8 +109,10 @@ class Fitted(eqx.Module):
 
 def _penalised(shape: Shape, theta: Array, args: Any) -> Equations:
     data, corner, ridge = args
-    sums = one_step if isinstance(data, Rows) else simulated
-    loss, gradient, hessian = sums(shape, theta, data, corner)
+    if isinstance(data, Rows):
+        loss, gradient, hessian = one_step(shape, theta, data, corner)
+    else:
+        loss, gradient, hessian = simulated(shape, theta, data, corner)
     return loss + 0.5 * jnp.sum(ridge * theta**2), gradient + ridge * theta, hessian + jnp.diag(ridge)
 
 
@@ -133,7 +135,7 @@ def fit_many(
     **Arguments:** `data`: `Rows` for the one-step error, `Windows` for the free run; `weights`, in place of the data's
     own, different for each start: folds of a validation, side by side.
     """
-    solver = NormalLevenbergMarquardt(partial(_penalised, shape), rtol=rtol)
+    solver = NormalLevenbergMarquardt(equations=partial(_penalised, shape), rtol=rtol)  # pyright: ignore[reportCallIssue]
     corner = jnp.asarray(huber, dtype=starts.dtype)
 
     def one(theta: Array, own: Array | None) -> tuple[Array, ...]:

@@ -1,6 +1,6 @@
 """NARX models (paper 2, section III): regressors with lags, a sigmoid network, fits in prediction and in simulation."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -20,17 +20,18 @@ __all__ = ["Narx", "Structure", "fit_prediction", "fit_simulation", "penalty", "
 
 COARSE = (3.0, 2.0, 1.0)  # weights of a coarse start's lags, newest first: units see one smoothed value of each input
 
+
 @dataclass(frozen=True)
 class Structure:
     """Which regressors, and what the units see of them.
 
-    **Arguments:** `source` of the inputs; `outputs`, past outputs y(k−1) … (n_a of paper 2, equation 14); `lags` of every
+    **Arguments:** `source` of the inputs; `outputs`, past outputs y(k−1) … (n_a of equation 14); `lags` of every
     input, 0 being the present (n_b = 3 and n_g = 0 are lags 0, 1, 2; a negative lag looks ahead); `units`, sigmoids;
     `seen`: "all" regressors or the "inputs" alone, so that what is fed back is linear and the free run cannot run away;
     `linear`: whether regressors enter linearly beside the units (X·M·L of equation 17).
     """
 
-    source: Source = Channels()
+    source: Source = field(default_factory=Channels)
     outputs: int = 3
     lags: tuple[int, ...] = (0, 1, 2)
     units: int = 10
@@ -53,7 +54,9 @@ class Structure:
     def shape(self) -> Shape:
         columns = self.outputs + len(self.source.names) * len(self.lags)
         seen = range(self.outputs if self.seen == "inputs" else 0, columns)
-        return Shape(columns, self.outputs, columns if self.linear else 0, self.units, tuple(seen) if self.units else ())
+        return Shape(
+            columns, self.outputs, columns if self.linear else 0, self.units, tuple(seen) if self.units else ()
+        )
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,9 @@ class Narx:
         """Free run, from the model's own past outputs (figure 11b), started from the measured rows before the first."""
         x, _ = self.regressors(trip)
         back = self.structure.outputs
-        run = _free_run(self.structure.shape, jnp.asarray(self.theta), jnp.asarray(x[0, :back]), jnp.asarray(x[:, back:]))
+        run = _free_run(
+            self.structure.shape, jnp.asarray(self.theta), jnp.asarray(x[0, :back]), jnp.asarray(x[:, back:])
+        )
         return self.output.undo(run)
 
     def measured(self, trip: Trip) -> Float[np.ndarray, " row"]:

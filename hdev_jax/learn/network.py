@@ -51,7 +51,9 @@ class Parts(NamedTuple):
 def unpack(shape: Shape, theta: Float[Array, " parameter"]) -> Parts:
     """The parameter vector in its parts."""
     a, n, q = 1 + shape.linear, shape.units, len(shape.seen)
-    return Parts(theta[0], theta[1:a], theta[a : a + n], theta[a + n : a + n + n * q].reshape(n, q), theta[a + n + n * q :])
+    return Parts(
+        theta[0], theta[1:a], theta[a : a + n], theta[a + n : a + n + n * q].reshape(n, q), theta[a + n + n * q :]
+    )
 
 
 def _plus(x: Array, shift: Array) -> Array:

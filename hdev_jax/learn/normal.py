@@ -1,4 +1,4 @@
-"""Normal equations of a network, summed over chunks: of its one-step errors, and of its free run in parallel windows."""
+"""Normal equations of a network, summed over chunks: of its one-step errors, and of its free run in windows."""
 
 import equinox as eqx
 import jax

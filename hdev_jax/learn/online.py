@@ -21,7 +21,7 @@ class Recursive(NamedTuple):
 
 
 def recursive(beta: Any, x: Any = None, *, prior: float = 1e6) -> Recursive:
-    """A state to begin with: `beta`, known as well as rows `x` `[row, column]` tell, or hardly (`prior`) without any."""
+    """A state to begin with: `beta`, known as well as rows `x` `[row, column]` tell; hardly (`prior`) without any."""
     beta = np.asarray(beta, dtype=float)
     if x is None:
         return Recursive(beta, prior * np.eye(len(beta)))
@@ -34,7 +34,7 @@ def update(
 ) -> tuple[Recursive, Any]:
     """One row: the state after it, and its prediction from the state before it.
 
-    K = P·x/(λ/w + xᵀ·P·x), β ← β + K·(y − xᵀβ), P ← (P − K·xᵀ·P)/λ (Ljung, System Identification, 1999, eq. 11.13), with
+    K = P·x/(λ/w + xᵀ·P·x), β ← β + K·(y − xᵀβ), P ← (P − K·xᵀ·P)/λ (Ljung, System Identification, 1999, 11.13), with
     Huber's weight w = min(1, corner/|e|). λ = 1 and an infinite corner is least squares of all rows so far.
 
     **Arguments:** `forgetting` λ in (0, 1]; `ceiling`: P grows no more once its trace is there, so that standing still,
@@ -65,7 +65,7 @@ def follow(
 ) -> tuple[Recursive, Float[np.ndarray, " row"]]:
     """A whole trip, row by row: the state after it and the prediction of every row from the rows before it.
 
-    **Arguments:** `x` `[row, column]`, `y` `[row]`; the rest as in `update`. Raises `InputError` for a forgetting factor
+    **Arguments:** `x` `[row, column]`, `y` `[row]`; the rest as in `update`. Raises `InputError` for a `forgetting`
     outside (0, 1].
     """
     if not 0 < forgetting <= 1:

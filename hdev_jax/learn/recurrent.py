@@ -119,7 +119,9 @@ def train_recurrent(
     begin, draw = jax.random.split(key)
     network = Recurrent(kind, x.shape[1], units, key=begin)
     weights, static = eqx.partition(network, eqx.is_array)
-    cell_only = eqx.tree_at(lambda n: n.cell, jax.tree.map(lambda _: False, weights), jax.tree.map(lambda _: True, weights.cell))
+    cell_only = eqx.tree_at(
+        lambda n: n.cell, jax.tree.map(lambda _: False, weights), jax.tree.map(lambda _: True, weights.cell)
+    )
     schedule = optax.cosine_decay_schedule(rate, steps)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=decay, mask=cell_only))
 

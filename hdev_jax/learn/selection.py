@@ -43,7 +43,15 @@ def folds(target: Any, count: int) -> list[np.ndarray]:
 
 
 def validated(
-    structure: Structure, trip: Trip, *, key: Array, count: int, blocks: int = 3, huber: float, ridge: Any, steps: int = 80
+    structure: Structure,
+    trip: Trip,
+    *,
+    key: Array,
+    count: int,
+    blocks: int = 3,
+    huber: float,
+    ridge: Any,
+    steps: int = 80,
 ) -> Score:
     """One step ahead on rows left out, from `count` starts in each fold, all fits in one program."""
     model = prepared(structure, trip)

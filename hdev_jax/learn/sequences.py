@@ -17,7 +17,7 @@ KW_S_PER_KWH = 3600.0
 
 @dataclass(frozen=True)
 class Trip:
-    """One trip: inputs by name and the target, all `[row]`, `dt_s` [s] apart; `segments` are its rows for the kernel."""
+    """One trip: inputs by name and the target, all `[row]`, `dt_s` [s] apart; `segments`, its rows for the kernel."""
 
     name: str
     dt_s: float
@@ -55,7 +55,9 @@ def trips_of(segments: Segments, target: Any, names: Sequence[str]) -> list[Trip
         own = segments.take(np.arange(rows.start, rows.stop))
         duration = np.asarray(own.duration_s)
         if np.ptp(duration) > 1e-3 * duration[0]:
-            raise InputError(f"trip {names[k]}: rows of {duration.min():.3g} to {duration.max():.3g} s; resample the log")
+            raise InputError(
+                f"trip {names[k]}: rows of {duration.min():.3g} to {duration.max():.3g} s; resample the log"
+            )
         inputs = {"speed_mps": own.speed_mps, "accel_from_speed_mps2": own.accel_mps2, **own.channels}
         arrays = {n: np.asarray(x, dtype=float) for n, x in inputs.items()}
         found.append(Trip(names[k], float(duration[0]), arrays, np.asarray(target, dtype=float)[rows], own))

@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.sequences import Trip
-from hdev_jax.physics import LIBRARY, Driveline, Machine, Vehicle
+from hdev_jax.physics import Driveline, Machine, Vehicle
+from hdev_jax.physics.losses import CopperLoss, InverterLoss, IronLoss
 from hdev_jax.segments import Segments
 
 __all__ = ["Channels", "KernelTerms", "Source"]
@@ -89,13 +90,12 @@ def _jacobian(torque: Any, speed: Any) -> Any:
 
     def power(theta: Any) -> Any:
         losses = (
-            LIBRARY["copper_loss"](w_per_nm2=theta[2]),
-            LIBRARY["iron_loss"](w_per_radps=theta[3], w_per_radps2=theta[4]),
-            LIBRARY["inverter_loss"](standby_w=0.0, per_nm_w=theta[5]),
+            CopperLoss(w_per_nm2=theta[2]),
+            IronLoss(w_per_radps=theta[3], w_per_radps2=theta[4]),
+            InverterLoss(standby_w=0.0, per_nm_w=theta[5]),
         )
         machine = Machine(motoring_efficiency=theta[0], regenerating_efficiency=theta[1])
         whole = Vehicle(losses, mass_kg=1.0, driveline=Driveline(1.0), machine=machine, entry="shaft")
         return whole.power(rows)
 
     return jax.jacfwd(power)(jnp.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
-

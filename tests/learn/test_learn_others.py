@@ -43,7 +43,9 @@ def test_a_change_is_followed():
 
 
 def test_a_row_that_tells_nothing_does_not_wind_up():
-    state, _ = follow(recursive(np.ones(2), np.eye(2)), np.zeros((5000, 2)), np.zeros(5000), forgetting=0.99, ceiling=10.0)
+    state, _ = follow(
+        recursive(np.ones(2), np.eye(2)), np.zeros((5000, 2)), np.zeros(5000), forgetting=0.99, ceiling=10.0
+    )
     assert np.trace(state.covariance) < 10.0
 
 
