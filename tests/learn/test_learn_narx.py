@@ -95,6 +95,7 @@ def test_windows_in_parallel_are_the_plain_free_run(name):
     assert np.linalg.norm(got[1] - jac.T @ r) < 0.05 * np.linalg.norm(gradient) + 1e-6
 
 
+@pytest.mark.slow
 def test_fit_reaches_scipys_cost_from_the_same_start():
     s, trip = Structure(outputs=1, lags=(0, 1), units=1), drive(400)
     model = prepared(s, trip)
@@ -204,6 +205,7 @@ def test_folds_are_blocks_and_the_edge():
     assert left_out[3].sum() == edge(y).sum() == 20
 
 
+@pytest.mark.slow
 def test_validation_prefers_the_true_orders():
     trip = drive(900)
     common = {
