@@ -36,8 +36,8 @@ class MarquardtDescent(optx.AbstractDescent):
         scale = scale + 1e-10 * jnp.max(scale) + jnp.finfo(scale.dtype).tiny
         factor = jnp.linalg.cholesky(hessian + jnp.diag(scale / step_size))
         move = -jax.scipy.linalg.cho_solve((factor, True), state.info.grad)
-        # not positive definite to rounding: a step of no length is turned down, and the next one is damped more
-        return jnp.where(jnp.all(jnp.isfinite(move)), move, jnp.zeros_like(move)), optx.RESULTS.successful
+        # not positive definite to rounding: a step to infinity is turned down, and the next one is damped more
+        return jnp.where(jnp.all(jnp.isfinite(move)), move, jnp.inf), optx.RESULTS.successful
 
 
 class _State(eqx.Module):
@@ -107,12 +107,12 @@ class Fitted(eqx.Module):
     converged: Bool[Array, " start"]
 
 
-def _penalised(shape: Shape, theta: Array, args: Any) -> Equations:
+def _penalised(shape: Shape, single: bool, theta: Array, args: Any) -> Equations:
     data, corner, ridge = args
     if isinstance(data, Rows):
-        loss, gradient, hessian = one_step(shape, theta, data, corner)
+        loss, gradient, hessian = one_step(shape, theta, data, corner, single=single)
     else:
-        loss, gradient, hessian = simulated(shape, theta, data, corner)
+        loss, gradient, hessian = simulated(shape, theta, data, corner, single=single)
     return loss + 0.5 * jnp.sum(ridge * theta**2), gradient + ridge * theta, hessian + jnp.diag(ridge)
 
 
@@ -127,15 +127,17 @@ def fit_many(
     max_steps: int = 100,
     rtol: float = 1e-6,
     weights: Float[Array, "start *shape"] | None = None,
+    single: bool = False,
 ) -> Fitted:
     """Every start fitted in one program.
 
     Minimises ½Σ ρ(y − ŷ) + ½Σ ridge·θ², ρ of Huber with its corner at `huber` (in the unit of y; infinite: squares).
 
     **Arguments:** `data`: `Rows` for the one-step error, `Windows` for the free run; `weights`, in place of the data's
-    own, different for each start: folds of a validation, side by side.
+    own, different for each start: folds of a validation, side by side; `single`, products of the Hessian in float32:
+    faster where there are many parameters, and a few more steps.
     """
-    solver = NormalLevenbergMarquardt(equations=partial(_penalised, shape), rtol=rtol)  # pyright: ignore[reportCallIssue]
+    solver = NormalLevenbergMarquardt(equations=partial(_penalised, shape, single), rtol=rtol)  # pyright: ignore[reportCallIssue]
     corner = jnp.asarray(huber, dtype=starts.dtype)
 
     def one(theta: Array, own: Array | None) -> tuple[Array, ...]:

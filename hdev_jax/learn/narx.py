@@ -91,6 +91,14 @@ class Narx:
         x, _ = self.regressors(trip)
         return self.output.undo(_output(self.structure.shape, jnp.asarray(self.theta), jnp.asarray(x)))
 
+    def step(self, x: Float[np.ndarray, " column"]) -> float:
+        """One step ahead of one row of normalised regressors, in NumPy for a controller; in the target's unit."""
+        p, s = _split(self.structure.shape, self.theta), self.structure.shape
+        y = p[0] + x[: s.linear] @ p[1]
+        if s.units:
+            y = y + p[2] @ (1.0 / (1.0 + np.exp(-(p[3] @ x[s.seen[0] :] + p[4]))))
+        return float(y * self.output.sd + self.output.mean)
+
     def simulate(self, trip: Trip) -> Float[np.ndarray, " row"]:
         """Free run, from the model's own past outputs (figure 11b), started from the measured rows before the first."""
         x, _ = self.regressors(trip)
@@ -103,6 +111,13 @@ class Narx:
     def measured(self, trip: Trip) -> Float[np.ndarray, " row"]:
         """What `predict` and `simulate` are to be compared with."""
         return np.asarray(trip.target)[self.structure.first :]
+
+
+def _split(shape: Shape, theta: np.ndarray) -> tuple[Any, ...]:
+    """The parts as views: `unpack` without JAX. What the units see ends with the last column."""
+    a, n, q = 1 + shape.linear, shape.units, len(shape.seen)
+    slope = theta[a + n : a + n + n * q].reshape(n, q)
+    return theta[0], theta[1:a], theta[a : a + n], slope, theta[a + n + n * q :]
 
 
 _output = jax.jit(output, static_argnums=0)
@@ -197,11 +212,12 @@ def fit_prediction(
     weights: np.ndarray | None = None,
     max_steps: int = 150,
     rtol: float = 1e-6,
+    single: bool = False,
 ) -> Fitted:
     """Fit the one-step error from several starts in one program (paper 2, section III-C).
 
     **Arguments:** `huber`, the corner of the loss in the target's unit; `ridge`, keywords of `penalty`; `weights`
-    `[start, row]` where starts differ in the rows they are fitted on.
+    `[start, row]` where starts differ in the rows they are fitted on; `single` as in `fit_many`.
     """
     x, y = model.regressors(trip)
     rows = rows_of(x, y)
@@ -209,7 +225,7 @@ def fit_prediction(
     shape = model.structure.shape
     return fit_many(
         shape, rows, jnp.asarray(begin), huber=huber / float(model.output.sd), ridge=penalty(shape, **(ridge or {})),
-        max_steps=max_steps, rtol=rtol, weights=own,
+        max_steps=max_steps, rtol=rtol, weights=own, single=single,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from hdev_jax.learn.network import Shape, direct, free_run
 __all__ = ["Equations", "Rows", "Windows", "one_step", "rows_of", "simulated", "windows_of"]
 
 Equations = tuple[Float[Array, ""], Float[Array, " parameter"], Float[Array, "parameter parameter"]]
-CHUNK = 2048  # rows: the Jacobian of a chunk stays in cache
+CHUNK = 256  # rows: the Jacobian of a chunk stays in cache
 BURN_IN = 64  # steps before a window counts: what is left of a wrong start is then below rounding for poles within 0.6
 
 
@@ -79,10 +79,13 @@ def _robust(error: Array, weight: Array, huber: Array) -> tuple[Array, Array]:
     return (weight * loss).sum(), weight * jnp.where(inside, 1.0, huber / jnp.where(inside, 1.0, size))
 
 
-def _add(total: Equations, error: Array, jac: Array, weight: Array, huber: Array) -> Equations:
+def _add(total: Equations, error: Array, jac: Array, weight: Array, huber: Array, single: bool) -> Equations:
     loss, w = _robust(error, weight, huber)
-    weighed = jac * w[:, None]
-    return total[0] + 0.5 * loss, total[1] + weighed.T @ error, total[2] + weighed.T @ jac
+    root = jac * jnp.sqrt(w)[:, None]
+    if single:  # a chunk's share of the Hessian, which only steers the step; the sum over chunks is kept in double
+        root = root.astype(jnp.float32)
+    hessian = (root.T @ root).astype(total[2].dtype)
+    return total[0] + 0.5 * loss, total[1] + (w * error) @ jac, total[2] + hessian
 
 
 def _empty(theta: Array) -> Equations:
@@ -90,17 +93,24 @@ def _empty(theta: Array) -> Equations:
     return jnp.zeros((), theta.dtype), jnp.zeros(p, theta.dtype), jnp.zeros((p, p), theta.dtype)
 
 
-def one_step(shape: Shape, theta: Float[Array, " parameter"], rows: Rows, huber: Float[Array, ""]) -> Equations:
-    """Loss, gradient and Gauss-Newton Hessian of ½Σ ρ(y − ŷ), ŷ from measured past outputs (paper 2, equation 20)."""
+def one_step(
+    shape: Shape, theta: Float[Array, " parameter"], rows: Rows, huber: Float[Array, ""], *, single: bool = False
+) -> Equations:
+    """Loss, gradient and Gauss-Newton Hessian of ½Σ ρ(y − ŷ), ŷ from measured past outputs (paper 2, equation 20).
+
+    `single`: products of the Hessian in float32, at half the time; loss and gradient, and so the minimum, are not.
+    """
 
     def add(total: Equations, chunk: Rows) -> tuple[Equations, None]:
         y, jac, _ = direct(shape, theta, chunk.x)
-        return _add(total, y - chunk.y, jac, chunk.weight, huber), None
+        return _add(total, y - chunk.y, jac, chunk.weight, huber, single), None
 
     return jax.lax.scan(add, _empty(theta), rows)[0]
 
 
-def simulated(shape: Shape, theta: Float[Array, " parameter"], windows: Windows, huber: Float[Array, ""]) -> Equations:
+def simulated(
+    shape: Shape, theta: Float[Array, " parameter"], windows: Windows, huber: Float[Array, ""], *, single: bool = False
+) -> Equations:
     """The same for the free run, every window at once.
 
     Sensitivities follow the recursion of the output, sₖ = ∂ŷₖ/∂θ + Σ ∂ŷₖ/∂ŷₖ₋ᵢ·sₖ₋ᵢ: gradients of all steps are worked
@@ -126,6 +136,6 @@ def simulated(shape: Shape, theta: Float[Array, " parameter"], windows: Windows,
         none = tuple(jnp.zeros_like(jac[0]) for _ in range(back))
         whole = jax.lax.scan(follow, none, (jac, fed))[1]
         error, weight = (y - w.y).reshape(-1), w.weight.reshape(-1)
-        return _add(total, error, whole.reshape(time * count, -1), weight, huber), None
+        return _add(total, error, whole.reshape(time * count, -1), weight, huber, single), None
 
     return jax.lax.scan(add, _empty(theta), windows)[0]

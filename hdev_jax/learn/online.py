@@ -30,7 +30,13 @@ def recursive(beta: Any, x: Any = None, *, prior: float = 1e6) -> Recursive:
 
 
 def update(
-    state: Recursive, x: Float[Any, " column"], y: Any, forgetting: Any, corner: Any = np.inf, ceiling: Any = np.inf
+    state: Recursive,
+    x: Float[Any, " column"],
+    y: Any,
+    forgetting: Any,
+    corner: Any = np.inf,
+    ceiling: Any = np.inf,
+    xp: Any = jnp,
 ) -> tuple[Recursive, Any]:
     """One row: the state after it, and its prediction from the state before it.
 
@@ -38,18 +44,18 @@ def update(
     Huber's weight w = min(1, corner/|e|). λ = 1 and an infinite corner is least squares of all rows so far.
 
     **Arguments:** `forgetting` λ in (0, 1]; `ceiling`: P grows no more once its trace is there, so that standing still,
-    which tells nothing, does not wind it up.
+    which tells nothing, does not wind it up; `xp`, NumPy where a row comes at a time, JAX inside a program.
     """
-    beta, covariance = jnp.asarray(state.beta), jnp.asarray(state.covariance)
+    beta, covariance = state
     predicted = x @ beta
     error = y - predicted
-    weight = jnp.minimum(1.0, corner / jnp.maximum(jnp.abs(error), 1e-300))
+    weight = xp.minimum(1.0, corner / xp.maximum(abs(error), 1e-300))
     along = covariance @ x
     gain = along / (forgetting / weight + x @ along)
-    smaller = covariance - gain[:, None] * along[None, :]
-    grown = smaller / forgetting
-    covariance = jnp.where(jnp.trace(grown) < ceiling, grown, smaller)
-    return Recursive(beta + gain * error, 0.5 * (covariance + covariance.T)), predicted
+    smaller = covariance - gain[:, None] * along[None, :]  # symmetric to rounding, whatever the order of the product
+    grown = xp.trace(smaller) < ceiling * forgetting
+    covariance = smaller / xp.where(grown, forgetting, 1.0)
+    return Recursive(beta + gain * error, covariance), predicted
 
 
 @jax.jit

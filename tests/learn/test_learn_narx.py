@@ -52,6 +52,9 @@ def test_model_is_the_loop(name, free):
     expected = narx_loop(model.theta, y, u, s.outputs, s.lags, s.units, seen_from, free)
     got = model.simulate(trip) if free else model.predict(trip)
     np.testing.assert_allclose(model.output.apply(got), expected, rtol=1e-9, atol=1e-9)
+    if not free:
+        x, _ = model.regressors(trip)
+        assert model.step(x[7]) == pytest.approx(got[7], rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["inputs", "all", "linear"])
