@@ -1,7 +1,7 @@
 """NARX models (paper 2, section III): regressors with lags, a sigmoid network, fits in prediction and in simulation."""
 
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import jax
@@ -50,7 +50,7 @@ class Structure:
         """The first row that has all its regressors."""
         return max(self.outputs, max(self.lags))
 
-    @property
+    @cached_property
     def shape(self) -> Shape:
         columns = self.outputs + len(self.source.names) * len(self.lags)
         seen = range(self.outputs if self.seen == "inputs" else 0, columns)
@@ -93,7 +93,8 @@ class Narx:
 
     def step(self, x: Float[np.ndarray, " column"]) -> float:
         """One step ahead of one row of normalised regressors, in NumPy for a controller; in the target's unit."""
-        p, s = _split(self.structure.shape, self.theta), self.structure.shape
+        s = self.structure.shape
+        p = _split(s, self.theta)
         y = p[0] + x[: s.linear] @ p[1]
         if s.units:
             y = y + p[2] @ (1.0 / (1.0 + np.exp(-(p[3] @ x[s.seen[0] :] + p[4]))))
