@@ -1,0 +1,145 @@
+"""The models of paper 2's tables: each kind fitted on trip 1, by settings of a config, with the spread over starts."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hdev_jax.errors import InputError
+from hdev_jax.learn import (
+    Channels,
+    KernelTerms,
+    Narx,
+    Structure,
+    Trip,
+    fit_prediction,
+    fit_simulation,
+    prepared,
+    starts,
+    with_theta,
+)
+from hdev_jax.learn.classical import search_classical
+from hdev_jax.learn.recurrent import train_recurrent
+from hdev_jax.learn.sequences import energy_kwh, mean_squared
+
+__all__ = ["KINDS", "evaluated", "fitted", "step_seconds"]
+
+Model = Any
+Fit = tuple[list[Model], list[float]]
+
+
+def structure(s: dict[str, Any]) -> Structure:
+    """Orders and units of a config's model."""
+    source = KernelTerms(s["kernel_order"]) if s["source"] == "kernel" else Channels(tuple(s["inputs"]))
+    return Structure(source, s["outputs"], tuple(s["lags"]), s["units"], s["seen"], s["linear"])
+
+
+def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
+    """One-step fit from many starts; then, where `simulation`, the free run from its solutions."""
+    shape = structure(s)
+    model, ridge = prepared(shape, trip), {"size": s["ridge_size"], "slope": s["ridge_slope"]}
+    huber = s["huber_kw"] if s["huber_kw"] else np.inf
+    if shape.units:
+        keys = jax.random.split(jax.random.key(seed), s["starts"])
+        begin = starts(model, trip, keys=keys, steps=s["coarse_steps"], huber=huber, ridge=ridge)
+    else:
+        begin = jnp.zeros((1, shape.shape.size))
+    common = {"huber": huber, "ridge": ridge, "rtol": s["rtol"]}
+    fit = fit_prediction(model, trip, begin, max_steps=s["steps"], **common)
+    if s["simulation"]:
+        fit = fit_simulation(model, trip, fit.theta, max_steps=s["simulation_steps"], **common)
+    order = np.argsort(np.nan_to_num(np.asarray(fit.loss), nan=np.inf))
+    return [with_theta(model, fit.theta[k]) for k in order], [float(fit.loss[k]) for k in order]
+
+
+def _recurrent(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
+    """A network for each start, ordered by its error on the training trip."""
+    keys = jax.random.split(jax.random.key(seed), s["starts"])
+    huber = s["huber_kw"] if s["huber_kw"] else np.inf
+    models = [
+        train_recurrent(s["cell"], trip, key=k, source=Channels(tuple(s["inputs"])), units=s["units"],
+                        steps=s["steps"], length=s["length"], rate=s["rate"], decay=s["decay"], huber=huber)
+        for k in keys
+    ]  # fmt: skip
+    loss = [mean_squared(m.predict(trip) - m.measured(trip)) for m in models]
+    order = np.argsort(loss)
+    return [models[k] for k in order], [loss[k] for k in order]
+
+
+def _classical(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
+    model = search_classical(s["model"], trip, trials=s["trials"], seed=seed, source=Channels(tuple(s["inputs"])))
+    return [model], [model.score]
+
+
+class _Persistence:
+    """ŷ(k) = y(k−1); in free run, the first value for ever."""
+
+    parameters = 0
+
+    def predict(self, trip: Trip) -> np.ndarray:
+        return np.asarray(trip.target)[:-1]
+
+    def simulate(self, trip: Trip) -> np.ndarray:
+        return np.full(len(trip) - 1, trip.target[0])
+
+    def measured(self, trip: Trip) -> np.ndarray:
+        return np.asarray(trip.target)[1:]
+
+
+def _persistence(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
+    return [_Persistence()], [0.0]
+
+
+KINDS: dict[str, Callable[[dict[str, Any], Trip, int], Fit]] = {
+    "narx": _narx,
+    "recurrent": _recurrent,
+    "classical": _classical,
+    "persistence": _persistence,
+}
+
+
+def fitted(settings: dict[str, Any], trip: Trip, seed: int) -> tuple[list[Model], list[float], float]:
+    """Models in the order of their loss on the training trip, those losses, and seconds. The first is *the* model."""
+    if settings["kind"] not in KINDS:
+        raise InputError(f"model kind {settings['kind']!r}: one of {', '.join(KINDS)} is expected")
+    started = time.perf_counter()
+    models, losses = KINDS[settings["kind"]](settings, trip, seed)
+    return models, losses, time.perf_counter() - started
+
+
+def evaluated(model: Model, trip: Trip) -> dict[str, float]:
+    """Errors, fit and energies of one trip, one step ahead (`step_`) and in free run (`free_`)."""
+    measured = model.measured(trip)
+    total, positive, negative = energy_kwh(measured, trip.dt_s)
+    out = {"n": len(measured), "energy": total, "energy_positive": positive, "energy_negative": negative}
+    for name, y in (("step", model.predict(trip)), ("free", model.simulate(trip))):
+        error = y - measured
+        sums = energy_kwh(y, trip.dt_s)
+        out |= {
+            f"{name}_mse": mean_squared(error),
+            f"{name}_fit": 100.0 * (1.0 - float(np.sqrt(np.mean(error**2)) / np.std(measured))),
+            f"{name}_energy": sums[0], f"{name}_energy_positive": sums[1], f"{name}_energy_negative": sums[2],
+        }  # fmt: skip
+        for kind, ours, theirs in zip(("", "_positive", "_negative"), sums, (total, positive, negative), strict=True):
+            out[f"{name}_pe{kind}"] = 100.0 * (ours - theirs) / theirs if theirs else 0.0
+    return out
+
+
+def step_seconds(model: Model, trip: Trip, repeats: int = 5) -> float:
+    """Wall time of a free run over a trip, by row [s]; the fastest of `repeats`, compiled before. A rough figure:
+    `benchmarks/narx.py` measures with care."""
+    model.simulate(trip)
+    taken = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        model.simulate(trip)
+        taken.append(time.perf_counter() - started)
+    return min(taken) / len(trip)
+
+
+def is_narx(model: Model) -> bool:
+    """Whether the model feeds outputs back."""
+    return isinstance(model, Narx)

@@ -1,0 +1,143 @@
+"""LSTM and GRU (paper 2, section IV) in Equinox, trained by Adam on windows of a trip."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from hdev_jax.errors import InputError
+from hdev_jax.learn.sequences import Scale, Trip
+from hdev_jax.learn.sources import Channels, Source
+
+__all__ = ["Recurrent", "RecurrentModel", "train_recurrent"]
+
+GAIN = 5.0
+CELLS = {"lstm": eqx.nn.LSTMCell, "gru": eqx.nn.GRUCell}
+
+
+class Recurrent(eqx.Module):
+    """One layer of cells and a linear read-out of the hidden state; float32, as it is trained.
+
+    The hidden state is bounded, power is not. Read out times `GAIN`, the state stays small, where it is nearly linear,
+    and a trip that goes further than the training trip is not cut off.
+    """
+
+    cell: eqx.nn.LSTMCell | eqx.nn.GRUCell
+    head: eqx.nn.Linear
+    memory: int = eqx.field(static=True)
+
+    def __init__(self, kind: str, inputs: int, units: int, *, key: PRNGKeyArray):
+        if kind not in CELLS:
+            raise InputError(f"recurrent cell {kind!r}: one of {', '.join(CELLS)}")
+        first, second = jax.random.split(key)
+        self.cell = CELLS[kind](inputs, units, dtype=jnp.float32, key=first)
+        self.head = eqx.nn.Linear(units, 1, dtype=jnp.float32, key=second)
+        self.memory = units
+
+    def __call__(self, x: Float[Array, "time inputs"]) -> Float[Array, " time"]:
+        """Output of every row; the state begins at zero."""
+        zero = jnp.zeros(self.memory, x.dtype)
+        first: Any = (zero, zero) if isinstance(self.cell, eqx.nn.LSTMCell) else zero
+
+        def step(state: Any, row: Array) -> tuple[Any, Array]:
+            state = self.cell(row, state)
+            return state, state[0] if isinstance(state, tuple) else state
+
+        hidden = jax.lax.scan(step, first, x)[1]
+        return GAIN * (hidden @ self.head.weight[0]) + (0.0 if self.head.bias is None else self.head.bias[0])
+
+
+@dataclass(frozen=True)
+class RecurrentModel:
+    """A trained network with its scales. It feeds nothing measured back: prediction and simulation are the same."""
+
+    network: Recurrent
+    source: Source
+    inputs: Scale
+    output: Scale
+
+    @property
+    def parameters(self) -> int:
+        """Trained parameters."""
+        return sum(x.size for x in jax.tree.leaves(eqx.filter(self.network, eqx.is_array)))
+
+    def predict(self, trip: Trip) -> Float[np.ndarray, " row"]:
+        """Output for every row of a trip, in the target's unit."""
+        x = jnp.asarray(self.inputs.apply(self.source(trip)), dtype=jnp.float32)
+        return self.output.undo(_run(self.network, x))
+
+    def simulate(self, trip: Trip) -> Float[np.ndarray, " row"]:
+        """The same as `predict`."""
+        return self.predict(trip)
+
+    def measured(self, trip: Trip) -> Float[np.ndarray, " row"]:
+        """What they are to be compared with."""
+        return np.asarray(trip.target)
+
+
+@eqx.filter_jit
+def _run(network: Recurrent, x: Array) -> Array:
+    return network(x)
+
+
+def train_recurrent(
+    kind: str,
+    trip: Trip,
+    *,
+    key: PRNGKeyArray,
+    source: Source | None = None,
+    units: int = 10,
+    steps: int = 4000,
+    batch: int = 128,
+    length: int = 128,
+    burn_in: int = 32,
+    rate: float = 0.02,
+    decay: float = 0.03,
+    huber: float = np.inf,
+) -> RecurrentModel:
+    """Adam with a cosine schedule from `rate` to 0 over `steps` batches of windows from random places of the trip.
+
+    **Arguments:** `length` rows of a window count, after `burn_in` that only fill the memory; `decay` of the
+    weights (Loshchilov and Hutter 2019), of the cell, not of the read-out, times the rate; `huber`, corner of the
+    loss in the target's unit. Raises `InputError` for a trip shorter than a window.
+    """
+    import optax
+
+    source = Channels() if source is None else source
+    columns = source(trip)
+    window = length + burn_in
+    if len(trip) <= window:
+        raise InputError(f"trip {trip.name}: {len(trip)} rows, a window has {window}; make `length` shorter")
+    scales = Scale.of(columns), Scale.of(trip.target)
+    x = jnp.asarray(scales[0].apply(columns), dtype=jnp.float32)
+    y = jnp.asarray(scales[1].apply(trip.target), dtype=jnp.float32)
+    corner = min(huber / float(scales[1].sd), 1e6)
+    begin, draw = jax.random.split(key)
+    network = Recurrent(kind, x.shape[1], units, key=begin)
+    weights, static = eqx.partition(network, eqx.is_array)
+    cell_only = eqx.tree_at(
+        lambda n: n.cell, jax.tree.map(lambda _: False, weights), jax.tree.map(lambda _: True, weights.cell)
+    )
+    schedule = optax.cosine_decay_schedule(rate, steps)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=decay, mask=cell_only))
+
+    def loss(weights: Any, xs: Array, ys: Array) -> Array:
+        error = jax.vmap(eqx.combine(weights, static))(xs)[:, burn_in:] - ys[:, burn_in:]
+        return jnp.mean(optax.huber_loss(error, delta=corner)) / corner
+
+    @jax.jit
+    def learn(weights: Any, state: Any, keys: Array) -> Any:
+        def one(carry: Any, key: Array) -> tuple[Any, None]:
+            weights, state = carry
+            at = jax.random.randint(key, (batch, 1), 0, x.shape[0] - window + 1) + jnp.arange(window)[None, :]
+            update, state = optimiser.update(jax.grad(loss)(weights, x[at], y[at]), state, weights)
+            return (optax.apply_updates(weights, update), state), None
+
+        return jax.lax.scan(one, (weights, state), keys)[0]
+
+    weights, _ = learn(weights, optimiser.init(weights), jax.random.split(draw, steps))
+    return RecurrentModel(eqx.combine(weights, static), source, *scales)

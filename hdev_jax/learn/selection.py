@@ -1,0 +1,79 @@
+"""Choices made on the training trip alone: blocks of time left out, and what lies at the edge left out too."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdev_jax.learn.narx import Narx, Structure, fit_prediction, prepared, starts, with_theta
+from hdev_jax.learn.sequences import Trip, blocks, mean_squared
+
+__all__ = ["Score", "edge", "folds", "validated"]
+
+
+@dataclass(frozen=True)
+class Score:
+    """MSE of rows left out, in the squared unit of the target: of blocks of time, of the edge, and of both together.
+
+    `mse` counts a row of the edge twice: once as time, once as the edge.
+    """
+
+    mse: float
+    blocks: float
+    edge: float
+    by_start: tuple[float, ...]
+
+
+def edge(target: Any, share: float = 0.01) -> np.ndarray:
+    """The rows of the smallest and the largest `share` of the target.
+
+    Other trips brake and accelerate harder than the training trip: a choice by blocks of time never sees that.
+    """
+    low, high = np.quantile(target, [share, 1 - share])
+    return (np.asarray(target) < low) | (np.asarray(target) > high)
+
+
+def folds(target: Any, count: int) -> list[np.ndarray]:
+    """Rows left out of each fold: `count` contiguous blocks, and the edge."""
+    number = blocks(len(target), count)
+    return [*(number == k for k in range(count)), edge(target)]
+
+
+def validated(
+    structure: Structure,
+    trip: Trip,
+    *,
+    key: Array,
+    count: int,
+    blocks: int = 3,
+    huber: float,
+    ridge: Any,
+    steps: int = 80,
+) -> Score:
+    """One step ahead on rows left out, from `count` starts in each fold, all fits in one program."""
+    model = prepared(structure, trip)
+    left_out = folds(model.measured(trip), blocks)
+    weights = np.repeat(np.stack([1.0 - f for f in left_out]), count, axis=0)
+    keys = jax.random.split(key, len(weights))
+    begin = starts(model, trip, keys=keys, huber=huber, ridge=ridge, weights=weights)
+    fit = fit_prediction(model, trip, begin, huber=huber, ridge=ridge, weights=weights, max_steps=steps, rtol=1e-5)
+    thetas = np.asarray(fit.theta).reshape(len(left_out), count, -1)
+    return _score(model, trip, left_out, [[with_theta(model, t) for t in fold] for fold in thetas])
+
+
+def _score(model: Narx, trip: Trip, left_out: list[np.ndarray], fitted: Sequence[Sequence[Narx]]) -> Score:
+    measured, starts_of = model.measured(trip), len(fitted[0])
+    error = np.zeros((starts_of, len(measured)))
+    at_edge = np.zeros((starts_of, int(left_out[-1].sum())))
+    for rows, models in zip(left_out, fitted, strict=True):
+        for k, m in enumerate(models):
+            e = m.predict(trip)[rows] - measured[rows]
+            if rows is left_out[-1]:
+                at_edge[k] = e
+            else:
+                error[k, rows] = e
+    both: Float[np.ndarray, "start row"] = np.concatenate([error, at_edge], axis=1)
+    return Score(mean_squared(both), mean_squared(error), mean_squared(at_edge), tuple(np.mean(both**2, axis=1)))

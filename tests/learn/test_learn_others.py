@@ -1,0 +1,86 @@
+"""Recursive least squares, recurrent networks and searched models."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from learn_rows import drive
+
+from hdev_jax.errors import InputError
+from hdev_jax.learn.classical import CLASSICAL, search_classical
+from hdev_jax.learn.online import follow, recursive
+from hdev_jax.learn.recurrent import train_recurrent
+
+
+def rows(n=200, columns=3, seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(n, columns))
+    return x, x @ np.arange(1.0, columns + 1) + 0.1 * rng.normal(size=n)
+
+
+@given(st.integers(0, 1000), st.integers(1, 5))
+def test_recursive_without_forgetting_is_least_squares(seed, columns):
+    x, y = rows(120, columns, seed)
+    state, _ = follow(recursive(np.zeros(columns), prior=1e9), x, y, forgetting=1.0)
+    np.testing.assert_allclose(state.beta, np.linalg.lstsq(x, y, rcond=None)[0], rtol=1e-5, atol=1e-6)
+
+
+def test_forgetting_weighs_rows_by_age():
+    x, y = rows()
+    factor = 0.97
+    state, _ = follow(recursive(np.zeros(3), prior=1e9), x, y, forgetting=factor)
+    w = factor ** np.arange(len(y))[::-1]
+    expected = np.linalg.solve((x * w[:, None]).T @ x, (x * w[:, None]).T @ y)
+    np.testing.assert_allclose(state.beta, expected, rtol=1e-5)
+
+
+def test_a_change_is_followed():
+    x, y = rows(2000)
+    y[1000:] += 0.5 * x[1000:, 0]
+    state, _ = follow(recursive(np.zeros(3)), x, y, forgetting=0.99)
+    assert state.beta[0] == pytest.approx(1.5, abs=0.05)
+
+
+def test_a_row_that_tells_nothing_does_not_wind_up():
+    state, _ = follow(
+        recursive(np.ones(2), np.eye(2)), np.zeros((5000, 2)), np.zeros(5000), forgetting=0.99, ceiling=10.0
+    )
+    assert np.trace(state.covariance) < 10.0
+
+
+def test_forgetting_outside_its_range_is_one_line():
+    with pytest.raises(InputError, match="above 0 and at most 1"):
+        follow(recursive(np.zeros(3)), *rows(), forgetting=1.5)
+
+
+@pytest.mark.parametrize("kind", ["lstm", "gru"])
+def test_recurrent_network_learns(kind):
+    trip = drive(600)
+    model = train_recurrent(kind, trip, key=jax.random.key(0), units=4, steps=150, batch=16, length=32, burn_in=8)
+    error = model.predict(trip) - model.measured(trip)
+    assert np.mean(error**2) < 0.3 * np.var(trip.target)
+    assert model.parameters == sum(x.size for x in jax.tree.leaves(model.network) if hasattr(x, "size"))
+
+
+def test_recurrent_refuses_in_one_line():
+    with pytest.raises(InputError, match="one of lstm, gru"):
+        train_recurrent("rnn", drive(300), key=jax.random.key(0))
+    with pytest.raises(InputError, match="a window has"):
+        train_recurrent("lstm", drive(100), key=jax.random.key(0))
+
+
+@pytest.mark.parametrize("kind", CLASSICAL)
+def test_searched_models_beat_the_mean(kind):
+    pytest.importorskip("optuna")
+    trip = drive(600)
+    model = search_classical(kind, trip, trials=2, seed=0)
+    error = model.predict(trip) - model.measured(trip)
+    assert np.mean(error**2) < np.var(trip.target)
+    assert model.parameters > 0
+
+
+def test_unknown_model_is_one_line():
+    pytest.importorskip("optuna")
+    with pytest.raises(InputError, match="one of tree"):
+        search_classical("forest", drive(100), trials=1, seed=0)
