@@ -144,18 +144,22 @@ def _described(
 def _shadow(
     problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, left: Remainder
 ) -> str | None:
-    """A found effect that explains less than the structure that is left, and may be no more than its mean.
+    """A found effect that may be no more than the mean of the structure that is left, the latest first.
 
-    The mean of a cause that the library does not hold is a constant load, its mean in each trip looks like something
-    that differs between trips; naming it so would be wrong.
+    The mean of a cause that the library does not hold is a constant load: one that reads no channel and explains less
+    than what is left is no cause of its own. The mean in each trip of a cycle is something that differs between trips:
+    what only trips tell is none, where a load in proportion to the cycle's swing in each of them explains as much.
     """
     if not left.significant:
         return None
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
-        mean_of_it = f.between or effect.id == "power_gain" or (effect.stage == "battery" and not effect.needs)
-        if mean_of_it and max(mse[k] - mse[k + 1], 0.0) < left.mean**2:
+        gain = max(mse[k] - mse[k + 1], 0.0)
+        reads_nothing = effect.id == "power_gain" or (effect.stage == "battery" and not effect.needs)
+        residual = (problem.measured - predicted[k])[train]
+        swing = float(left.cycle @ residual) ** 2 / max(float(left.cycle @ left.cycle), 1e-300) / len(residual)
+        if (reads_nothing and gain < left.rms**2) or (f.between and gain <= swing):
             return f.id
     return None
 

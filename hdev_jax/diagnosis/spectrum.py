@@ -21,11 +21,15 @@ LEAST_RATIO = 1.5  # of a peak to the noise around it
 
 @dataclass(frozen=True)
 class Period:
-    """A peak of the spectrum: its period [s], its amplitude in units of `worth`, and p over all frequencies."""
+    """A peak of the spectrum: its period [s], its amplitude in units of `worth`, and p over all frequencies.
+
+    `amplitudes` are those of the window that a row is in.
+    """
 
     period_s: float
     amplitude: float
     p: float
+    amplitudes: Float[np.ndarray, " row"]
 
 
 @dataclass(frozen=True)
@@ -105,8 +109,12 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
     p = float(stats.gamma.sf(height, count)) * len(inside) / per if height >= LEAST_RATIO * count else 1.0
     near = inside[np.abs(inside - k) <= 2 * per]  # a strong peak lifts the floor beneath itself least at its feet
     k = int(near[np.argmax(power[near])])
-    period, amplitude = _refined(residual, rows, pieces, float(frequency[k]), 1 / (size * step))
-    return Period(period, amplitude, min(p, 1.0))
+    period, by_window = _refined(residual, rows, pieces, float(frequency[k]), 1 / (size * step))
+    mean = float(np.sqrt(np.mean(by_window**2)))
+    amplitudes = np.full(len(residual), mean)  # the end of a trip, in no window, has that of the others
+    for piece, x in zip(pieces, by_window, strict=True):
+        amplitudes[piece] = x
+    return Period(period, mean, min(p, 1.0), amplitudes)
 
 
 def _windows(clock: np.ndarray, trip: slice, window: float) -> list[slice]:
@@ -144,10 +152,10 @@ def _floor(power: np.ndarray, k: int, per: int, count: int) -> float:
 
 def _refined(
     residual: np.ndarray, rows: Clocked, pieces: list[slice], frequency: float, width: float
-) -> tuple[float, float]:
-    """Period and amplitude (root mean square over windows) by least squares on whitened rows near a frequency."""
+) -> tuple[float, np.ndarray]:
+    """Period and amplitude in each window by least squares on whitened rows near a frequency."""
     white = rows.whitened(residual[:, None])[:, 0]
-    best = (-1.0, 0.0, 0.0)
+    best = (-1.0, 0.0, np.zeros(len(pieces)))
     for f in frequency + width * np.linspace(-1, 1, 9):
         angle = 2 * np.pi * f * rows.clock_s
         columns = rows.whitened(rows.worth[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -157,5 +165,5 @@ def _refined(
             gain += float(white[s] @ columns[s] @ x)
             square.append(float(x @ x))
         if gain > best[0]:
-            best = gain, float(1.0 / f), float(np.sqrt(np.mean(square)))
+            best = gain, float(1.0 / f), np.sqrt(square)
     return best[1], best[2]

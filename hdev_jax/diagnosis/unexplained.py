@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
+from hdev_jax.diagnosis.spectrum import Clocked, Period, strongest_period
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import Clusters
 from hdev_jax.segments import trip_slices
@@ -30,7 +30,7 @@ class Remainder:
     depends_on: tuple[str, ...]
     signature: str
     rms: float  # of the structure seen, in the target's unit; 0 where none is
-    mean: float  # rms of what it may add on the average, which something else may have been named for
+    cycle: Float[np.ndarray, " train"]  # a load as large as the cycle's swing about each training row; 0 where none is
     correction: Float[np.ndarray, " test"]
     expression: str | None = None
 
@@ -43,7 +43,7 @@ class Remainder:
         start, between = (self.signature.rstrip("."), "; ") if self.significant else ("What is left", ": ")
         return replace(
             self, significant=True, depends_on=tuple(dict.fromkeys((*channels, *self.depends_on))),
-            signature=f"{start}{between}{words}.", rms=max(self.rms, rms), mean=max(self.mean, rms), expression=formula,
+            signature=f"{start}{between}{words}.", rms=max(self.rms, rms), expression=formula,
         )  # fmt: skip
 
 
@@ -84,16 +84,14 @@ def remainder(
     period = _period(train, noise)
     steps = _change_point(white, train.trip)
     level = _levels(train, noise)
-    parts, depends, sizes, means = [], [], [0.0], [0.0]
+    parts, depends, sizes = [], [], [0.0]
     if learned:
         sizes.append(float(np.sqrt(share * np.mean(test.residual**2))))
         depends += list(order)
         parts.append(f"{100 * share:.0f} % of it follows {', '.join(order)} in a way the library does not hold")
     if period is not None:
-        seconds, amplitude = period
+        seconds, amplitude = period.period_s, period.amplitude
         sizes.append(_rms(train, amplitude))
-        # a load that goes up and down from nothing: its mean is up to twice its first harmonic
-        means.append(2.0 * np.sqrt(2.0) * sizes[-1])
         depends.append("time_s")
         clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
         parts.append(f"a {clock} cycle of about {amplitude:.3g} {train.cycle_unit}")
@@ -111,9 +109,10 @@ def remainder(
     rmse = float(np.sqrt(np.mean(test.residual**2)))
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
-    rms, mean = max(sizes), max(*sizes, *means)
+    rms = max(sizes)
+    cycle = train.worth * period.amplitudes if period is not None else np.zeros(len(train.residual))
     depends_on = tuple(dict.fromkeys(depends))
-    return Remainder(bool(parts), share, floor, depends_on, signature + ".", rms, mean, correction)
+    return Remainder(bool(parts), share, floor, depends_on, signature + ".", rms, cycle, correction)
 
 
 def _colour(noise: Noise) -> str:
@@ -185,12 +184,12 @@ def _rms(rows: Rows, amplitude: float) -> float:
     return float(amplitude * np.sqrt(0.5 * np.mean(rows.worth**2)))
 
 
-def _period(rows: Rows, noise: Noise) -> tuple[float, float] | None:
-    """Period and amplitude of a cycle that noise with the spectrum around it could not have made."""
+def _period(rows: Rows, noise: Noise) -> Period | None:
+    """A cycle that noise with the spectrum around it could not have made."""
     hit = strongest_period(rows.residual, Clocked.of(rows.trip, rows.duration_s, rows.worth, noise))
     if hit is None or hit.p > LEVEL or _rms(rows, hit.amplitude) ** 2 < LEAST_SHARE * np.mean(rows.residual**2):
         return None
-    return hit.period_s, hit.amplitude
+    return hit
 
 
 def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[Rows], float]] | None:

@@ -40,15 +40,14 @@ def cycle_of(rows):
 def test_a_cycle_is_found_with_its_period_and_size(rho, trips, cycles, size):
     found = cycle_of(residual(np.random.default_rng(1), trips, 300, rho=rho, cycles=cycles, size=size))
     assert found is not None
-    period, amplitude = found
-    assert period == pytest.approx(600.0 / cycles, rel=0.03)
-    assert amplitude == pytest.approx(np.sqrt(2) * size, rel=0.12)
+    assert found.period_s == pytest.approx(600.0 / cycles, rel=0.03)
+    assert found.amplitude == pytest.approx(np.sqrt(2) * size, rel=0.12)
 
 
 def test_a_single_trip_is_its_own_repetition():
     found = cycle_of(residual(np.random.default_rng(2), 1, 3000, cycles=40, size=1.0))
     assert found is not None
-    assert found[0] == pytest.approx(150.0, rel=0.02)
+    assert found.period_s == pytest.approx(150.0, rel=0.02)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9, 0.97])
