@@ -31,6 +31,7 @@ ROUNDS = 3  # of choosing period, duty and phases in turn
 UNLIKE = 1e-3  # p from which on a cycle is not the same in every trip, or no square wave
 SPREAD = 0.3  # of its size over trips, beyond which it is not the same in every trip
 OTHER = 0.1  # of the square wave's gain that other waves of the same period may add
+WITHIN = 1.5  # of the shortest and the longest period, so that a fit may move
 COST = 3.0  # of each of its numbers, in log-likelihood
 LEAST_SHARE = 0.02  # of the residual's variance
 RESAMPLES = 100
@@ -67,8 +68,12 @@ class _Rows(Clocked):
 
 def add_cycle(problem: Loop, state: Search) -> tuple[Search | None, Verdict | None]:
     """The state with a periodic load added and refitted, or a verdict on why it is not; neither where it cannot be."""
-    if state.vehicle.has(ID) or PeriodicLoad not in problem.effects or problem.target not in BATTERY_TARGETS:
+    if state.vehicle.has(ID) or PeriodicLoad not in problem.effects:
         return None, None
+    if problem.target not in BATTERY_TARGETS:
+        return None, Verdict(ID, None, 1.0, f"not tried: acts behind the target {problem.target}")
+    if ID in state.taken_out:
+        return None, Verdict(ID, None, 1.0, "superfluous beside what was added later")
     residual = problem.measured - state.fit.predicted
     rows = _rows(problem, residual, residual)
     hit = strongest_period(residual, rows)
@@ -77,6 +82,9 @@ def add_cycle(problem: Loop, state: Search) -> tuple[Search | None, Verdict | No
     q = min(1.0, hit.p * len(problem.effects))
     if q > problem.fdr:
         return None, Verdict(ID, None, q, f"no cycle stands out of the spectrum of the noise (q = {q:.2g})")
+    period = next(p for p in PeriodicLoad.parameters if p.name == "period_s")
+    if not WITHIN * period.lower < hit.period_s < period.upper / WITHIN:
+        return None, Verdict(ID, None, q, f"a cycle of {hit.period_s:.3g} s, which no load is switched in")
     wave, square = _fitted(rows, hit.period_s)
     # the noise is quieter, and phases are sharper, without the cycle
     load = rows.worth * rows.load(wave) * _common(rows, square[:, None])[1]

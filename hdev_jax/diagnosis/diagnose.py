@@ -156,7 +156,8 @@ def _shadow(
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
         gain = max(mse[k] - mse[k + 1], 0.0)
-        reads_nothing = effect.id == "power_gain" or (effect.stage == "battery" and not effect.needs)
+        constant = effect.stage == "battery" and not (effect.needs or effect.searched)
+        reads_nothing = effect.id == "power_gain" or constant
         residual = (problem.measured - predicted[k])[train]
         swing = float(left.cycle @ residual) ** 2 / max(float(left.cycle @ left.cycle), 1e-300) / len(residual)
         if (reads_nothing and gain < left.rms**2) or (f.between and gain <= swing):

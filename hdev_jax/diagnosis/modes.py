@@ -26,6 +26,7 @@ ID = ModeChange.id
 LEAST_TRIPS = 8  # with fewer, any trips fall into two groups
 LEAST_SIDE = 2  # trips of either mode
 ENOUGH = 0.01  # p from which on two values leave trips that differ still
+BEATS = 3.0  # in log-likelihood, that two values are better than levels that differ at random
 LEAST_SHARE = 0.02  # of the residual's variance
 RESAMPLES = 100
 
@@ -35,8 +36,12 @@ Grams = Float[np.ndarray, "trip d d"]
 def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | None]:
     """The state with a mode of some trips added and refitted, or a verdict on why it is not; neither where no trip's
     mode could be told."""
-    if state.vehicle.has(ID) or ModeChange not in problem.effects or problem.target not in BATTERY_TARGETS:
+    if state.vehicle.has(ID) or ModeChange not in problem.effects:
         return None, None
+    if problem.target not in BATTERY_TARGETS:
+        return None, Verdict(ID, None, 1.0, f"not tried: acts behind the target {problem.target}")
+    if ID in state.taken_out:
+        return None, Verdict(ID, None, 1.0, "superfluous beside what was added later")
     slices = [s for _, s in trip_slices(problem.trip)]
     if len(slices) < LEAST_TRIPS:
         return None, Verdict(ID, None, 1.0, f"needs {LEAST_TRIPS} trips to fall into two groups")
@@ -56,14 +61,13 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
             best = c, split
     if best is None:
         return None, Verdict(ID, None, 1.0, "no trip tells of it")
-    c, (gain, z, size, left) = best
+    c, (gain, z, size, left, over_levels) = best
     n = len(slices)
-    # every way to split the trips in two counts, and every coefficient that may have a second value
-    p = min(1.0, float(stats.chi2.sf(2.0 * gain, 1)) * 2.0 ** (n - 1) * len(plan.candidates))
+    p = _p(gain, n, len(plan.candidates))
     q = min(1.0, p * len(problem.effects))
     if q > problem.fdr:
         return None, Verdict(ID, gain, q, f"trips do not fall into two groups (q = {q:.2g})")
-    if stats.chi2.sf(2.0 * left, n - 2) < ENOUGH:
+    if stats.chi2.sf(2.0 * left, n - 2) < ENOUGH or over_levels < BEATS:
         return None, Verdict(ID, gain, q, "trips differ, but two values are not enough for them")
     if _ordered(z):
         return None, Verdict(ID, gain, q, "a change that stays from one trip on says as much")
@@ -77,7 +81,8 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     before = float(np.mean((problem.measured - state.fit.predicted) ** 2))
     if new is None or before - float(np.mean((problem.measured - new.fit.predicted) ** 2)) < LEAST_SHARE * before:
         return None, Verdict(ID, gain, q, "in the joint refit it is out of range or not told from nothing")
-    found = Found(ID, score, q, _stability(evidence.grams, c, base, z), (), gain)
+    stability = _stability(evidence.grams, c, base, z)
+    found = Found(ID, score, q, stability, (), gain, between=c.sizes == ("power_w",))
     return replace(new, found=[*state.found, found]), None
 
 
@@ -88,9 +93,18 @@ def _solved(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     return 0.5 * float(b @ x), x
 
 
-def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray) -> tuple[float, np.ndarray, float, float] | None:
-    """Gain of the best split of the trips in two, the trips of the second mode, its size, and what more one value for
-    each trip would gain; None where no trip has the column."""
+def _p(gain: float, trips: int, coefficients: int) -> float:
+    """p of a split: every way to split the trips in two counts, and every coefficient that may have a second value."""
+    ways = (trips - 1) * np.log(2.0) + np.log(coefficients)
+    return float(np.exp(min(stats.chi2.logsf(2.0 * gain, 1) + ways, 0.0)))
+
+
+def _split(
+    grams: Grams, precision: np.ndarray, pull: np.ndarray
+) -> tuple[float, np.ndarray, float, float, float] | None:
+    """Gain of the best split of the trips in two, the trips of the second mode, its size, what more one value for
+    each trip would gain, and how much better two values are than levels that differ at random; None where no trip has
+    the column."""
     n, base = len(grams), len(pull)
     cross, square, told = grams[:, :base, base], grams[:, base, base], grams[:, base, base + 1]
     if np.count_nonzero(square > 1e-20) < LEAST_TRIPS:
@@ -110,7 +124,25 @@ def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray) -> tuple[float
         if best is None or gain > best[0]:
             best = gain, z, float(y[-1])
     assert best is not None
-    return best[0] - alone, best[1], best[2], max(every - best[0], 0.0)
+    better = _over_levels(x[base:], np.maximum(square, 1e-300), best[1])
+    return best[0] - alone, best[1], best[2], max(every - best[0], 0.0), better
+
+
+def _over_levels(x: np.ndarray, precision: np.ndarray, z: np.ndarray) -> float:
+    """Log-likelihood of trips' sizes with two values, less that with normal levels of the variance that suits them."""
+
+    def likelihood(group: np.ndarray, variance: float) -> float:
+        total = variance + 1.0 / precision[group]
+        mean = float(np.sum(x[group] / total) / np.sum(1.0 / total))
+        return -0.5 * float(np.sum((x[group] - mean) ** 2 / total + np.log(total)))
+
+    # which trip is in which mode was chosen: each choice costs what a coin would
+    two = likelihood(z > 0, 0.0) + likelihood(z == 0, 0.0) - len(z) * float(np.log(2.0))
+    spread = float(np.var(x)) + 1e-300
+    return two - max(likelihood(z >= 0, v * spread) for v in LEVELS)
+
+
+LEVELS = (0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)  # of the sizes' own variance
 
 
 def _ordered(z: np.ndarray) -> bool:

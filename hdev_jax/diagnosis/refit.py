@@ -27,8 +27,9 @@ MOST_SHARPENED = 3
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
 
-def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, float] | None:
-    """The joint refit with a candidate, and its gain in whitened log-likelihood; None where it fails."""
+def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, float, Score] | None:
+    """The joint refit with a candidate, its gain in whitened log-likelihood, and the score with the shapes that it
+    started from (what is held stays there); None where it fails."""
     c = s.candidate
     shaped = any(c.parameter(n).kind != "choice" for n, _ in c.shapes)
     plain, plain_sd = view.plain.estimate(c)
@@ -49,7 +50,10 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     ways = [noise] * better + [None] * try_plain + [noise] * (lends and not better)
     tries = (joined(problem, state, refined, way) for way in ways)
     new = next((t for t in tries if t is not None), None)
-    return None if new is None else (new, _gain(problem, state, new.fit, view))
+    if new is None:
+        return None
+    started = replace(s, candidate=replace(c, shapes=refined.candidate.shapes), beta=refined.beta)
+    return new, _gain(problem, state, new.fit, view), started
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:
@@ -156,8 +160,10 @@ def sharpened(problem: Loop, view: View) -> View:
     for s in sorted(doubted, key=lambda s: -s.gain)[:MOST_SHARPENED]:
         finer_one = _refined(problem, s, view)
         if finer_one is not s and finer_one.p < s.p:
-            id_ = s.candidate.id
-            view.best[id_], view.q[id_] = finer_one, view.q[id_] * finer_one.p / s.p
+            # places among the view's columns stay those of its own grid; a refit looks for finer shapes again
+            tests = {k: getattr(finer_one, k) for k in ("p_model", "p_cluster", "left_out_gain")}
+            view.best[s.candidate.id] = replace(s, **tests)
+            view.q[s.candidate.id] *= finer_one.p / s.p
     return view
 
 

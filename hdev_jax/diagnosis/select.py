@@ -122,12 +122,12 @@ def choose(
             tell(f"refitting with {s.candidate.id}")
             if (tried := refit(problem, state, s, view)) is not None:
                 gain = max(tried[1], s.gain) if s.plain else tried[1]
-                fits.append((worth(gain, s.candidate), s, tried[0], gain))
+                fits.append((worth(gain, s.candidate), s, tried, gain))
             else:
                 view.reasons[s.candidate.id] = "in the joint refit it is out of range or not told from nothing"
         able = [s for s in able if s not in close]
         fits.sort(key=lambda f: -f[0])
-        for _, s, new, gain in fits:
+        for _, s, (new, _, started), gain in fits:
             c = s.candidate
             if why := _placebo(problem, s, view):
                 view.reasons[c.id] = why
@@ -139,7 +139,7 @@ def choose(
                 view.reasons[c.id] = f"comes first in only {100 * stability:.0f} % of resampled sets of trips"
                 tell(f"turned down {c.id}: {view.reasons[c.id]}")
                 continue
-            found = Found(c.id, s, float(view.q[c.id]), stability, twins, float(gain), view.between(c))
+            found = Found(c.id, started, float(view.q[c.id]), stability, twins, float(gain), view.between(c))
             return replace(new, found=[*state.found, found])
     return None
 

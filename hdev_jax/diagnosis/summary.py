@@ -175,7 +175,8 @@ def _fitted(state: Search) -> int:
         for p in f.score.candidate.effect.parameters
         if p.kind == "choice" and any(p.name == n for n, _ in f.score.candidate.shapes)
     )
-    return len(state.table.free) + choices
+    by_trip = sum("[" in name for f in state.found for name, _ in f.score.candidate.shapes)
+    return len(state.table.free) + choices + by_trip
 
 
 def _subsets(problem: Problem, test: np.ndarray, before: np.ndarray, after: np.ndarray) -> dict[str, Any]:
@@ -213,12 +214,13 @@ def _by_trip(problem: Problem, state: Search) -> list[str]:
     for f in state.found:
         told = [(n.partition("[")[2].removesuffix("]"), v) for n, v in f.score.candidate.shapes if "[" in n]
         by_trip = [(problem.log.trip_names[int(t)], v) for t, v in told]
+        mean = "a trip that was not fitted, and every trip in augmented_vehicle.toml, gets its mean"
         if f.id == "mode_change":
             trips = ", ".join(t for t, v in by_trip if v > 0)
-            out.append(f"mode_change holds in {trips}; a trip that was not fitted gets its mean")
+            out.append(f"mode_change holds in {trips}; {mean}")
         elif by_trip:
             phases = ", ".join(f"{t} {v:+.2f}" for t, v in by_trip)
-            out.append(f"{f.id}: phase by trip {phases}; a trip that was not fitted gets the load's mean")
+            out.append(f"{f.id}: phase by trip {phases}; {mean}")
     return out
 
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from planted import run
+from scipy import stats
 
-from hdev_jax.diagnosis.modes import _split
+from hdev_jax.diagnosis.modes import BEATS, _p, _split
 from hdev_jax.physics.loads import PeriodicLoad
 
 
@@ -83,14 +84,22 @@ def test_trips_are_split_where_their_sizes_differ():
     truth = np.array([0, 1, 0, 0, 1, 0, 0, 1, 0, 0.0])
     split = _split(_grams(rng, 0.5 * truth), np.zeros((1, 1)), np.zeros(1))
     assert split is not None
-    gain, z, size, left = split
+    gain, z, size, left, over_levels = split
     assert np.array_equal(z, truth)
     assert size == pytest.approx(0.5, abs=0.1)
     assert gain > 50 > 20 > left
+    assert over_levels > BEATS
 
 
-def test_sizes_that_differ_at_random_are_not_two():
+@pytest.mark.parametrize("trips", [8, 16, 40])
+@pytest.mark.parametrize("sd", [0.07, 0.1, 0.15, 0.5])  # of the sizes; a trip knows its own to 0.05
+def test_sizes_that_differ_at_random_are_not_two(trips, sd):
     rng = np.random.default_rng(1)
-    split = _split(_grams(rng, rng.normal(0, 0.5, 16)), np.zeros((1, 1)), np.zeros(1))
-    assert split is not None
-    assert split[3] > 40  # far more than 14 degrees of freedom bring by chance
+    splits = [_split(_grams(rng, rng.normal(0, sd, trips)), np.zeros((1, 1)), np.zeros(1)) for _ in range(25)]
+    assert sum(s is not None and s[4] > BEATS for s in splits) <= 1
+
+
+def test_ways_to_split_many_trips_are_counted():
+    assert _p(5.0, 2, 1) == pytest.approx(2.0 * stats.chi2.sf(10.0, 1))
+    assert _p(100.0, 5000, 4) == 1.0
+    assert _p(5000.0, 5000, 4) < 1e-100

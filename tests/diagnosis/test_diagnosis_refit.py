@@ -41,7 +41,7 @@ def heating_found(folder, above_w_per_k: float):
     score = view.evidence.score(best)
     tried = refit(loop, declared, score, view)
     assert tried is not None
-    state, gain = tried
+    state, gain, score = tried
     state.found = [looks.Found("hvac_power", score, 1e-9, 1.0, (), gain)]
     return problem, loop, state
 
