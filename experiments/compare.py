@@ -68,6 +68,7 @@ def told(metrics: Mapping[str, Any]) -> list[str]:
         said.append(f"Short of what is wanted: {'; '.join(metrics['missed'])}.")
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
+    said += [f"{note.rstrip('.')}." for note in metrics.get("notes", [])]
     return said
 
 

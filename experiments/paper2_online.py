@@ -6,14 +6,14 @@ power, growing over the trip: losses are what the battery gives beyond the power
 """
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from pydantic import Field
 
 from experiments.config import Strict
-from experiments.paper2_data import kia_trips
+from experiments.paper2_data import kia_fingerprint, kia_trips
 from experiments.tables import write_tables
 from hdev_jax.learn import KernelTerms, Narx, Structure, Trip, fit_prediction, prepared, with_theta
 from hdev_jax.learn.online import Recursive, follow, recursive
@@ -28,7 +28,7 @@ SOURCES = ("paper2_online.py", "paper2_data.py")
 class Config(Strict):
     """The model, the memories to choose from, and the ageing that is planted."""
 
-    experiment: str
+    experiment: Literal["paper2_online"]
     artefact: str
     caption: str
     outputs: int = 3
@@ -46,7 +46,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """As driven, and with the ageing."""
     common = config.model_dump(mode="json", exclude={"experiment", "artefact", "caption", "paper", "seed", "aged_trip"})
     for trip in ("", config.aged_trip):
-        yield {**common, "aged_trip": trip}
+        yield {**common, "aged_trip": trip, "data": kia_fingerprint()}
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
@@ -130,6 +130,6 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     return {
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
-        "better_than_paper": 0, "of": 0, "logs": 4, "skipped": [], "missed": [],
-        "notes": ["the ageing is planted into measured power; everything else is as measured"],
+        "better_than_paper": 0, "of": 0, "logs": 4,
+        "notes": ["The ageing is planted into measured power; everything else is as measured"],
     }  # fmt: skip
