@@ -70,10 +70,11 @@ def _run_one(options: argparse.Namespace) -> int:
 
 def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
     from experiments.compute import Where
+    from experiments.page import write_list_docs
     from experiments.paper import against, run_list
     from experiments.tables import cells
 
-    for name in ("set", "tasks", "kept", "docs"):
+    for name in ("set", "tasks", "kept"):
         if getattr(options, name):
             raise InputError(f"--{name}: is for one config; {options.config} is a list of {len(configs)}")
     where = Where(_workers(options), options.scheduler)
@@ -83,6 +84,9 @@ def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
         widths = [max(len(c) for c in column) for column in zip(*table, strict=True)]
         for line in table:
             print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+    if options.docs:
+        made = {path: [Path(r["folder"]) for r in runs] for path, runs in came.made.items()}
+        write_list_docs(options.docs, options.config, made)
     print(f"{len(came.made)} of {len(configs)} configs: {options.out / 'index.html'}")
     for why in came.reasons():
         print(f"experiments: {why}", file=sys.stderr)
