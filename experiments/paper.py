@@ -36,10 +36,13 @@ class Outcomes:
         return [f"{', '.join(names)}: {why}" for why, names in by.items()]
 
 
-def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bool = False) -> Outcomes:
+def run_list(
+    configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bool = False, fresh: bool = True
+) -> Outcomes:
     """Run each config in `out/NAME`, those whose tasks run on all workers at once first; then write `out/index.html`.
 
     A config that cannot run leaves the others alone. A run of an older configuration in its place is replaced.
+    `fresh=False` runs no task and reports on those that `out` keeps; a config with none of them is not made.
 
     **Raises:** `InputError` where `out` holds something else.
     """
@@ -51,7 +54,9 @@ def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bo
     of: dict[str, Path] = {}
     for path in configs:
         with _caught(came, path, log):
-            plans = plan(path, tiny=tiny)
+            plans = plan(path, tiny=tiny, kept=None if fresh else store)
+            if not any(p.tasks for p in plans):
+                raise InputError("none of its tasks is kept; run it without --kept")
             planned += unfinished(plans, home / artefact(path))
             of[artefact(path)] = path
     log.say(f"{len(configs)} configs, {len({p.name for p in planned})} of them to run")
@@ -62,7 +67,7 @@ def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bo
             with _caught(came, path, log):
                 came.made[path] = run_config(
                     path, out=home / name, workers=where.workers, scheduler=where.scheduler, kept=store, tiny=tiny,
-                    replace=True,
+                    fresh=fresh, replace=True,
                 )  # fmt: skip
     _write_index(home, came)
     log.say("index.html")

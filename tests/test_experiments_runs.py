@@ -156,6 +156,9 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     assert len(set(figures)) == 2, "of each config its own"
     for name in figures:
         assert (tmp_path / "docs" / name).stat().st_size > 200
+    assert main([*command, "--kept"]) == 2
+    assert "toy10" in capsys.readouterr().err
+    assert ran(tmp_path) == [], "with --kept no task is run"
     (tmp_path / "toy10.toml").unlink()
     assert main(command) == 2, "the data is not there"
     assert ran(tmp_path) == []
