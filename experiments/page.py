@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.compare import comparison, told
+from experiments.compare import DECIDES, comparison, headlines, told
 from experiments.config import shown
 from experiments.tables import cells, markdown, read_markdown
 from hdev_jax.rundir import Run, atomic_file
@@ -111,7 +111,7 @@ def write_docs(docs: Path, config: str | Path, folders: Sequence[Path], sets: Se
 
 
 def write_list_docs(docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]]) -> list[Path]:
-    """`docs/FOLDER.md` for each folder of configs in a list: the paper beside ours, then every table and figure.
+    """`docs/FOLDER.md` for each folder of configs in a list: what decides, every table and figure, paper and ours.
 
     **Arguments:** `configs`, the list; `made`, the folders of each config's runs. Figures go to `docs/figures/FOLDER/`.
     """
@@ -120,12 +120,14 @@ def write_list_docs(docs: Path, configs: str | Path, made: Mapping[Path, Sequenc
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
         lines = [f"# {_kind(next(iter(runs)))}", "", _by(f"{shown(configs)} --out OUT --docs docs"), ""]
-        if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
-            lines += [markdown(cells(against, 4), "Paper against ours")]
+        if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
+            lines += [markdown(cells(first, 4), DECIDES)]
         for path, folders in runs.items():
             lines += [f"## {path.stem}", ""]
             for k, folder in enumerate(folders):
                 lines += [*_lines(folder, docs, home.name, f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"), ""]
+        if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
+            lines += ["## Paper against ours", "", markdown(cells(against, 4), "Every number of the paper")]
         pages.append(docs / f"{home.name}.md")
         pages[-1].write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     return pages
@@ -138,7 +140,7 @@ def _by(arguments: str) -> str:
 def _lines(folder: Path, docs: Path, name: str, before: str) -> list[str]:
     """What is told of the run in `folder`, its tables, and its figures, which are put under `docs/figures/NAME/`."""
     metrics = json.loads((folder / "metrics.json").read_text())
-    lines = told(metrics)
+    lines = [f"- {line}" for line in told(metrics)]
     for table in sorted((folder / "tables").glob("*.md")):
         lines += ["", table.read_text(encoding="utf-8").rstrip()]
     home = docs / "figures" / name

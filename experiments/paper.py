@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.compare import comparison
+from experiments.compare import DECIDES, comparison, headlines
 from experiments.compute import Where, compute
 from experiments.config import artefact, changes, shown
 from experiments.engine import Plan, claim_folder, plan, run_config, unfinished
@@ -127,8 +127,10 @@ def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
         }
         for path, runs in came.made.items() for run in runs
     ]  # fmt: skip
-    lines = against(came)
+    lines, every = against(came), [(path, run) for path, runs in came.made.items() for run in runs]
+    first = [{"config": _title(path, run), **line} for path, run in every for line in headlines(run)]
     tables = [("Runs", cells(rows))] if rows else []
+    tables += [(DECIDES, cells(first, 4))] if first else []
     tables += [("Paper against ours", cells(lines, 4))] if lines else []
     told = [] if came.made else ["No config of the list has been run."]
     told += [f"Not made: {why}." for why in came.reasons()]

@@ -59,22 +59,27 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     model = with_theta(model, fit_prediction(model, first, jax.numpy.asarray(zero), huber=task["huber_kw"]).theta[0])
     corner = task["huber_kw"] / float(model.output.sd)
     x1, y1 = _rows(model, first)
+    # columns that are uncorrelated on trip 1: between like columns a covariance that grows loses its sign to rounding
+    turn = np.linalg.inv(np.linalg.cholesky(x1.T @ x1 / len(x1))).T
+    x1, beta = x1 @ turn, np.linalg.solve(turn, model.theta)
     scores = {}
     for memory in task["memories_min"]:
         factor = 1.0 - first.dt_s / (60.0 * memory)
         half = len(x1) // 2  # the first half to begin with, the second to be judged by
-        begin = _begin(model, x1[:half], corner, memory, first.dt_s)
-        _, predicted = follow(begin, x1[half:], y1[half:], forgetting=factor, corner=corner)
-        scores[memory] = mean_squared((predicted - y1[half:]) * model.output.sd)
-    memory = min(scores, key=scores.__getitem__)
+        begin = _begin(beta, x1[:half], corner, memory, first.dt_s)
+        _, predicted = follow(begin, x1[half:], y1[half:], forgetting=factor, corner=corner, ceiling=_ceiling(begin))
+        score = mean_squared((predicted - y1[half:]) * model.output.sd)
+        scores[memory] = score if np.isfinite(score) else None
+    memory = min((m for m, score in scores.items() if score is not None), key=lambda m: scores[m] or 0.0)
     factor = 1.0 - first.dt_s / (60.0 * memory)
-    state = _begin(model, x1, corner, memory, first.dt_s)
-    ceiling = 100.0 * float(np.trace(state.covariance))
+    state = _begin(beta, x1, corner, memory, first.dt_s)
+    ceiling = _ceiling(state)
     out: dict[str, Any] = {"memory_min": memory, "scores": {str(k): v for k, v in scores.items()}, "trips": {}}
     for name in ("2", "3", "4"):
         trip = aged(trips[name], task["ageing"]) if name == task["aged_trip"] else trips[name]
         x, y = _rows(model, trip)
-        frozen = model.output.undo(x @ model.theta)
+        x = x @ turn
+        frozen = model.output.undo(x @ beta)
         before = model.output.undo(x @ np.asarray(state.beta))
         state, predicted = follow(state, x, y, forgetting=factor, corner=corner, ceiling=ceiling)
         followed, measured = model.output.undo(predicted), model.measured(trip)
@@ -106,11 +111,16 @@ def _rows(model: Narx, trip: Trip) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.ones((len(x), 1)), x], axis=1), y
 
 
-def _begin(model: Narx, x: np.ndarray, corner: float, memory_min: float, dt_s: float) -> Recursive:
+def _begin(beta: np.ndarray, x: np.ndarray, corner: float, memory_min: float, dt_s: float) -> Recursive:
     """The solution of trip 1, known as well as the rows tell that the memory still holds."""
     share = min(1.0, 60.0 * memory_min / dt_s / len(x))
-    state = recursive(model.theta, x * np.sqrt(share))
+    state = recursive(beta, x * np.sqrt(share))
     return Recursive(state.beta, state.covariance)
+
+
+def _ceiling(state: Recursive) -> float:
+    """Where the covariance stops growing while the car stands: well above what it is where the drive begins."""
+    return 100.0 * float(np.trace(state.covariance))
 
 
 def _pe(predicted: np.ndarray, measured: np.ndarray, dt_s: float) -> float:

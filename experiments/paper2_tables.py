@@ -17,7 +17,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     """The rows of one artefact, and its table: a line for each model and number of `config.show`."""
     found = {task["name"]: result for task, result in results if not task.get("timed")}
     seconds = {task["name"]: result["step_seconds"] for task, result in results if task.get("timed")}
-    rows, lines = [], []
+    rows, lines, first = [], [], config.show[0]
     for name in config.order:
         if name not in found:
             rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": "not run"})
@@ -26,15 +26,14 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         ours = _ours(config, found[name], config.models[name])
         if name in seconds:
             ours["step_ms"] = 1e3 * seconds[name]
-        if len(next(iter(spread.values()))["every"]) > 1:
+        if first == "test_mean" and spread[first]["starts"] > 1:
             ours["spread"] = spread["test_mean"]
         rows.append({"name": name, "paper": paper, "ours": ours})
         lines += [_line(name, key, paper or {}, ours, spread.get(key, {})) for key in config.show]
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
-    first = config.show[0]
     compared = [r for r in rows if r["ours"] and r["paper"] and first in r["paper"]]
     return {
-        "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
+        "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows, "headline": first,
         "better_than_paper": sum(abs(r["ours"][first]) <= abs(r["paper"][first]) for r in compared),
         "of": len(compared), "notes": [*config.notes, *_described(config, found)], "logs": 1 + len(config.test),
         "missed": [

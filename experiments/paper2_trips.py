@@ -62,7 +62,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     """Rows by quantity, keys by trip."""
     found = {task["trip"]: result for task, result in results}
     rows, lines = [], []
-    measured = [k for k in found["1"] if k != "speed_quartiles_mph"] if config.paper else []
+    measured = [k for k in found["1"] if k in config.paper]
     for name in [*measured, *config.reasons]:
         paper = config.paper.get(name)
         if name in config.reasons:
