@@ -88,7 +88,7 @@ def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
             print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
     if options.docs:
         made = {path: [Path(r["folder"]) for r in runs] for path, runs in came.made.items()}
-        write_list_docs(options.docs, options.config, made)
+        write_list_docs(options.docs, options.config, made, came.reasons())
     print(f"{len(came.made)} of {len(configs)} configs: {options.out / 'index.html'}")
     for why in came.reasons():
         print(f"experiments: {why}", file=sys.stderr)

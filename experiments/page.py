@@ -110,16 +110,20 @@ def write_docs(docs: Path, config: str | Path, folders: Sequence[Path], sets: Se
     (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_list_docs(docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]]) -> list[Path]:
+def write_list_docs(
+    docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]], missing: Sequence[str] = ()
+) -> list[Path]:
     """`docs/FOLDER.md` for each folder of configs in a list: what decides, every table and figure, paper and ours.
 
-    **Arguments:** `configs`, the list; `made`, the folders of each config's runs. Figures go to `docs/figures/FOLDER/`.
+    **Arguments:** `configs`, the list; `made`, the folders of each config's runs; `missing`, why others have none.
+    Figures go to `docs/figures/FOLDER/`.
     """
     pages = []
     for home in dict.fromkeys(path.parent for path in made):
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
         lines = [f"# {_kind(next(iter(runs)))}", "", _by(f"{shown(configs)} --out OUT --docs docs"), ""]
+        lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
             lines += [markdown(cells(first, 4), DECIDES)]
         for path, folders in runs.items():

@@ -56,7 +56,7 @@ def run_list(
         with _caught(came, path, log):
             plans = plan(path, tiny=tiny, kept=None if fresh else store)
             if not any(p.tasks for p in plans):
-                raise InputError("none of its tasks is kept; run it without --kept")
+                raise InputError("none of its tasks has been run yet")
             planned += unfinished(plans, home / artefact(path))
             of[artefact(path)] = path
     log.say(f"{len(configs)} configs, {len({p.name for p in planned})} of them to run")
