@@ -150,7 +150,11 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     assert "by = 2.0 (not there)" in page
     assert "Not made: data, data2: no measured data" in page
     docs = (tmp_path / "docs" / f"{tmp_path.name}.md").read_text()
-    assert [line for line in docs.splitlines() if line.startswith("## ")] == ["## toy", "## toy2"]
+    assert [line for line in docs.splitlines() if line.startswith("## ")] == [
+        "## toy",
+        "## toy2",
+        "## Paper against ours",
+    ]
     assert "| toy | sum | total | 10 | 14 | 1.4 |" in docs
     figures = re.findall(r"\]\((figures/[^)]*)\)", docs)
     assert len(set(figures)) == 2, "of each config its own"
