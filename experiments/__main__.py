@@ -48,7 +48,9 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument("--workers", type=int, default=1, metavar="N", help="processes (0: one for each core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="run on a Dask cluster: tcp://host:port, or its file")
     parser.add_argument("--tasks", type=Path, help="a folder for results of tasks that runs share")
-    parser.add_argument("--kept", action="store_true", help="run no task: tables of what --tasks holds")
+    parser.add_argument(
+        "--kept", action="store_true", help="run no task: tables of what --tasks holds, or of a list what --out does"
+    )
     parser.add_argument("--tiny", action="store_true", help="as small as the config's table [tiny] says, to try it")
     parser.add_argument("--docs", type=Path, help="a folder for the tables as a page in Markdown, with its figures")
     return parser
@@ -70,19 +72,23 @@ def _run_one(options: argparse.Namespace) -> int:
 
 def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
     from experiments.compute import Where
+    from experiments.page import write_list_docs
     from experiments.paper import against, run_list
     from experiments.tables import cells
 
-    for name in ("set", "tasks", "kept", "docs"):
+    for name in ("set", "tasks"):
         if getattr(options, name):
             raise InputError(f"--{name}: is for one config; {options.config} is a list of {len(configs)}")
     where = Where(_workers(options), options.scheduler)
-    came = run_list(configs, out=options.out, where=where, tiny=options.tiny)
+    came = run_list(configs, out=options.out, where=where, tiny=options.tiny, fresh=not options.kept)
     if lines := against(came):
         table = cells(lines, 4)
         widths = [max(len(c) for c in column) for column in zip(*table, strict=True)]
         for line in table:
             print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
+    if options.docs:
+        made = {path: [Path(r["folder"]) for r in runs] for path, runs in came.made.items()}
+        write_list_docs(options.docs, options.config, made, came.reasons())
     print(f"{len(came.made)} of {len(configs)} configs: {options.out / 'index.html'}")
     for why in came.reasons():
         print(f"experiments: {why}", file=sys.stderr)

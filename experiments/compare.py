@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
 
-__all__ = ["check", "comparison", "numbers", "told"]
+__all__ = ["DECIDES", "check", "comparison", "headlines", "numbers", "told"]
 
+DECIDES = "The number that decides of each row; least to most are over starts"
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
 
@@ -47,6 +48,26 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     return lines
 
 
+def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A line for each row of a run that says which quantity decides (`metrics["headline"]`), whether the paper has it.
+
+    With the spread over starts, where the row has one (`spread`: least, median, most, starts).
+    """
+    quantity = metrics.get("headline")
+    lines = []
+    for row in metrics["rows"] if quantity else ():
+        paper, own = _number((row["paper"] or {}).get(quantity)), _number((row["ours"] or {}).get(quantity))
+        spread = (row["ours"] or {}).get("spread", {})
+        lines.append(
+            {
+                "name": row["name"], "quantity": quantity, "paper": paper, "ours": own,
+                "ratio": own / paper if own is not None and paper else None,
+                **{k: spread.get(k) for k in ("starts", "least", "median", "most")}, "why_not": row.get("reason"),
+            }
+        )  # fmt: skip
+    return lines
+
+
 def _number(x: Any) -> float | None:
     return float(x) if isinstance(x, Real) and not isinstance(x, bool) else None
 
@@ -68,6 +89,7 @@ def told(metrics: Mapping[str, Any]) -> list[str]:
         said.append(f"Short of what is wanted: {'; '.join(metrics['missed'])}.")
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
+    said += [f"{note.rstrip('.')}." for note in metrics.get("notes", [])]
     return said
 
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.compare import comparison, told
+from experiments.compare import DECIDES, comparison, headlines, told
 from experiments.config import shown
-from experiments.tables import cells, read_markdown
+from experiments.tables import cells, markdown, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
-__all__ = ["Section", "of_run", "write_docs", "write_html", "write_page"]
+__all__ = ["Section", "of_run", "write_docs", "write_html", "write_list_docs", "write_page"]
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
@@ -103,20 +103,57 @@ def write_docs(docs: Path, config: str | Path, folders: Sequence[Path], sets: Se
     **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with. Figures go to `docs/figures/NAME/`.
     """
     name = Path(config).stem
-    kind, every = _kind(Path(config)), " ".join([shown(config), *(f"--set {s}" for s in sets)])
-    lines = [f"# {kind}: {name}", "", f"Made by `python -m experiments {every} --tasks DIR --out OUT --docs docs`.", ""]
+    every = " ".join([shown(config), *(f"--set {s}" for s in sets)])
+    lines = [f"# {_kind(Path(config))}: {name}", "", _by(f"{every} --tasks DIR --out OUT --docs docs"), ""]
     for k, folder in enumerate(folders):
-        metrics = json.loads((folder / "metrics.json").read_text())
-        lines += told(metrics)
-        for table in sorted((folder / "tables").glob("*.md")):
-            lines += ["", table.read_text(encoding="utf-8").rstrip()]
-        home = docs / "figures" / name
-        home.mkdir(parents=True, exist_ok=True)
-        for figure in sorted((folder / "figures").glob("*.png")):
-            to = home / (figure.name if len(folders) == 1 else f"{k}_{figure.name}")
-            to.write_bytes(figure.read_bytes())
-            lines += ["", f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})"]
+        lines += _lines(folder, docs, name, "" if len(folders) == 1 else f"{k}_")
     (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_list_docs(
+    docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]], missing: Sequence[str] = ()
+) -> list[Path]:
+    """`docs/FOLDER.md` for each folder of configs in a list: what decides, every table and figure, paper and ours.
+
+    **Arguments:** `configs`, the list; `made`, the folders of each config's runs; `missing`, why others have none.
+    Figures go to `docs/figures/FOLDER/`.
+    """
+    pages = []
+    for home in dict.fromkeys(path.parent for path in made):
+        runs = {path: folders for path, folders in made.items() if path.parent == home}
+        every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
+        lines = [f"# {_kind(next(iter(runs)))}", "", _by(f"{shown(configs)} --out OUT --docs docs"), ""]
+        lines += [line for why in missing for line in (f"Not made: {why}.", "")]
+        if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
+            lines += [markdown(cells(first, 4), DECIDES)]
+        for path, folders in runs.items():
+            lines += [f"## {path.stem}", ""]
+            for k, folder in enumerate(folders):
+                lines += [*_lines(folder, docs, home.name, f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"), ""]
+        if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
+            lines += ["## Paper against ours", "", markdown(cells(against, 4), "Every number of the paper")]
+        pages.append(docs / f"{home.name}.md")
+        pages[-1].write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    return pages
+
+
+def _by(arguments: str) -> str:
+    return f"Made by `python -m experiments {arguments}`."
+
+
+def _lines(folder: Path, docs: Path, name: str, before: str) -> list[str]:
+    """What is told of the run in `folder`, its tables, and its figures, which are put under `docs/figures/NAME/`."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    lines = [f"- {line}" for line in told(metrics)]
+    for table in sorted((folder / "tables").glob("*.md")):
+        lines += ["", table.read_text(encoding="utf-8").rstrip()]
+    home = docs / "figures" / name
+    for figure in sorted((folder / "figures").glob("*.png")):
+        home.mkdir(parents=True, exist_ok=True)
+        to = home / (figure.name if before == f"{figure.stem}_" else f"{before}{figure.name}")
+        to.write_bytes(figure.read_bytes())
+        lines += ["", f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})"]
+    return lines
 
 
 def _kind(config: Path) -> str:

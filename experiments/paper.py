@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.compare import comparison
+from experiments.compare import DECIDES, comparison, headlines
 from experiments.compute import Where, compute
 from experiments.config import artefact, changes, shown
 from experiments.engine import Plan, claim_folder, plan, run_config, unfinished
@@ -36,10 +36,13 @@ class Outcomes:
         return [f"{', '.join(names)}: {why}" for why, names in by.items()]
 
 
-def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bool = False) -> Outcomes:
+def run_list(
+    configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bool = False, fresh: bool = True
+) -> Outcomes:
     """Run each config in `out/NAME`, those whose tasks run on all workers at once first; then write `out/index.html`.
 
     A config that cannot run leaves the others alone. A run of an older configuration in its place is replaced.
+    `fresh=False` runs no task and reports on those that `out` keeps; a config with none of them is not made.
 
     **Raises:** `InputError` where `out` holds something else.
     """
@@ -51,7 +54,9 @@ def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bo
     of: dict[str, Path] = {}
     for path in configs:
         with _caught(came, path, log):
-            plans = plan(path, tiny=tiny)
+            plans = plan(path, tiny=tiny, kept=None if fresh else store)
+            if not any(p.tasks for p in plans):
+                raise InputError("none of its tasks has been run yet")
             planned += unfinished(plans, home / artefact(path))
             of[artefact(path)] = path
     log.say(f"{len(configs)} configs, {len({p.name for p in planned})} of them to run")
@@ -62,7 +67,7 @@ def run_list(configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bo
             with _caught(came, path, log):
                 came.made[path] = run_config(
                     path, out=home / name, workers=where.workers, scheduler=where.scheduler, kept=store, tiny=tiny,
-                    replace=True,
+                    fresh=fresh, replace=True,
                 )  # fmt: skip
     _write_index(home, came)
     log.say("index.html")
@@ -122,8 +127,10 @@ def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
         }
         for path, runs in came.made.items() for run in runs
     ]  # fmt: skip
-    lines = against(came)
+    lines, every = against(came), [(path, run) for path, runs in came.made.items() for run in runs]
+    first = [{"config": _title(path, run), **line} for path, run in every for line in headlines(run)]
     tables = [("Runs", cells(rows))] if rows else []
+    tables += [(DECIDES, cells(first, 4))] if first else []
     tables += [("Paper against ours", cells(lines, 4))] if lines else []
     told = [] if came.made else ["No config of the list has been run."]
     told += [f"Not made: {why}." for why in came.reasons()]

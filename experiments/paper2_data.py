@@ -1,36 +1,49 @@
-"""The four trips of paper 2 as its experiments read them, and one line where they are not there."""
+"""The four trips of paper 2 as its experiments read them."""
 
-import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from hdev_jax.errors import InputError
+from experiments.data import ORIGIN, MissingDataError, data_folder, fingerprint
 from hdev_jax.learn import Trip, trips_of
 from hdev_jax.logs import Log, read_log
 from hdev_jax.logs.adapter import Adapter
 
-__all__ = ["kia_log", "kia_trips"]
+__all__ = ["kia_fingerprint", "kia_log", "kia_trips"]
 
-ROOT = Path(__file__).parents[1]
-SOURCE = "github.com/FMLabSouthampton/EV_EnergyConsumptionModel_v1_2024"
+ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "kia_niro.toml"
+
+
+def _files(only: str) -> list[Path]:
+    """The adapter and the trips' files. Raises `MissingDataError` without the latter."""
+    folder = data_folder("kia_niro")
+    files = sorted(folder.glob(f"Trip_{only or '*'}_Road_Data_*.mat"))
+    if not files:
+        raise MissingDataError(f"no Trip_*.mat in {folder}: they are from {ORIGIN['kia_niro']}; put them there")
+    return [ADAPTER, *files]
+
+
+def kia_fingerprint(only: str = "") -> str:
+    """What a task that reads the trips has among its values. Raises `MissingDataError` without data."""
+    return _digest(*_files(only))
 
 
 @cache
+def _digest(*files: Path) -> str:
+    return fingerprint(files)
+
+
 def kia_log(only: str = "") -> Log:
     """The log of all trips, or of one (`only`): the pedal is in trip 1 alone. Rows as in the paper, untrimmed.
 
-    Raises `InputError` without the data.
+    Raises `MissingDataError` without data.
     """
-    folder = Path(os.environ.get("HDEV_DATA") or ROOT.parent / "shared" / "data") / "kia_niro"
-    files = sorted(folder.glob(f"Trip_{only or '*'}_Road_Data_*.mat"))
-    if not files:
-        raise InputError(
-            f"no Trip_*.mat in {folder}: they are in {SOURCE}; put them in a folder kia_niro and set HDEV_DATA to the "
-            "folder above it"
-        )
-    adapter = replace(Adapter.load(ROOT / "configs" / "adapters" / "kia_niro.toml"), edge_trim_s=0.0)
-    return read_log(files, adapter)
+    return _read(*_files(only))
+
+
+@cache
+def _read(adapter: Path, *files: Path) -> Log:
+    return read_log(list(files), replace(Adapter.load(adapter), edge_trim_s=0.0))
 
 
 def kia_trips(rows: int | None = None, only: str = "") -> dict[str, Trip]:

@@ -1,19 +1,17 @@
 """The models of paper 2's tables: each kind fitted on trip 1, by settings of a config, with the spread over starts."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.paper2_models import structure
 from hdev_jax.errors import InputError
 from hdev_jax.learn import (
     Channels,
-    KernelTerms,
-    Narx,
-    Structure,
     Trip,
     fit_prediction,
     fit_simulation,
@@ -25,16 +23,11 @@ from hdev_jax.learn.classical import search_classical
 from hdev_jax.learn.recurrent import train_recurrent
 from hdev_jax.learn.sequences import energy_kwh, mean_squared
 
-__all__ = ["KINDS", "evaluated", "fitted", "step_seconds"]
+__all__ = ["KINDS", "Mean", "evaluated", "fitted", "step_seconds"]
 
+DIVERGED_KW = 1e6  # far beyond any battery of a car
 Model = Any
 Fit = tuple[list[Model], list[float]]
-
-
-def structure(s: dict[str, Any]) -> Structure:
-    """Orders and units of a config's model."""
-    source = KernelTerms(s["kernel_order"]) if s["source"] == "kernel" else Channels(tuple(s["inputs"]))
-    return Structure(source, s["outputs"], tuple(s["lags"]), s["units"], s["seen"], s["linear"])
 
 
 def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
@@ -74,6 +67,32 @@ def _classical(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     return [model], [model.score]
 
 
+class Mean:
+    """The mean of several models' predictions, and of their free runs."""
+
+    def __init__(self, members: Sequence[Model]):
+        self.members = members
+
+    @staticmethod
+    def of(models: Sequence[Model], trip: Trip) -> "Mean":
+        """Of those whose free run stays finite on the training trip; of all where none does."""
+        finite = [m for m in models if np.all(np.isfinite(m.simulate(trip)))] if len(models) > 1 else models
+        return Mean(finite or models)
+
+    @property
+    def parameters(self) -> int:
+        return sum(m.parameters for m in self.members)
+
+    def predict(self, trip: Trip) -> np.ndarray:
+        return np.mean([m.predict(trip) for m in self.members], axis=0)
+
+    def simulate(self, trip: Trip) -> np.ndarray:
+        return np.mean([m.simulate(trip) for m in self.members], axis=0)
+
+    def measured(self, trip: Trip) -> np.ndarray:
+        return self.members[0].measured(trip)
+
+
 class _Persistence:
     """ŷ(k) = y(k−1); in free run, the first value for ever."""
 
@@ -101,21 +120,23 @@ KINDS: dict[str, Callable[[dict[str, Any], Trip, int], Fit]] = {
 }
 
 
-def fitted(settings: dict[str, Any], trip: Trip, seed: int) -> tuple[list[Model], list[float], float]:
-    """Models in the order of their loss on the training trip, those losses, and seconds. The first is *the* model."""
+def fitted(settings: dict[str, Any], trip: Trip, seed: int) -> tuple[list[Model], list[float]]:
+    """Models in the order of their loss on the training trip, and those losses."""
     if settings["kind"] not in KINDS:
         raise InputError(f"model kind {settings['kind']!r}: one of {', '.join(KINDS)} is expected")
-    started = time.perf_counter()
-    models, losses = KINDS[settings["kind"]](settings, trip, seed)
-    return models, losses, time.perf_counter() - started
+    return KINDS[settings["kind"]](settings, trip, seed)
 
 
 def evaluated(model: Model, trip: Trip) -> dict[str, float]:
-    """Errors, fit and energies of one trip, one step ahead (`step_`) and in free run (`free_`)."""
+    """Errors, fit and energies of one trip, one step ahead (`step_`) and in free run (`free_`).
+
+    A run that leaves the numbers has the error that `DIVERGED_KW` gives, for what is kept is finite.
+    """
     measured = model.measured(trip)
     total, positive, negative = energy_kwh(measured, trip.dt_s)
     out = {"n": len(measured), "energy": total, "energy_positive": positive, "energy_negative": negative}
     for name, y in (("step", model.predict(trip)), ("free", model.simulate(trip))):
+        y = np.clip(np.nan_to_num(y, nan=DIVERGED_KW), -DIVERGED_KW, DIVERGED_KW)
         error = y - measured
         sums = energy_kwh(y, trip.dt_s)
         out |= {
@@ -128,9 +149,15 @@ def evaluated(model: Model, trip: Trip) -> dict[str, float]:
     return out
 
 
-def step_seconds(model: Model, trip: Trip, repeats: int = 5) -> float:
-    """Wall time of a free run over a trip, by row [s]; the fastest of `repeats`, compiled before. A rough figure:
-    `benchmarks/narx.py` measures with care."""
+def step_seconds(settings: dict[str, Any], trip: Trip, repeats: int = 5) -> float:
+    """Wall time of a free run over a trip, by row [s]; the fastest of `repeats`, compiled before.
+
+    Of a NARX with all parameters at zero: the time does not depend on their values. Raises `InputError` for a model
+    that is no NARX.
+    """
+    if settings["kind"] not in ("narx", "persistence"):
+        raise InputError(f"model kind {settings['kind']!r}: time is measured of a NARX alone")
+    model = prepared(structure(settings), trip) if settings["kind"] == "narx" else _Persistence()
     model.simulate(trip)
     taken = []
     for _ in range(repeats):
@@ -138,8 +165,3 @@ def step_seconds(model: Model, trip: Trip, repeats: int = 5) -> float:
         model.simulate(trip)
         taken.append(time.perf_counter() - started)
     return min(taken) / len(trip)
-
-
-def is_narx(model: Model) -> bool:
-    """Whether the model feeds outputs back."""
-    return isinstance(model, Narx)

@@ -1,5 +1,6 @@
-"""Tables of paper 2: the paper's number, ours, their ratio; trips, free run beside one step, spread over starts."""
+"""Tables of paper 2: the paper's number, ours, their ratio, and all starts beside the one that is the model."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,40 +10,40 @@ from hdev_jax.rundir import Run
 
 __all__ = ["collect"]
 
+DIVERGED_KW2 = 1e6  # an error above this is of a run that left the numbers
+
 
 def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
-    """`metrics.json` and tables of one artefact."""
-    found = {task["name"]: result for task, result in results}
-    rows, lines, starts = [], [], []
+    """The rows of one artefact, and its table: a line for each model and number of `config.show`."""
+    found = {task["name"]: result for task, result in results if not task.get("timed")}
+    seconds = {task["name"]: result["step_seconds"] for task, result in results if task.get("timed")}
+    rows, lines, first = [], [], config.show[0]
     for name in config.order:
-        paper = config.paper.get(name)
         if name not in found:
-            rows.append({"name": name, "paper": paper, "ours": None, "reason": config.reasons.get(name, "not run")})
-            lines += [_line(name, key, paper, None) for key in config.show]
+            rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": "not run"})
             continue
-        ours = _ours(config, found[name])
-        if paper is not None and (both := [k for k in paper if k in ours and paper[k]]):
-            ours["ratio"] = {k: ours[k] / paper[k] for k in both}
+        paper, spread = config.paper.get(name), _spread(config, found[name])
+        ours = _ours(config, found[name], config.models[name])
+        if name in seconds:
+            ours["step_ms"] = 1e3 * seconds[name]
+        if first == "test_mean" and spread[first]["starts"] > 1:
+            ours["spread"] = spread["test_mean"]
         rows.append({"name": name, "paper": paper, "ours": ours})
-        lines += [_line(name, key, paper, ours) for key in config.show]
-        if len(found[name]["spread"]) > 1:
-            starts.append(_starts(name, found[name]))
-    artefact = config.artefact.rpartition("/")[2]
-    write_tables(run, artefact, lines, config.caption)
-    if starts:
-        write_tables(run, f"{artefact}_starts", starts, "Spread over starts, mean MSE of the test trips [kW²]")
-    if config.notes:
-        run.path("notes.txt").write_text("\n".join(config.notes) + "\n")
-    first = config.show[0]
-    compared = [r for r in rows if r["ours"] and r["paper"] and first in r["paper"] and first in r["ours"]]
+        lines += [_line(name, key, paper or {}, ours, spread.get(key, {})) for key in config.show]
+    write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
+    compared = [r for r in rows if r["ours"] and r["paper"] and first in r["paper"]]
     return {
-        "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
+        "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows, "headline": first,
         "better_than_paper": sum(abs(r["ours"][first]) <= abs(r["paper"][first]) for r in compared),
-        "of": len(compared), "notes": config.notes, "logs": 1 + len(config.test), "skipped": [], "missed": [],
+        "of": len(compared), "notes": [*config.notes, *_described(config, found)], "logs": 1 + len(config.test),
+        "missed": [
+            f"{r['name']} has {first} {r['ours'][first]:.4g}, the paper {r['paper'][first]:.4g}"
+            for r in compared if abs(r["ours"][first]) > abs(r["paper"][first])
+        ],
     }  # fmt: skip
 
 
-def _ours(config: Any, result: dict[str, Any]) -> dict[str, Any]:
+def _ours(config: Any, result: Mapping[str, Any], settings: Any) -> dict[str, Any]:
     """The paper's keys, from the configuration that the table is of, and the other one beside it."""
     trips = result["trips"]
     own = "free" if config.free_run else "step"
@@ -58,37 +59,58 @@ def _ours(config: Any, result: dict[str, Any]) -> dict[str, Any]:
             out[f"measured{kind}_trip{t}"] = m[f"energy{kind}"]
             out[f"pe{kind}_trip{t}"] = m[f"{own}_pe{kind}"]
             out[f"free_pe{kind}_trip{t}"] = m[f"free_pe{kind}"]
-    out |= {
-        "free_run": config.free_run, "parameters": result["parameters"],
-        "step_ms": 1e3 * result["step_seconds"], "fit_seconds": result["fit_seconds"],
-    }  # fmt: skip
-    if len(result["spread"]) > 1:
-        out["spread"] = _starts("", result)
+    out |= {"free_run": config.free_run, "parameters": result["parameters"], "rule": settings.rule}
     if result["settings_found"]:
         out["settings_found"] = result["settings_found"]
     return out
 
 
-def _line(name: str, key: str, paper: dict[str, float] | None, ours: dict[str, Any] | None) -> dict[str, Any]:
-    theirs = None if paper is None else paper.get(key)
-    own = None if ours is None else ours.get(key)
+def _spread(config: Any, result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """MSE of every start, in the order of the loss on the training trip, and of their mean; by trip and over tests."""
+    key = f"{'free' if config.free_run else 'step'}_mse"
+    every = {f"trip{t}": (np.asarray(m[key]), result["ensemble"][t][key]) for t, m in result["starts"].items()}
+    tests = [every[f"trip{t}"] for t in config.test]
+    every["test_mean"] = (np.mean([e for e, _ in tests], axis=0), float(np.mean([m for _, m in tests])))
+    return {name: _starts(mse, mean) for name, (mse, mean) in every.items()}
+
+
+def _starts(mse: np.ndarray, mean: float) -> dict[str, Any]:
     return {
-        "model": name, "number": key, "paper": _digits(theirs), "ours": _digits(own),
+        "chosen": float(mse[0]), "least": float(mse.min()), "median": float(np.median(mse)), "most": float(mse.max()),
+        "ensemble": mean, "starts": len(mse), "every": mse.tolist(),
+    }  # fmt: skip
+
+
+def _line(
+    name: str, key: str, paper: Mapping[str, float], ours: Mapping[str, Any], spread: Mapping[str, Any]
+) -> dict[str, Any]:
+    several = spread if spread.get("starts", 0) > 1 else {}
+    theirs, own = paper.get(key), ours.get(key)
+    return {
+        "model": name, "number": key.replace("_", " "), "paper": _digits(theirs), "ours": _digits(own),
         "ratio": own / theirs if theirs and own is not None else None,
-        "free run": _digits(ours["free_test_mean"]) if ours and key == "test_mean" else None,
-        "parameters": ours["parameters"] if ours else None,
+        "starts": several.get("starts"), **{k: _digits(several.get(k)) for k in ("least", "median", "most")},
+        "their mean": _digits(several.get("ensemble")),
     }  # fmt: skip
 
 
 def _digits(x: Any) -> str | None:
-    return None if x is None else f"{x:.4g}" if isinstance(x, float) else str(x)
+    if isinstance(x, float):
+        return "diverges" if abs(x) > DIVERGED_KW2 else f"{x:.4g}"
+    return None if x is None else str(x)
 
 
-def _starts(name: str, result: dict[str, Any]) -> dict[str, Any]:
-    """The chosen start beside all of them: the luckiest is not the result."""
-    spread = np.asarray(result["spread"])
-    row = {
-        "chosen": float(spread[0]), "least": float(spread.min()), "median": float(np.median(spread)),
-        "most": float(spread.max()), "starts": len(spread),
+def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
+    """What the columns and rows are, where the table does not say."""
+    several = [n for n in found if len(found[n]["losses"]) > 1]
+    rules = {
+        "least": "ours is the start of least loss on trip 1", "ensemble": "ours is the mean of all starts' predictions"
     }  # fmt: skip
-    return {"model": name, **{k: _digits(v) for k, v in row.items()}} if name else row
+    said = [
+        f"{', '.join(names)}: {words}"
+        for rule, words in rules.items()
+        if (names := [n for n in several if config.models[n].rule == rule])
+    ]
+    if several:
+        said.append("least, median and most are over the starts, each number by itself, read afterwards")
+    return [*said, *(f"{n}: {config.models[n].why}" for n in found if config.models[n].why)]

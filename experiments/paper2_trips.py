@@ -1,14 +1,14 @@
 """Tables II and III and figures 4-8 of paper 2: the trips themselves, from the public files."""
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from experiments.config import Strict
-from experiments.paper2_data import kia_trips
-from experiments.paper2_figures import signals_figure, speeds_figure
+from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_drawings import signals_figure, speeds_figure
 from experiments.tables import write_tables
 from hdev_jax.learn.sequences import energy_kwh
 from hdev_jax.rundir import Run
@@ -22,10 +22,10 @@ MPH, MILE_M = 0.44704, 1609.344  # m/s and m: the international mile (1959)
 class Config(Strict):
     """`table`: statistics by trip beside the paper's; `figure`: "speeds" (figure 4) or "signals" of `trip` (5-8)."""
 
-    experiment: str
+    experiment: Literal["paper2_trips"]
     artefact: str
     caption: str
-    figure: str = ""
+    figure: Literal["", "speeds", "signals"] = ""
     trip: str = "1"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     reasons: dict[str, str] = Field(default_factory=dict)
@@ -36,7 +36,7 @@ class Config(Strict):
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """One for each trip."""
     for trip in ("1", "2", "3", "4"):
-        yield {"trip": trip, "rows": config.rows}
+        yield {"trip": trip, "rows": config.rows, "data": kia_fingerprint()}
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
@@ -62,20 +62,16 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     """Rows by quantity, keys by trip."""
     found = {task["trip"]: result for task, result in results}
     rows, lines = [], []
-    measured = [k for k in found["1"] if k != "speed_quartiles_mph"] if config.paper else []
+    measured = [k for k in found["1"] if k in config.paper]
     for name in [*measured, *config.reasons]:
         paper = config.paper.get(name)
         if name in config.reasons:
             rows.append({"name": name, "paper": paper, "ours": None, "reason": config.reasons[name]})
-            lines += [{"quantity": name, "trip": "all", "paper": None, "ours": config.reasons[name], "ratio": None}]
+            lines.append({"quantity": name.replace("_", " "), **_beside({}, paper or {}), "ours": config.reasons[name]})
             continue
         ours = {f"trip{t}": found[t][name] for t in found}
-        ratio = {k: ours[k] / paper[k] for k in ours if paper and paper.get(k)}
-        rows.append({"name": name, "paper": paper, "ours": {**ours, "ratio": ratio}})
-        lines += [
-            {"quantity": name, "trip": k, "paper": paper[k] if paper else None, "ours": x, "ratio": ratio.get(k)}
-            for k, x in ours.items()
-        ]
+        rows.append({"name": name, "paper": paper, "ours": ours})
+        lines.append({"quantity": name.replace("_", " "), **_beside(ours, paper or {})})
     if config.figure == "speeds":
         speeds_figure(run, {t: kia_trips(config.rows or None)[t] for t in found})
         rows = [{"name": f"trip{t}", "paper": None, "ours": {"speed_quartiles_mph": r["speed_quartiles_mph"]}}
@@ -86,9 +82,19 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         signals_figure(run, kia_trips(config.rows or None)[config.trip])
         own = found[config.trip]
         rows = [{"name": f"trip{config.trip}", "paper": None, "ours": own}]
-        lines = [{"quantity": k, "value": x} for k, x in own.items() if k != "speed_quartiles_mph"]
+        lines = [{"quantity": k.replace("_", " "), "value": x} for k, x in own.items() if k != "speed_quartiles_mph"]
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     return {
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
-        "better_than_paper": 0, "of": 0, "logs": len(found), "skipped": [], "missed": [],
+        "better_than_paper": 0, "of": 0, "logs": len(found),
     }  # fmt: skip
+
+
+def _beside(ours: Mapping[str, float], paper: Mapping[str, float]) -> dict[str, Any]:
+    """A trip after the other: the paper's number, ours, their ratio."""
+    out: dict[str, Any] = {}
+    for t in dict.fromkeys([*paper, *ours]):
+        own, theirs = ours.get(t), paper.get(t)
+        trip = t.replace("trip", "trip ")
+        out |= {f"{trip}, paper": theirs, trip: own, f"{trip}, ratio": own / theirs if own and theirs else None}
+    return out

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -128,7 +129,8 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     (tmp_path / "data2.toml").write_text('extends = "data.toml"\nby = 3.0\n')
     (tmp_path / "_base.toml").write_text("count = 3\n")
     (tmp_path / "list.toml").write_text('configs = ["data*.toml", "toy*.toml", "_*.toml", "none*.toml"]\n')
-    command = [str(tmp_path / "list.toml"), "--out", str(tmp_path / "out")]
+    command = [str(tmp_path / "list.toml"), "--out", str(tmp_path / "out"), "--docs", str(tmp_path / "docs")]
+    (tmp_path / "docs").mkdir()
     assert main(command) == 1, "a division by zero is our fault"
     assert ran(tmp_path) == ["0", "1", "2", "3"]
     told = capsys.readouterr()
@@ -147,6 +149,20 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     assert "not in the public data" in page
     assert "by = 2.0 (not there)" in page
     assert "Not made: data, data2: no measured data" in page
+    docs = (tmp_path / "docs" / f"{tmp_path.name}.md").read_text()
+    assert [line for line in docs.splitlines() if line.startswith("## ")] == [
+        "## toy",
+        "## toy2",
+        "## Paper against ours",
+    ]
+    assert "| toy | sum | total | 10 | 14 | 1.4 |" in docs
+    figures = re.findall(r"\]\((figures/[^)]*)\)", docs)
+    assert len(set(figures)) == 2, "of each config its own"
+    for name in figures:
+        assert (tmp_path / "docs" / name).stat().st_size > 200
+    assert main([*command, "--kept"]) == 2
+    assert "toy10" in capsys.readouterr().err
+    assert ran(tmp_path) == [], "with --kept no task is run"
     (tmp_path / "toy10.toml").unlink()
     assert main(command) == 2, "the data is not there"
     assert ran(tmp_path) == []

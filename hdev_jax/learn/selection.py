@@ -18,12 +18,15 @@ __all__ = ["Score", "edge", "folds", "validated"]
 class Score:
     """MSE of rows left out, in the squared unit of the target: of blocks of time, of the edge, and of both together.
 
-    `mse` counts a row of the edge twice: once as time, once as the edge.
+    `mse`, of both, counts a row of the edge twice: once as time, once as the edge. These three are means over starts;
+    `least` is of both for the start of least training loss in each fold, `ensemble` for the mean of all predictions.
     """
 
     mse: float
     blocks: float
     edge: float
+    least: float
+    ensemble: float
     by_start: tuple[float, ...]
 
 
@@ -53,14 +56,23 @@ def validated(
     ridge: Any,
     steps: int = 80,
 ) -> Score:
-    """One step ahead on rows left out, from `count` starts in each fold, all fits in one program."""
+    """One step ahead on rows left out, from `count` starts in each fold, all fits in one program.
+
+    A structure without units has one solution, whatever the start.
+    """
     model = prepared(structure, trip)
     left_out = folds(model.measured(trip), blocks)
+    count = count if structure.units else 1
     weights = np.repeat(np.stack([1.0 - f for f in left_out]), count, axis=0)
     keys = jax.random.split(key, len(weights))
-    begin = starts(model, trip, keys=keys, huber=huber, ridge=ridge, weights=weights)
+    if structure.units:
+        begin = starts(model, trip, keys=keys, huber=huber, ridge=ridge, weights=weights)
+    else:
+        begin = np.zeros((len(weights), structure.shape.size))
     fit = fit_prediction(model, trip, begin, huber=huber, ridge=ridge, weights=weights, max_steps=steps, rtol=1e-5)
-    thetas = np.asarray(fit.theta).reshape(len(left_out), count, -1)
+    # in each fold the start of least loss first
+    order = np.argsort(np.nan_to_num(np.asarray(fit.loss), nan=np.inf).reshape(len(left_out), count), axis=1)
+    thetas = np.take_along_axis(np.asarray(fit.theta).reshape(len(left_out), count, -1), order[:, :, None], axis=1)
     return _score(model, trip, left_out, [[with_theta(model, t) for t in fold] for fold in thetas])
 
 
@@ -76,4 +88,7 @@ def _score(model: Narx, trip: Trip, left_out: list[np.ndarray], fitted: Sequence
             else:
                 error[k, rows] = e
     both: Float[np.ndarray, "start row"] = np.concatenate([error, at_edge], axis=1)
-    return Score(mean_squared(both), mean_squared(error), mean_squared(at_edge), tuple(np.mean(both**2, axis=1)))
+    return Score(
+        mse=mean_squared(both), blocks=mean_squared(error), edge=mean_squared(at_edge), least=mean_squared(both[0]),
+        ensemble=mean_squared(both.mean(axis=0)), by_start=tuple(np.mean(both**2, axis=1)),
+    )  # fmt: skip

@@ -1,0 +1,58 @@
+"""What a model of paper 2's tables is: its settings, and the structure that they declare."""
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from experiments.config import Strict
+from hdev_jax.learn import Channels, KernelTerms, Structure
+
+__all__ = ["Settings", "structure"]
+
+
+class Settings(Strict):
+    """One model. What a kind does not read has no effect on it."""
+
+    # what decides a NARX and its loss, the search for its minimum apart
+    STRUCTURE: ClassVar = (
+        "source", "inputs", "kernel_order", "outputs", "lags", "units", "seen", "linear", "huber_kw", "ridge_size",
+        "ridge_slope",
+    )  # fmt: skip
+
+    kind: Literal["narx", "recurrent", "classical", "persistence"]
+    why: str = ""  # what the row is, for the table
+    # which of several starts is the model: that of least loss on the training trip, or the mean of all
+    rule: Literal["least", "ensemble"] = "least"
+    source: Literal["channels", "kernel"] = "channels"
+    inputs: list[str] = Field(default_factory=lambda: ["motor_torque_nm", "speed_mps"])
+    kernel_order: int = 2
+    outputs: int = 3
+    lags: list[int] = Field(default_factory=lambda: [0, 1, 2])
+    units: int = 5
+    seen: Literal["inputs", "all"] = "inputs"
+    linear: bool = True
+    huber_kw: float = 0.4  # corner of Huber's loss; 0: squares
+    ridge_size: float = 1e-6
+    ridge_slope: float = 1e-3
+    starts: int = 16
+    steps: int = 120
+    coarse_steps: int = 50
+    rtol: float = 1e-5
+    simulation: bool = False
+    simulation_steps: int = 30
+    cell: Literal["lstm", "gru"] = "lstm"
+    length: int = 128
+    rate: float = 0.02
+    decay: float = 0.03
+    model: Literal["tree", "boosted", "robust_linear", "support_vectors"] = "tree"
+    trials: int = 12
+
+    def task(self) -> dict[str, Any]:
+        """Plain values for a task: all that decides the model."""
+        return self.model_dump(mode="json", exclude={"why"})
+
+
+def structure(s: dict[str, Any]) -> Structure:
+    """Orders and units of a model's settings."""
+    source = KernelTerms(s["kernel_order"]) if s["source"] == "kernel" else Channels(tuple(s["inputs"]))
+    return Structure(source, s["outputs"], tuple(s["lags"]), s["units"], s["seen"], s["linear"])
