@@ -32,7 +32,10 @@ def _methods(rivals: Sequence[str]) -> list[str]:
 
 @styled
 def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
-    """Share named exactly, against the size of what was planted; single effects that the library holds."""
+    """Share named exactly, against the size of what was planted; single effects that the library holds.
+
+    Its caller leaves out what is planted to be called something else than by its name.
+    """
     single = [(t, r) for t, r in done if len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
     if not single:
         return

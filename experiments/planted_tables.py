@@ -32,7 +32,8 @@ def collect(config: "Config", results: list[tuple[dict[str, Any], dict[str, Any]
     write_tables(run, "planted", rows, f"Planted effects, synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
     sized = _sized([(t, r) for t, r in done if t["effects"] and all(k in LIBRARY for k in t["effects"])])
     write_tables(run, "planted_sizes", sized, "Sizes and errors after the loop, every log with a planted effect")
-    power_figure(run, done, config.rivals)
+    able = [(t, r) for t, r in done if t["noise"] == "ar1" and not _case(config, t).absorbed]
+    power_figure(run, able, config.rivals)
     false_figure(run, done, config.rivals)
     confusion_figure(run, done)
     missed = [r["name"] for r in (*rows, *sized) if r["met"] is False]
