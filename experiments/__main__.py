@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import signal
 import sys
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
@@ -100,4 +101,5 @@ def _workers(options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as an interrupt: the workers end with us
     sys.exit(main())
