@@ -82,7 +82,7 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     if new is None or before - float(np.mean((problem.measured - new.fit.predicted) ** 2)) < LEAST_SHARE * before:
         return None, Verdict(ID, gain, q, "in the joint refit it is out of range or not told from nothing")
     stability = _stability(evidence.grams, c, base, z)
-    found = Found(ID, score, q, stability, (), gain, between=c.sizes == ("power_w",))
+    found = Found(ID, score, q, stability, (), gain)
     return replace(new, found=[*state.found, found]), None
 
 

@@ -207,7 +207,8 @@ class ModeChange(Effect):
         Parameter("share", "1", 0.5, 0.2, 0.0, 1.0, kind="choice"),
         Parameter("in_mode", "1", float("nan"), 1.0, 0.0, 1.0, kind="choice"),
     )
-    variants: ClassVar = (("regeneration",), ("loss",), ("c_rr",), ("power_w",))
+    # a load that is there in some trips only could be anything: it may be declared, but is not looked for
+    variants: ClassVar = (("regeneration",), ("loss",), ("c_rr",))
     searched: ClassVar = "trips"
     mistaken_for: ClassVar = ("step_change", "mass_scale")
     separated_by: ClassVar = "the same trip in either mode"
