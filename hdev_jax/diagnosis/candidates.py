@@ -47,6 +47,16 @@ class Candidate:
         chosen = sum(len(p.grid) > 1 for p in self.effect.parameters if p.kind in FIXED and _matters(p, self.sizes))
         return len(self.columns) + chosen
 
+    @property
+    def by_trip(self) -> dict[str, dict[int, float]]:
+        """Shapes that were sought for each trip, `phase[3]` among `shapes`: by name, then by the trip's id."""
+        out: dict[str, dict[int, float]] = {}
+        for key, value in self.shapes:
+            name, bracket, trip = key.partition("[")
+            if bracket:
+                out.setdefault(name, {})[int(trip.removesuffix("]"))] = value
+        return out
+
     def parameter(self, name: str) -> Parameter:
         """The effect's parameter of that name."""
         return next(p for p in self.effect.parameters if p.name == name)
@@ -246,19 +256,11 @@ def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
     return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
 
 
-def _by_trip(shapes: Sequence[tuple[str, float]]) -> dict[str, Grouped]:
-    """Shapes that were chosen for each trip (`phase[3]`), NaN for every other trip."""
-    by_name: dict[str, dict[int, float]] = {}
-    for key, value in shapes:
-        name, bracket, trip = key.partition("[")
-        if bracket:
-            by_name.setdefault(name, {})[int(trip.removesuffix("]"))] = value
-    out = {}
-    for name, by_trip in by_name.items():
-        values = np.full(max(by_trip) + 2, np.nan)  # ids past the end take the last
-        values[list(by_trip)] = list(by_trip.values())
-        out[name] = Grouped(jnp.asarray(values), "trip")
-    return out
+def _grouped(by_trip: Mapping[int, float]) -> Grouped:
+    """A number of each trip, NaN for every other trip."""
+    values = np.full(max(by_trip) + 2, np.nan)  # ids past the end take the last
+    values[list(by_trip)] = list(by_trip.values())
+    return Grouped(jnp.asarray(values), "trip")
 
 
 def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int = 1) -> Effect:
@@ -266,7 +268,7 @@ def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int 
     effect = at_null(candidate.effect, gears=gears)
     values: dict[str, Any] = {p.name: getattr(effect, p.name) for p in effect.parameters}
     values.update({name: np.asarray(v, dtype=float) for name, v in candidate.shapes if "[" not in name})
-    values.update(_by_trip(candidate.shapes))
+    values.update({name: _grouped(by_trip) for name, by_trip in candidate.by_trip.items()})
     for p in candidate.effect.parameters:
         if p.kind == "limit" and p.name not in candidate.sizes:
             values[p.name] = None  # not part of it: the effect skips what it costs

@@ -15,11 +15,10 @@ from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict
+from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict, barred
 from hdev_jax.diagnosis.refit import joined
 from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.whiten import estimate_noise
-from hdev_jax.inference.sheet import BATTERY_TARGETS
 from hdev_jax.physics.loads import PeriodicLoad
 from hdev_jax.physics.vehicle import JOULES_PER_WH
 
@@ -68,12 +67,8 @@ class _Rows(Clocked):
 
 def add_cycle(problem: Loop, state: Search) -> tuple[Search | None, Verdict | None]:
     """The state with a periodic load added and refitted, or a verdict on why it is not; neither where it cannot be."""
-    if state.vehicle.has(ID) or PeriodicLoad not in problem.effects:
-        return None, None
-    if problem.target not in BATTERY_TARGETS:
-        return None, Verdict(ID, None, 1.0, f"not tried: acts behind the target {problem.target}")
-    if ID in state.taken_out:
-        return None, Verdict(ID, None, 1.0, "superfluous beside what was added later")
+    if (why := barred(problem, state, PeriodicLoad)) is not None:
+        return None, Verdict(ID, None, 1.0, why) if why else None
     residual = problem.measured - state.fit.predicted
     rows = _rows(problem, residual, residual)
     hit = strongest_period(residual, rows)

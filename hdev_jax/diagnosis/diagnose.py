@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.diagnosis.expression import find_expression
-from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict
+from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.next_drive import advise
 from hdev_jax.diagnosis.problem import Problem
@@ -25,7 +25,6 @@ from hdev_jax.physics.across import distance_since_start
 __all__ = ["Diagnosis", "diagnose"]
 
 MOST_SHADOWS = 4
-DIFFERS = 1.5  # times the swing of a cycle, for trips to be those that have it
 SECONDS_PER_WH_OF_A_KW = 3.6
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
@@ -157,25 +156,13 @@ def _shadow(
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
         gain = max(mse[k] - mse[k + 1], 0.0)
-        constant = effect.stage == "battery" and not effect.needs and effect.searched != "spectrum"
+        constant = effect.stage == "battery" and not (effect.needs or effect.searched)
         reads_nothing = effect.id == "power_gain" or constant
         residual = (problem.measured - predicted[k])[train]
         swing = float(left.cycle @ residual) ** 2 / max(float(left.cycle @ left.cycle), 1e-300) / len(residual)
-        alike = (f.between and gain <= swing) or _has_the_cycle(problem, f, train, left)
-        if (reads_nothing and gain < left.rms**2) or alike:
+        if (reads_nothing and gain < left.rms**2) or (f.between and gain <= swing):
             return f.id
     return None
-
-
-def _has_the_cycle(problem: Problem, f: Found, train: np.ndarray, left: Remainder) -> bool:
-    """Whether the trips of a mode are those in which a cycle that is left swings more (or less) than in the others."""
-    modes = {int(n.partition("[")[2].removesuffix("]")): v for n, v in f.score.candidate.shapes if "in_mode[" in n}
-    if not modes or not np.any(left.cycle):
-        return False
-    trip = np.asarray(problem.segments.trip)[train]
-    swing = {t: float(np.mean(left.cycle[trip == t])) for t in modes}
-    inside, outside = (float(np.median([swing[t] for t in modes if modes[t] == z])) for z in (1.0, 0.0))
-    return max(inside, outside) > DIFFERS * min(inside, outside)
 
 
 def _without(problem: Problem, state: Search, effect_id: str, rows: Fit) -> Search:

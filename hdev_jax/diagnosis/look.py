@@ -14,6 +14,7 @@ from hdev_jax.diagnosis.significance import adjusted, clusters_needed, effective
 from hdev_jax.diagnosis.sums import Ground, both_looks
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
+from hdev_jax.inference.sheet import BATTERY_TARGETS
 from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import trip_slices
@@ -26,6 +27,7 @@ __all__ = [
     "Search",
     "Verdict",
     "View",
+    "barred",
     "best_of",
     "look",
     "plausible",
@@ -123,6 +125,18 @@ class Loop:
         lengths = [s.stop - s.start for _, s in trip_slices(self.trip)]
         shapes = Shapes(self.rows.rows, max(lengths), self.chunk_rows)
         return Ground(lambda: chunks_of_fit(self.rows, shapes), self.clusters, len(lengths), fit, self.target, noise)
+
+
+def barred(problem: Loop, state: Search, effect: type[Effect]) -> str | None:
+    """Why an effect that is sought elsewhere than in columns is not sought now; None where it is.
+
+    The reason is empty where there is nothing to say of it: the vehicle has it, or it was not asked for.
+    """
+    if state.vehicle.has(effect.id) or effect not in problem.effects:
+        return ""
+    if problem.target not in BATTERY_TARGETS:
+        return f"not tried: acts behind the target {problem.target}"
+    return "superfluous beside what was added later" if effect.id in state.taken_out else None
 
 
 @dataclass

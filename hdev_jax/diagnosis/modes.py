@@ -12,11 +12,10 @@ from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate, plan_of
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict
+from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict, barred
 from hdev_jax.diagnosis.refit import joined
 from hdev_jax.diagnosis.sums import evidence_of
 from hdev_jax.inference import Clusters
-from hdev_jax.inference.sheet import BATTERY_TARGETS
 from hdev_jax.physics.battery import ModeChange
 from hdev_jax.segments import trip_slices
 
@@ -26,6 +25,7 @@ ID = ModeChange.id
 LEAST_TRIPS = 8  # with fewer, any trips fall into two groups
 LEAST_SIDE = 2  # trips of either mode
 ENOUGH = 0.01  # p from which on two values leave trips that differ still
+RANDOM = (0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)  # variances of random levels, over the sizes' own
 BEATS = 3.0  # in log-likelihood, that two values are better than levels that differ at random
 LEAST_SHARE = 0.02  # of the residual's variance
 RESAMPLES = 100
@@ -36,12 +36,8 @@ Grams = Float[np.ndarray, "trip d d"]
 def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | None]:
     """The state with a mode of some trips added and refitted, or a verdict on why it is not; neither where no trip's
     mode could be told."""
-    if state.vehicle.has(ID) or ModeChange not in problem.effects:
-        return None, None
-    if problem.target not in BATTERY_TARGETS:
-        return None, Verdict(ID, None, 1.0, f"not tried: acts behind the target {problem.target}")
-    if ID in state.taken_out:
-        return None, Verdict(ID, None, 1.0, "superfluous beside what was added later")
+    if (why := barred(problem, state, ModeChange)) is not None:
+        return None, Verdict(ID, None, 1.0, why) if why else None
     slices = [s for _, s in trip_slices(problem.trip)]
     if len(slices) < LEAST_TRIPS:
         return None, Verdict(ID, None, 1.0, f"needs {LEAST_TRIPS} trips to fall into two groups")
@@ -139,10 +135,7 @@ def _over_levels(x: np.ndarray, precision: np.ndarray, z: np.ndarray) -> float:
     # which trip is in which mode was chosen: each choice costs what a coin would
     two = likelihood(z > 0, 0.0) + likelihood(z == 0, 0.0) - len(z) * float(np.log(2.0))
     spread = float(np.var(x)) + 1e-300
-    return two - max(likelihood(z >= 0, v * spread) for v in LEVELS)
-
-
-LEVELS = (0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)  # of the sizes' own variance
+    return two - max(likelihood(z >= 0, v * spread) for v in RANDOM)
 
 
 def _ordered(z: np.ndarray) -> bool:

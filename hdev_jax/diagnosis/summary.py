@@ -175,7 +175,7 @@ def _fitted(state: Search) -> int:
         for p in f.score.candidate.effect.parameters
         if p.kind == "choice" and any(p.name == n for n, _ in f.score.candidate.shapes)
     )
-    by_trip = sum("[" in name for f in state.found for name, _ in f.score.candidate.shapes)
+    by_trip = sum(len(x) for f in state.found for x in f.score.candidate.by_trip.values())
     return len(state.table.free) + choices + by_trip
 
 
@@ -212,8 +212,8 @@ def _by_trip(problem: Problem, state: Search) -> list[str]:
     """What was sought for each trip: the phases of a cycle, the trips of a mode."""
     out = []
     for f in state.found:
-        told = [(n.partition("[")[2].removesuffix("]"), v) for n, v in f.score.candidate.shapes if "[" in n]
-        by_trip = [(problem.log.trip_names[int(t)], v) for t, v in told]
+        told = next(iter(f.score.candidate.by_trip.values()), {})
+        by_trip = [(problem.log.trip_names[t], v) for t, v in told.items()]
         mean = "a trip that was not fitted, and every trip in augmented_vehicle.toml, gets its mean"
         if f.id == "mode_change":
             trips = ", ".join(t for t, v in by_trip if v > 0)
