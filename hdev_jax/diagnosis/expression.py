@@ -18,19 +18,20 @@ import numpy as np
 from jaxtyping import Array
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.look import Loop, Search, look
-from hdev_jax.diagnosis.select import choose, prune
+from hdev_jax.diagnosis.look import Loop, Search, View, look
+from hdev_jax.diagnosis.select import choose
 from hdev_jax.physics import Effect, Parameter, Vehicle
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 from hdev_jax.units import registry, unit_of
 
-__all__ = ["Expression", "Factor", "find_expression", "monomials"]
+__all__ = ["TERM", "Described", "Expression", "Factor", "find_expression", "monomials"]
 
 STRICTER = 5.0  # a description of the rest has to clear a level so much lower than a cause does
 MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds of columns
 TOGETHER = 64  # monomials that are evaluated at once
 QUANTILES = (0.5, 0.75, 0.9)
+STEP = 0.2  # of the rows, on either side of a threshold that is looked at again
 MOTION = ("speed_mps", "accel_mps2")
 TERM = "derived:expression"
 # units with an offset count as differences, a slope as a ratio
@@ -84,16 +85,15 @@ class Described(Effect):
 
 @dataclass(frozen=True)
 class Expression:
-    """What was accepted: the formula with its coefficient, the channels in it, the prediction with it in place.
-
-    `superfluous` are found effects that say nothing more once the formula is there: they stood in for it.
-    """
+    """What was accepted: the formula with its coefficient, the channels in it, the prediction with it in place, and the
+    loop and the state that have it."""
 
     formula: str
-    channels: tuple[str, ...]
+    factors: tuple[Factor, ...]
     q_value: float
     predicted: np.ndarray
-    superfluous: tuple[str, ...]
+    loop: Loop
+    state: Search
 
 
 def _power_unit(factors: Sequence[Factor]) -> str:
@@ -178,10 +178,20 @@ def _added(car: Vehicle, segments: Segments, target: Target, terms: Array) -> Ar
     return jax.lax.map(lambda term: predicted(term) - nothing, terms)
 
 
-def _terms(vehicle: Vehicle, segments: Segments, rows: int, target: Target) -> Terms:
-    """The monomials that vary on the first `rows` rows."""
+def finer(factor: Factor, segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
+    """The same channel above thresholds nearer to where it may be: between the quantiles on either side."""
+    x = np.asarray(segments.channels[factor.name], dtype=float)[:rows]
+    near = [q for q in np.linspace(0.02, 0.98, 97) if abs(q - np.mean(x <= factor.above)) < STEP]
+    cuts = sorted({float(f"{np.quantile(x, q):.4g}") for q in near} - {factor.above})
+    return [(replace(factor, above=c),) for c in cuts if x.min() <= c < x.max()]
+
+
+def _terms(
+    vehicle: Vehicle, segments: Segments, rows: int, target: Target, made: Sequence[tuple[Factor, ...]]
+) -> Terms:
+    """The monomials of `made` that vary on the first `rows` rows."""
     sets, scales = [], []
-    for factors in monomials(segments, rows):
+    for factors in made:
         term = product(factors, segments)[:rows]
         scale = float(np.sqrt(np.mean(term**2)))
         if np.isfinite(scale) and np.std(term) > 1e-9 * scale > 0:
@@ -191,24 +201,44 @@ def _terms(vehicle: Vehicle, segments: Segments, rows: int, target: Target) -> T
 
 def find_expression(
     state: Search, problem: Loop, everything: Segments, *, predict: Callable[..., np.ndarray],
-    tell: Callable[[str], None] = lambda _: None,
+    first: tuple[Factor, ...] = (), tell: Callable[[str], None] = lambda _: None,
 ) -> Expression | None:  # fmt: skip
     """The monomial that clears every bar that an effect has to clear, at a stricter level; None where none does.
 
     **Arguments:** where the loop ended; its `problem` on training rows (whose effects are not looked at); `everything`,
-    the rows to predict with `predict(vehicle, segments)`.
+    the rows to predict with `predict(vehicle, segments)`; `first`, a monomial that is tried before all others.
     """
-    n, segments = problem.rows.rows, problem.rows.segments
-    terms = _terms(state.fit.vehicle, segments, n, problem.target)
-    if not terms.width:
-        return None
     start = replace(state, refused=(), taken_out=())
-    view = look(problem, start, made=terms)
-    best = view.best.get("expression")
-    if best is None:
+    if first and (found := _chosen(start, problem, [first], everything, predict, tell)) is not None:
+        return found
+    made = monomials(problem.rows.segments, problem.rows.rows)
+    best, _ = _best(start, problem, made)
+    if best is not None and len(factors := best[0]) == 1 and factors[0].above is not None:
+        # a threshold that is off leaves some of the cause to whatever is near
+        made += finer(factors[0], problem.rows.segments, problem.rows.rows)
+    return _chosen(start, problem, made, everything, predict, tell)
+
+
+def _best(start: Search, problem: Loop, made: Sequence[tuple[Factor, ...]]) -> tuple[Any, View | None]:
+    """The best monomial of those made with its scale, None where none can be told, and the look at all of them."""
+    terms = _terms(start.fit.vehicle, problem.rows.segments, problem.rows.rows, problem.target, made)
+    view = look(problem, start, made=terms) if terms.width else None
+    if view is None or Described.id not in view.best:
+        return None, view
+    which = view.best[Described.id].candidate.columns[0]
+    return (terms.sets[which], terms.scales[which]), view
+
+
+def _chosen(
+    start: Search, problem: Loop, made: Sequence[tuple[Factor, ...]], everything: Segments,
+    predict: Callable[..., np.ndarray], tell: Callable[[str], None],
+) -> Expression | None:  # fmt: skip
+    """The best monomial of those made, if it clears every bar."""
+    best, view = _best(start, problem, made)
+    if best is None or view is None:
         return None
-    which = best.candidate.columns[0]
-    factors, scale = terms.sets[which], terms.scales[which]
+    factors, scale = best
+    segments = problem.rows.segments
     rows = replace(problem.rows, segments=segments.with_channels(**{TERM: product(factors, segments) / scale}))
     narrow = replace(problem, rows=rows, fdr=problem.fdr / STRICTER)
     chosen = choose(narrow, start, view, tell, skip=(), tries=1)
@@ -219,7 +249,5 @@ def find_expression(
     words = "·".join(f.words() for f in factors)
     formula = f"({value:.3g} ± {sd:.2g}) {_power_unit(factors)} · {words}"
     everything = everything.with_channels(**{TERM: product(factors, everything) / scale})
-    names = tuple(dict.fromkeys(f.name for f in factors))
-    kept = {f.id for f in prune(narrow, chosen, tell).found}
-    superfluous = tuple(f.id for f in state.found if f.id not in kept)
-    return Expression(formula, names, chosen.found[-1].q_value, predict(chosen.fit.vehicle, everything), superfluous)
+    predicted = predict(chosen.fit.vehicle, everything)
+    return Expression(formula, factors, chosen.found[-1].q_value, predicted, narrow, chosen)

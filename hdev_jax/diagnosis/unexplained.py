@@ -30,7 +30,7 @@ class Remainder:
     depends_on: tuple[str, ...]
     signature: str
     rms: float  # of the structure seen, in the target's unit; 0 where none is
-    cycle: Float[np.ndarray, " train"]  # a load as large as the cycle's swing about each training row; 0 where none is
+    cycle_w: Float[np.ndarray, " train"]  # the cycle's swing about each training row, 0 where none is or it is no power
     correction: Float[np.ndarray, " test"]
     expression: str | None = None
 
@@ -110,9 +110,10 @@ def remainder(
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
     rms = max(sizes)
-    cycle = train.worth * period.amplitudes if period is not None else np.zeros(len(train.residual))
+    watts = {"kW": 1000.0, "W": 1.0}.get(train.cycle_unit, 0.0)
+    cycle_w = watts * period.amplitudes if period is not None else np.zeros(len(train.residual))
     depends_on = tuple(dict.fromkeys(depends))
-    return Remainder(bool(parts), share, floor, depends_on, signature + ".", rms, cycle, correction)
+    return Remainder(bool(parts), share, floor, depends_on, signature + ".", rms, cycle_w, correction)
 
 
 def _colour(noise: Noise) -> str:

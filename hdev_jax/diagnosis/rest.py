@@ -1,0 +1,195 @@
+"""What is left once the search has ended, and which effects were no more than its stand-ins.
+
+The mean of a cause that the library does not hold is left to whatever named cause comes nearest. Such an effect is
+taken out again and what is left is looked at anew.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hdev_jax.diagnosis.expression import Factor, find_expression
+from hdev_jax.diagnosis.look import Loop, Search, Verdict
+from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.select import prune
+from hdev_jax.diagnosis.split import Split
+from hdev_jax.diagnosis.standins import beside, stand_ins
+from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder
+from hdev_jax.inference import Calibration, Fit, calibrate, cluster_rows
+from hdev_jax.physics.across import distance_since_start
+
+__all__ = ["told_apart"]
+
+MOST_SHADOWS = 4
+SECONDS_PER_WH_OF_A_KW = 3.6
+Tell = Callable[[str], None]
+Checkpoint = Callable[[str, Callable[[], Any]], Any]
+
+
+def told_apart(
+    problem: Problem, split: Split, state: Search, loop: Loop, *, seed: int, tell: Tell, checkpoint: Checkpoint
+) -> tuple[Search, list[Calibration], list[np.ndarray], Remainder]:
+    """What is left told apart from what was found.
+
+    **Returns:** the state without effects that only stood in for what is left; the declared model's fit and that with
+    each effect in turn; their predictions on all rows; and what is left.
+    """
+    train, first = problem.rows(split.train), []
+    for round_ in range(MOST_SHADOWS + 1):
+        steps = _path(problem, state, loop.rows)
+        predicted = [problem.predict(fit.vehicle) for fit in steps]
+        plain = checkpoint(
+            f"remainder-{round_}",
+            lambda p=predicted: _remainder(problem, split, p[-1], p[0], seed, tell).__dict__,
+        )
+        left = Remainder(**plain)
+        told = checkpoint(
+            f"formula-{round_}",
+            lambda s=state, p=predicted[-1], f=first, c=bool(np.any(left.cycle_w)): _formula(
+                problem, s, loop, p, f, c, tell
+            ),
+        )
+        if told:
+            left, first = _described(problem, split, left, told, predicted[-1]), told["factors"]
+        elif np.any(left.cycle_w):
+            told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, loop, c, tell))
+        gone = told["superfluous"] if told else []
+        shadow = gone[0] if gone else _shadow(problem, state, predicted, train, left)
+        if shadow is None or round_ == MOST_SHADOWS:
+            break
+        tell(f"taking {shadow} out: what is left is larger than what it explains")
+        state = _without(problem, state, shadow, loop.rows)
+    return state, steps, predicted, left
+
+
+def _formula(
+    problem: Problem, state: Search, loop: Loop, predicted: np.ndarray, first: Sequence[Mapping[str, Any]],
+    cyclic: bool, tell: Tell,
+) -> dict[str, Any]:  # fmt: skip
+    """A formula for what is left, as plain values; empty where none clears the bar. `first` is tried before others.
+
+    Where what is left is `cyclic`, what only trips tell is no formula: it would be the cycle's mean in each of them.
+    """
+    tell("what is left: a formula from the log's own channels")
+    before = tuple(Factor(**f) for f in first)
+    found = find_expression(state, loop, problem.segments, predict=problem.predict, first=before)
+    if found is None or (cyclic and found.state.found[-1].between):
+        return {}
+    rms = float(np.sqrt(np.mean((found.predicted - predicted) ** 2)))
+    if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted) ** 2):
+        return {}  # real perhaps, but it explains nothing
+    channels = tuple(dict.fromkeys(f.name for f in found.factors))
+    kept = {f.id for f in prune(found.loop, found.state, tell).found}
+    again = [f.id for f in state.found if f.id not in kept]
+    again += [k for k in stand_ins(replace(found.loop, fdr=loop.fdr), found.state, channels, tell) if k in kept]
+    return {
+        "formula": found.formula, "factors": [asdict(f) for f in found.factors], "channels": list(channels),
+        "rms": rms, "predicted": found.predicted, "superfluous": again,
+    }  # fmt: skip
+
+
+def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, tell: Tell) -> dict[str, Any]:
+    """Which effects are not found again beside a load as large in each trip as the cycle that is left there."""
+    if not state.found:
+        return {}
+    load = np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))]
+    return {"superfluous": list(stand_ins(*beside(loop, state, load), (), tell))}
+
+
+def _described(
+    problem: Problem, split: Split, left: Remainder, found: Mapping[str, Any], predicted: np.ndarray
+) -> Remainder:
+    test = problem.rows(split.test)
+    error = [float(np.sqrt(np.mean((problem.measured - p)[test] ** 2))) for p in (predicted, found["predicted"])]
+    return left.described(found["formula"], found["channels"], found["rms"], problem.unit, (error[0], error[1]))
+
+
+def _shadow(
+    problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, left: Remainder
+) -> str | None:
+    """A found effect that may be no more than the mean of the structure that is left, the latest first.
+
+    The mean of a cause that the library does not hold is a constant load: one that reads no channel and explains less
+    than what is left is no cause of its own.
+    """
+    if not left.significant:
+        return None
+    mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
+    for k, f in reversed(list(enumerate(state.found))):
+        effect = f.score.candidate.effect
+        gain = max(mse[k] - mse[k + 1], 0.0)
+        constant = effect.stage == "battery" and not (effect.needs or effect.searched)
+        reads_nothing = effect.id == "power_gain" or constant
+        if reads_nothing and gain < left.rms**2:
+            return f.id
+    return None
+
+
+def _without(problem: Problem, state: Search, effect_id: str, rows: Fit) -> Search:
+    """The state with one effect taken out again and the rest refitted."""
+    table, vehicle = state.table.minus(effect_id), state.fit.vehicle.minus(effect_id)
+    clusters = cluster_rows(rows.segments.take(np.arange(rows.rows)))
+    fit = calibrate(vehicle, table, rows, problem.target, clusters)
+    gone = next(f for f in state.found if f.id == effect_id)
+    why = "the mean of something larger that is left unexplained, not a cause of its own"
+    verdicts = [Verdict(effect_id, gone.score.gain, gone.q_value, why), *state.verdicts]
+    found = [f for f in state.found if f.id != effect_id]
+    return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found, verdicts=verdicts)
+
+
+def _path(problem: Problem, state: Search, rows: Fit) -> list[Calibration]:
+    """The declared model, then with each effect in the order found, each fitted to all training rows."""
+    real = rows.segments.take(np.arange(rows.rows))
+    clusters = cluster_rows(real)
+    fits = [calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)]
+    for k in range(1, len(state.found)):
+        later = [f.id for f in state.found[k:]]
+        table = state.table
+        for id_ in later:
+            table = table.minus(id_)
+        vehicle = state.fit.vehicle.minus(*later)
+        values = state.trail.get(",".join(f.id for f in state.found[:k]))
+        if values is not None:  # fitted when it was found
+            fits.append(replace(fits[0], vehicle=table.insert(vehicle, jnp.asarray(values)), table=table))
+        else:
+            fits.append(calibrate(vehicle, table, rows, problem.target, clusters))
+    return [*fits, state.fit] if state.found else fits
+
+
+def _features(problem: Problem, predicted: np.ndarray, declared: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """What a flexible learner may use: every channel, motion, time and place in the trip, and the models' own words."""
+    s = problem.segments
+    columns: dict[str, np.ndarray] = {
+        "speed_mps": np.asarray(s.speed_mps),
+        "acceleration": np.asarray(s.accel_mps2),
+        "time_s": np.asarray(s.time_s),
+        "distance_since_start_m": np.asarray(distance_since_start(jax.tree.map(jnp.asarray, s))),
+        "duration_s": np.asarray(s.duration_s),
+        "predicted": predicted,
+        "declared": declared,
+        **{k: np.asarray(v, dtype=float) for k, v in s.channels.items()},
+    }
+    names = [k for k, v in columns.items() if np.ptp(v) > 0]
+    return np.stack([columns[k] for k in names], axis=1), names
+
+
+def _remainder(
+    problem: Problem, split: Split, predicted: np.ndarray, declared: np.ndarray, seed: int, tell: Tell
+) -> Remainder:
+    features, names = _features(problem, predicted, declared)
+
+    def side(trips: Sequence[int]) -> Rows:
+        at = problem.rows(trips)
+        segments = problem.segments.take(at)
+        residual, seconds = (problem.measured - predicted)[at], np.asarray(segments.duration_s)
+        energy = problem.target == "energy_wh"  # a load in kW, whatever the rows' lengths
+        worth, unit = (seconds / SECONDS_PER_WH_OF_A_KW, "kW") if energy else (np.ones(len(seconds)), problem.unit)
+        trip = np.asarray(segments.trip)
+        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit)
+
+    trip_names = problem.log.trip_names
+    return remainder(side(split.train), side(split.test), names, problem.unit, trip_names, seed=seed, tell=tell)
