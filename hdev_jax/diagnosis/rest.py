@@ -49,9 +49,7 @@ def told_apart(
         left = Remainder(**plain)
         told = checkpoint(
             f"formula-{round_}",
-            lambda s=state, p=predicted[-1], f=first, c=bool(np.any(left.cycle_w)): _formula(
-                problem, s, loop, p, f, c, tell
-            ),
+            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, s, loop, p, f, r, tell),
         )
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told["factors"]
@@ -68,16 +66,16 @@ def told_apart(
 
 def _formula(
     problem: Problem, state: Search, loop: Loop, predicted: np.ndarray, first: Sequence[Mapping[str, Any]],
-    cyclic: bool, tell: Tell,
+    left: Remainder, tell: Tell,
 ) -> dict[str, Any]:  # fmt: skip
     """A formula for what is left, as plain values; empty where none clears the bar. `first` is tried before others.
 
-    Where what is left is `cyclic`, what only trips tell is no formula: it would be the cycle's mean in each of them.
+    Where what is `left` is a cycle, what only trips tell is no formula: it would be the cycle's mean in each of them.
     """
     tell("what is left: a formula from the log's own channels")
     before = tuple(Factor(**f) for f in first)
     found = find_expression(state, loop, problem.segments, predict=problem.predict, first=before)
-    if found is None or (cyclic and found.state.found[-1].between):
+    if found is None or (np.any(left.cycle_w) and found.state.found[-1].between):
         return {}
     rms = float(np.sqrt(np.mean((found.predicted - predicted) ** 2)))
     if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted) ** 2):

@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.inference import padded
 from hdev_jax.report.data import ReportData
-from hdev_jax.report.words import answer, next_drives
+from hdev_jax.report.words import answer, next_drives, plus_minus
 
 __all__ = ["answer_text", "of_diagnosis", "report_data"]
 
@@ -66,7 +66,7 @@ def answer_text(data: ReportData, out: Path) -> str:
         pe = "-" if m["pe_percent"] is None else f"{m['pe_percent']:+.2f} %"
         lines.append(f"{when:10s}{m['rmse']:12.4g}{pe:>20s}")
     for e in s["effects"]:
-        sizes = ", ".join(f"{k} {p['value']:.4g} ± {p['sd']:.2g} {p['unit']}" for k, p in e["parameters"].items())
+        sizes = ", ".join(f"{k} {plus_minus(p['value'], p['sd'], p['unit'])}" for k, p in e["parameters"].items())
         twins = f"; not told from {', '.join(e['indistinguishable_from'])}" if e["indistinguishable_from"] else ""
         lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")
     lines += next_drives(s)

@@ -5,6 +5,7 @@ effect's column, after projecting off the declared coefficients, has the RMS of 
 """
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,18 @@ def test_a_cause_outside_the_library_is_called_unexplained(cause):
     assert result.summary["effects"] == []
     assert result.summary["verdict"] == "unexplained_structure"
     assert np.isfinite(result.summary["unexplained"]["noise_floor_rmse"])
+
+
+@pytest.mark.slow
+def test_what_stood_in_for_a_cause_outside_the_library_gives_way_to_its_description():
+    """In this log air-conditioning is found first: by chance it was warm in the humid trips."""
+    _, result = run(4015, effects={"outside_humidity_load": {}}, ratio=1.0)
+    assert result.summary["effects"] == []
+    assert "hvac_power" in {c["id"] for c in result.summary["candidates"]}
+    left = result.summary["unexplained"]
+    size, threshold = (float(x) for x in re.findall(r"^\(([\d.e+]+) .*> ([\d.]+)\]$", left["expression"])[0])
+    assert abs(threshold - 70.0) < 0.5, left["expression"]
+    assert abs(size - 2500.0) < 200.0, left["expression"]
 
 
 @pytest.mark.slow
