@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from learn_rows import drive
 
-from experiments import paper2, paper2_choice, paper2_online, paper2_selection
+from experiments import paper2, paper2_choice, paper2_online, paper2_pedal, paper2_selection
 from experiments.config import CONFIGS, resolve, typed
+from experiments.engine import run_config
 from experiments.paper2_choice import chosen_keys
 from experiments.paper2_models import Settings
 from hdev_jax.errors import InputError
@@ -147,3 +148,13 @@ def test_what_the_tables_use_is_held_against_what_was_best(tmp_path):
     assert missed(0.2, 0.3) == []
     assert missed(0.3, 0.2) == ["the tables' NARXP is not the best on trip 1, other"]
     assert missed(0.2, 0.3, least=0.3) == ["the tables' NARXP is by the rule least, on trip 1 ensemble is better"]
+
+
+@pytest.mark.parametrize(
+    ("name", "sets"),
+    [("table8", 'order=["nope"]'), ("pedal", 'model="nope"'), ("selection", 'groups.NARXP.model="nope"')],
+)
+def test_a_model_that_no_one_defined_is_one_line(trips, name, sets, tmp_path, monkeypatch):
+    monkeypatch.setattr(paper2_pedal, "kia_fingerprint", lambda only="": "made up")
+    with pytest.raises(InputError, match=f"{name}.toml: names 'nope', and has nothing of that name"):
+        run_config(CONFIGS / "paper2" / f"{name}.toml", [sets], out=tmp_path / "out")
