@@ -8,6 +8,7 @@ from learn_rows import drive
 
 from experiments import paper2, paper2_choice, paper2_online, paper2_pedal, paper2_selection
 from experiments.config import CONFIGS, resolve, typed
+from experiments.data import MissingDataError
 from experiments.engine import run_config
 from experiments.paper2_choice import chosen_keys
 from experiments.paper2_models import Settings
@@ -158,3 +159,25 @@ def test_a_model_that_no_one_defined_is_one_line(trips, name, sets, tmp_path, mo
     monkeypatch.setattr(paper2_pedal, "kia_fingerprint", lambda only="": "made up")
     with pytest.raises(InputError, match=f"{name}.toml: names 'nope', and has nothing of that name"):
         run_config(CONFIGS / "paper2" / f"{name}.toml", [sets], out=tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("name", "sets", "key"),
+    [
+        ("table8", 'test=["5"]', "test.0"), ("table8", "test=[]", "test"), ("table8", 'train="9"', "train"),
+        ("table8", "show=[]", "show"), ("table8", "rows=-5", "rows"), ("table4", "models.NARXP.starts=0", "starts"),
+        ("table6", "models.RT.trials=0", "trials"), ("fig5", 'trip="9"', "trip"),
+        ("online", "memories_min=[]", "memories_min"), ("online", 'aged_trip="1"', "aged_trip"),
+    ],
+)  # fmt: skip
+def test_a_value_out_of_range_is_one_line(name, sets, key, tmp_path):
+    with pytest.raises(InputError, match=rf"--set .*key .*{key}"):
+        run_config(CONFIGS / "paper2" / f"{name}.toml", [sets], out=tmp_path / "out")
+
+
+def test_a_trip_that_is_not_there_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "kia_niro").mkdir()
+    (tmp_path / "kia_niro" / "Trip_1_Road_Data_0.mat").touch()
+    monkeypatch.setenv("HDEV_DATA", str(tmp_path))
+    with pytest.raises(MissingDataError, match=r"no Trip_2_Road_Data_\*.mat in .*: they are from github"):
+        run_config(CONFIGS / "paper2" / "table2.toml", out=tmp_path / "out")
