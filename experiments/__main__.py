@@ -28,6 +28,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with progress.shown():
             configs = listed(options.config)
+            _check_folders(options)
             return _run_one(options) if configs is None else _run_list(options, configs)
     except (InputError, ClusterError) as e:
         print(f"experiments: {e}", file=sys.stderr)
@@ -40,13 +41,30 @@ def main(argv: list[str] | None = None) -> int:
         return 130
 
 
+def _count(text: str) -> int:
+    if (count := int(text)) < 0:
+        raise argparse.ArgumentTypeError(f"{text}: a number of processes, 0 for one for each core")
+    return count
+
+
+def _check_folders(options: argparse.Namespace) -> None:
+    """What is written when everything has run can be written. Raises `InputError`."""
+    if options.tasks and options.tasks.exists() and not options.tasks.is_dir():
+        raise InputError(f"--tasks {options.tasks}: is a file; name a folder")
+    if options.docs:
+        try:
+            options.docs.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            raise InputError(f"--docs {options.docs}: cannot be written ({e.strerror or e}); name a folder") from e
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m experiments", description="Run one experiment from its config.")
     parser.add_argument("config", type=Path, help="a TOML file under configs/, or a list of such: configs/paper.toml")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a key (repeatable)")
     parser.add_argument("--out", type=Path, required=True, help="the run's folder")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--workers", type=int, default=1, metavar="N", help="processes (0: one for each core)")
+    where.add_argument("--workers", type=_count, default=1, metavar="N", help="processes (0: one for each core)")
     where.add_argument("--scheduler", metavar="ADDRESS", help="run on a Dask cluster: tcp://host:port, or its file")
     parser.add_argument("--tasks", type=Path, help="a folder for results of tasks that runs share")
     parser.add_argument(
@@ -58,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run_one(options: argparse.Namespace) -> int:
+    from experiments.config import shown_point
     from experiments.engine import run_config
     from experiments.page import write_docs
 
@@ -66,7 +85,8 @@ def _run_one(options: argparse.Namespace) -> int:
         kept=options.tasks, fresh=not options.kept, tiny=options.tiny,
     )  # fmt: skip
     if options.docs:
-        write_docs(options.docs, options.config, [Path(r["folder"]) for r in runs], options.set)
+        points = [shown_point(r["sweep"]) for r in runs]
+        write_docs(options.docs, options.config, [Path(r["folder"]) for r in runs], options.set, points)
     print(options.out / ("sweep.json" if runs[0]["sweep"] else "metrics.json"))
     return 0
 

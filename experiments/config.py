@@ -8,6 +8,7 @@ Four keys are not the experiment's own:
 - `[sweep]`, dotted key = list of values, or `{ first = 0, count = 16 }` for whole numbers: a grid.
 """
 
+import contextlib
 import difflib
 import itertools
 import re
@@ -31,6 +32,7 @@ __all__ = [
     "listed",
     "resolve",
     "shown",
+    "shown_point",
     "typed",
 ]
 
@@ -39,9 +41,11 @@ C = TypeVar("C", bound=BaseModel)
 
 
 class Strict(BaseModel):
-    """A part of a config: an unknown key or a wrong type is refused, and nothing changes once it is read."""
+    """A part of a config: an unknown key, a wrong type or what is no number (nan, inf) is refused, and nothing changes
+    once it is read.
+    """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 def every_config(folder: Path = CONFIGS) -> list[Path]:
@@ -53,7 +57,9 @@ def every_config(folder: Path = CONFIGS) -> list[Path]:
 def listed(path: str | Path) -> list[Path] | None:
     """The configs that a list names: `configs = ["paper2/table*.toml", …]`, patterns beside the file; None: no list.
 
-    A pattern may match nothing; table2 comes before table10. Raises `InputError` where a name is no file.
+    A pattern may match nothing; table2 comes before table10; a file comes once, whatever names it.
+
+    **Raises:** `InputError` where a name is no file and no pattern, or two files are called the same.
     """
     table = _layers(Path(path))[-1][1]
     if "configs" not in table:
@@ -61,13 +67,22 @@ def listed(path: str | Path) -> list[Path] | None:
     names = table["configs"]
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names) or len(table) > 1:
         raise InputError(f"{path}: a list of configs has the one key configs, names or patterns such as paper2/*.toml")
-    found: dict[Path, None] = {}
+    found: dict[Path, Path] = {}
     for name in names:
-        matches = sorted(Path(path).parent.glob(name), key=_natural)
+        try:
+            matches = sorted((p for p in Path(path).parent.glob(name) if not p.is_dir()), key=_natural)
+        except (ValueError, IndexError, NotImplementedError) as e:
+            raise InputError(f"{path}, key configs: {name!r} is no name and no pattern beside this file ({e})") from e
         if not matches and not set(name) & set("*?["):
             raise InputError(f"{path}, key configs: no such config {name}")
-        found |= dict.fromkeys(p for p in matches if not p.name.startswith("_"))
-    return list(found)
+        for p in matches:
+            if not p.name.startswith("_") and p.resolve() != Path(path).resolve():
+                found.setdefault(p.resolve(), p)
+    called: dict[str, Path] = {}
+    for p in found.values():
+        if (other := called.setdefault(artefact(p), p)) is not p:
+            raise InputError(f"{path}, key configs: {other} and {p} are both called {artefact(p)}; rename one")
+    return list(found.values())
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -86,6 +101,11 @@ def shown(path: str | Path) -> str:
     """A config's place as a page names it: from the checkout on where it lies in it, on no machine in particular."""
     inside = Path(path).resolve().is_relative_to(CONFIGS)
     return f"configs/{artefact(path)}.toml" if inside else Path(path).as_posix()
+
+
+def shown_point(delta: Mapping[str, Any]) -> str:
+    """A point of a sweep in words."""
+    return ", ".join(f"{k} = {v}" for k, v in delta.items())
 
 
 def resolve(path: str | Path, sets: Sequence[str] = (), *, tiny: bool = False) -> dict[str, Any]:
@@ -114,10 +134,11 @@ def _override(text: str) -> tuple[str, Any]:
     key, found, value = text.partition("=")
     if not found or not key.strip():
         raise InputError(f"--set {text!r}: key=value is expected")
-    try:
-        return key.strip(), tomllib.loads(f"x = {value}")["x"]
-    except tomllib.TOMLDecodeError:
-        return key.strip(), value
+    with contextlib.suppress(tomllib.TOMLDecodeError):
+        parsed = tomllib.loads(f"x = {value}")
+        if set(parsed) == {"x"}:  # a line break in the value would begin another key
+            return key.strip(), parsed["x"]
+    return key.strip(), value
 
 
 def _layers(path: Path, seen: tuple[Path, ...] = ()) -> list[tuple[Path, dict[str, Any]]]:

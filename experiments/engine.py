@@ -3,7 +3,8 @@
 An experiment is a module with
 
 - `Config`, a `Strict` model, and `tasks(config)`: plain dicts, each decides its result by itself (a task that reads a
-  file has the file's fingerprint among its values, a task that draws has its seed);
+  file has the file's fingerprint among its values, a task that draws has its seed); a `KeyError` is a name that the
+  config uses and does not define;
 - `run(task)`: plain values;
 - `collect(config, results, run)`: writes tables and figures into the run's folder and returns its metrics;
 - `SOURCES`: the files beside it, by name, that a task's result depends on;
@@ -31,12 +32,12 @@ from typing import Any
 from experiments import store
 from experiments.compare import check
 from experiments.compute import Asked, Where, compute
-from experiments.config import artefact, expanded, resolve, typed
+from experiments.config import artefact, expanded, resolve, shown_point, typed
 from experiments.log import Log
 from experiments.page import write_page
 from experiments.sweep import write_sweep
 from hdev_jax.errors import InputError
-from hdev_jax.rundir import config_digest, is_complete, open_run
+from hdev_jax.rundir import Run, config_digest, is_complete, open_run
 
 __all__ = ["Plan", "claim_folder", "plan", "run_config", "unfinished"]
 
@@ -86,6 +87,8 @@ def run_config(
     where = Where(workers, scheduler)
     shared = Path(kept) if kept is not None else None
     plans = plan(path, sets, tiny=tiny, kept=None if fresh else shared or Path(out) / "tasks")
+    if not plans:
+        raise InputError(f"{path}: none of its tasks has been run yet; run it without --kept")
     if not plans[0].delta:
         metrics = finish(plans[0], Path(out), where, shared, replace=replace)
         return [{"sweep": {}, "folder": str(out), **metrics}]
@@ -131,15 +134,20 @@ def claim_folder(out: str | Path) -> None:
 def plan(path: str | Path, sets: Sequence[str] = (), *, tiny: bool = False, kept: Path | None = None) -> list[Plan]:
     """A config as runs that are to be: one, or one for each point of its sweep.
 
-    **Arguments:** `kept`: leave out the tasks whose result is not in this folder.
+    **Arguments:** `kept`: leave out the tasks whose result is not in this folder, and points that have none there.
 
-    **Raises:** `InputError` where the config is at fault, or the measured data that its tasks need is not there.
+    **Raises:** `InputError` where the config is at fault, two points of its sweep are one run, or the measured data
+    that its tasks need is not there.
     """
-    plans = []
+    plans: list[Plan] = []
+    points: dict[str, dict[str, Any]] = {}
     for delta, table in expanded(resolve(path, sets, tiny=tiny), path):
         module = store.experiment(table.get("experiment"), path)
         config = typed(module.Config, table, path, sets)
-        every = list(module.tasks(config))
+        try:
+            every = list(module.tasks(config))
+        except KeyError as e:
+            raise InputError(f"{path}: names {e.args[0]!r}, and has nothing of that name") from e
         tasks = [t for t in every if kept is None or store.place(module, t, kept).exists()]
         resolved = {
             "config": config.model_dump(mode="json"),
@@ -147,7 +155,10 @@ def plan(path: str | Path, sets: Sequence[str] = (), *, tiny: bool = False, kept
             "tasks": len(tasks),
             "tasks_sha256": hashlib.sha256(json.dumps(tasks, sort_keys=True).encode()).hexdigest(),
         }
-        plans.append(Plan(artefact(path), module, config, tasks, len(every) - len(tasks), resolved, delta))
+        if (twin := points.setdefault(config_digest(resolved), delta)) is not delta and tasks:
+            raise InputError(f"{path}, table sweep: {shown_point(twin)} and {shown_point(delta)} are one run")
+        if tasks or kept is None:
+            plans.append(Plan(artefact(path), module, config, tasks, len(every) - len(tasks), resolved, delta))
     return plans
 
 
@@ -174,7 +185,7 @@ def finish(plan: Plan, out: Path, where: Where, kept: Path | None, *, replace: b
             places = [store.place(plan.module, t, kept) for t in plan.tasks]
             results = [store.read(p) for p in places]
             pairs = [(t, r["result"]) for t, r in zip(plan.tasks, results, strict=True)]
-            metrics = plan.module.collect(plan.config, pairs, run)
+            metrics = _collected(plan, pairs, run)
             metrics |= {
                 "tasks_left_out": plan.left_out,
                 "tasks_in_one_program": sum(r["together"] > 1 for r in results),
@@ -187,6 +198,16 @@ def finish(plan: Plan, out: Path, where: Where, kept: Path | None, *, replace: b
             log.say(f"done, {metrics['seconds']} s in all tasks and here")
             run.path("log.txt").write_bytes(log.path.read_bytes())
         return json.loads((run.work / "metrics.json").read_text())
+
+
+def _collected(plan: Plan, pairs: list[tuple[dict[str, Any], Any]], run: Run) -> dict[str, Any]:
+    """What the experiment makes of its results. Raises `InputError` where it cannot without the tasks left out."""
+    try:
+        return plan.module.collect(plan.config, pairs, run)
+    except (LookupError, StopIteration, ValueError) as e:
+        if not plan.left_out:
+            raise
+        raise InputError(f"{plan.name}: cannot be told without the {plan.left_out} tasks that have not been run") from e
 
 
 def _environment(where: Where) -> dict[str, Any]:

@@ -97,15 +97,19 @@ def write_page(run: Run, metrics: dict[str, Any]) -> None:
     write_html(run.path("report.html"), metrics["artefact"], [of_run(run.work, metrics)])
 
 
-def write_docs(docs: Path, config: str | Path, folders: Sequence[Path], sets: Sequence[str] = ()) -> None:
+def write_docs(
+    docs: Path, config: str | Path, folders: Sequence[Path], sets: Sequence[str] = (), points: Sequence[str] = ()
+) -> None:
     """`docs/NAME.md`, NAME being the config's, its tables and figures, from complete runs of that config.
 
-    **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with. Figures go to `docs/figures/NAME/`.
+    **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with; `points` of a sweep, one for each
+    run, which head them. Figures go to `docs/figures/NAME/`.
     """
     name = Path(config).stem
     every = " ".join([shown(config), *(f"--set {s}" for s in sets)])
     lines = [f"# {_kind(Path(config))}: {name}", "", _by(f"{every} --tasks DIR --out OUT --docs docs"), ""]
     for k, folder in enumerate(folders):
+        lines += ["", f"## {points[k]}", ""] if k < len(points) and points[k] else []
         lines += _lines(folder, docs, name, "" if len(folders) == 1 else f"{k}_")
     (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from experiments.compare import DECIDES, comparison, headlines
 from experiments.compute import Where, compute
-from experiments.config import artefact, changes, shown
+from experiments.config import artefact, changes, shown, shown_point
 from experiments.engine import Plan, claim_folder, plan, run_config, unfinished
 from experiments.log import Log
 from experiments.page import Section, of_run, write_html
@@ -55,7 +55,7 @@ def run_list(
     for path in configs:
         with _caught(came, path, log):
             plans = plan(path, tiny=tiny, kept=None if fresh else store)
-            if not any(p.tasks for p in plans):
+            if not plans:
                 raise InputError("none of its tasks has been run yet")
             planned += unfinished(plans, home / artefact(path))
             of[artefact(path)] = path
@@ -102,7 +102,7 @@ def against(came: Outcomes) -> list[dict[str, Any]]:
 
 def _title(path: Path, run: Mapping[str, Any]) -> str:
     """What the config is called, and of a sweep the point of the grid."""
-    point = ", ".join(f"{k} = {v}" for k, v in run["sweep"].items())
+    point = shown_point(run["sweep"])
     return f"{artefact(path)} ({point})" if point else artefact(path)
 
 
@@ -139,7 +139,7 @@ def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
 
 def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:
     """The command of a run, and what its config changes in the one that it extends."""
-    point = ", ".join(f"{k} = {v}" for k, v in delta.items())
+    point = shown_point(delta)
     lines = [f"python -m experiments {shown(path)} --out DIR{f': the run at {point}' if point else ''}"]
     changed = [
         f"{k} = {new!r:.60} ({'not there' if old is None else f'there {old!r:.60}'})"

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from experiments.config import Strict
-from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
 from experiments.paper2_fits import Mean, evaluated, fitted, step_seconds
 from experiments.paper2_models import Settings
 from experiments.paper2_tables import collect
@@ -24,16 +24,17 @@ class Config(Strict):
     experiment: Literal["paper2"]
     artefact: str
     caption: str
-    show: list[str]  # what the table compares: keys of the metrics, the first decides which is better
+    # what the table compares: keys of the metrics, the first decides which is better
+    show: list[str] = Field(min_length=1)
     models: dict[str, Settings]
     order: list[str]  # rows of the table
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     free_run: bool = False  # which of the two configurations the table's columns are of
     timed: bool = False  # also the time of a step
     notes: list[str] = Field(default_factory=list)
-    rows: int = 0  # of each trip; 0: all
-    train: str = "1"
-    test: list[str] = Field(default_factory=lambda: ["2", "3", "4"])
+    rows: int = Field(0, ge=0)  # of each trip; 0: all
+    train: TripName = "1"
+    test: list[TripName] = Field(default_factory=lambda: ["2", "3", "4"], min_length=1)
     seed: int = 0
 
 

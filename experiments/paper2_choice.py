@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from experiments.config import typed
 from experiments.paper2_models import Settings
 from experiments.tables import write_tables
 from hdev_jax.rundir import Run
@@ -13,8 +14,12 @@ RULES = ("least", "ensemble")
 
 
 def chosen_keys(model: Settings, keys: Mapping[str, Any]) -> dict[str, Any]:
-    """What a structure and its loss are made of, in the settings of `model` with `keys` in their place."""
-    full = Settings.model_validate({**model.model_dump(mode="json"), **keys}).model_dump(mode="json")
+    """What a structure and its loss are made of, in the settings of `model` with `keys` in their place.
+
+    **Raises:** `InputError` where a key is none of theirs, or a value of the wrong type.
+    """
+    table = {**model.model_dump(mode="json"), **keys}
+    full = typed(Settings, table, f"what is tried, {dict(keys)}").model_dump(mode="json")
     return {k: full[k] for k in Settings.STRUCTURE}
 
 
@@ -51,7 +56,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         "better_than_paper": 0, "of": 0, "logs": 1, "missed": missed,
         "notes": [
             "The paper chose its orders on the trips that it validates with; here rows of trip 1 are left out instead, "
-            "and no other trip is read",
+            "and nothing of another trip enters",
             "The best setting is that of the least mean of MSE over starts",
             "Where nothing else is said, the ridge is 1e-3 and the loss is Huber's with its corner at 0.4 kW",
             "The sizes of NN, NNP and NNS and the training of LSTM and GRU were not searched; the classical models "

@@ -3,24 +3,30 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 from experiments.data import ORIGIN, MissingDataError, data_folder, fingerprint
 from hdev_jax.learn import Trip, trips_of
 from hdev_jax.logs import Log, read_log
 from hdev_jax.logs.adapter import Adapter
 
-__all__ = ["kia_fingerprint", "kia_log", "kia_trips"]
+__all__ = ["TripName", "kia_fingerprint", "kia_log", "kia_trips"]
 
+TripName = Literal["1", "2", "3", "4"]
+TRIPS: tuple[TripName, ...] = ("1", "2", "3", "4")
 ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "kia_niro.toml"
 
 
 def _files(only: str) -> list[Path]:
-    """The adapter and the trips' files. Raises `MissingDataError` without the latter."""
+    """The adapter and the trips' files. Raises `MissingDataError` where a trip has none."""
     folder = data_folder("kia_niro")
-    files = sorted(folder.glob(f"Trip_{only or '*'}_Road_Data_*.mat"))
-    if not files:
-        raise MissingDataError(f"no Trip_*.mat in {folder}: they are from {ORIGIN['kia_niro']}; put them there")
-    return [ADAPTER, *files]
+    files = [ADAPTER]
+    for trip in (only,) if only else TRIPS:
+        if not (own := sorted(folder.glob(f"Trip_{trip}_Road_Data_*.mat"))):
+            where = f"they are from {ORIGIN['kia_niro']}; put them there"
+            raise MissingDataError(f"no Trip_{trip}_Road_Data_*.mat in {folder}: {where}")
+        files += own
+    return files
 
 
 def kia_fingerprint(only: str = "") -> str:

@@ -34,18 +34,18 @@ class Settings(Strict):
     huber_kw: float = 0.4  # corner of Huber's loss; 0: squares
     ridge_size: float = 1e-6
     ridge_slope: float = 1e-3
-    starts: int = 16
-    steps: int = 120
-    coarse_steps: int = 50
+    starts: int = Field(16, ge=1)
+    steps: int = Field(120, ge=1)
+    coarse_steps: int = Field(50, ge=1)
     rtol: float = 1e-5
     simulation: bool = False
-    simulation_steps: int = 30
+    simulation_steps: int = Field(30, ge=1)
     cell: Literal["lstm", "gru"] = "lstm"
-    length: int = 128
+    length: int = Field(128, ge=1)
     rate: float = 0.02
     decay: float = 0.03
     model: Literal["tree", "boosted", "robust_linear", "support_vectors"] = "tree"
-    trials: int = 12
+    trials: int = Field(12, ge=1)
 
     def task(self) -> dict[str, Any]:
         """Plain values for a task: all that decides the model."""

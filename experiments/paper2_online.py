@@ -34,9 +34,9 @@ class Config(Strict):
     outputs: int = 3
     lags: list[int] = Field(default_factory=lambda: [0, 1, 2])
     huber_kw: float = 0.4
-    memories_min: list[float] = Field(default_factory=lambda: [15.0, 30.0, 60.0, 120.0, 240.0])
+    memories_min: list[float] = Field(default_factory=lambda: [15.0, 30.0, 60.0, 120.0, 240.0], min_length=1)
     ageing: float = 0.10  # share of the losses that is added by the end of the trip
-    aged_trip: str = "3"
+    aged_trip: Literal["2", "3", "4"] = "3"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = 0
     seed: int = 0
@@ -114,8 +114,7 @@ def _rows(model: Narx, trip: Trip) -> tuple[np.ndarray, np.ndarray]:
 def _begin(beta: np.ndarray, x: np.ndarray, corner: float, memory_min: float, dt_s: float) -> Recursive:
     """The solution of trip 1, known as well as the rows tell that the memory still holds."""
     share = min(1.0, 60.0 * memory_min / dt_s / len(x))
-    state = recursive(beta, x * np.sqrt(share))
-    return Recursive(state.beta, state.covariance)
+    return recursive(beta, x * np.sqrt(share))
 
 
 def _ceiling(state: Recursive) -> float:

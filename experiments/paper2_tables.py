@@ -11,6 +11,7 @@ from hdev_jax.rundir import Run
 __all__ = ["collect"]
 
 DIVERGED_KW2 = 1e6  # an error above this is of a run that left the numbers
+PREDICTION = ("NARXP", "NNP")  # the P of their names: one step ahead in whatever table they stand (tables VIII and IX)
 
 
 def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
@@ -22,8 +23,11 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         if name not in found:
             rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": "not run"})
             continue
-        paper, spread = config.paper.get(name), _spread(config, found[name])
-        ours = _ours(config, found[name], config.models[name])
+        way = "free" if config.free_run and name not in PREDICTION else "step"
+        paper, spread = config.paper.get(name), _spread(config, found[name], way)
+        ours = _ours(config, found[name], config.models[name], way)
+        if "change_percent" in config.show and rows and rows[0]["ours"]:
+            ours["change_percent"] = 100.0 * (ours[first] / rows[0]["ours"][first] - 1.0)
         if name in seconds:
             ours["step_ms"] = 1e3 * seconds[name]
         if first == "test_mean" and spread[first]["starts"] > 1:
@@ -43,10 +47,12 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _ours(config: Any, result: Mapping[str, Any], settings: Any) -> dict[str, Any]:
-    """The paper's keys, from the configuration that the table is of, and the other one beside it."""
+def _ours(config: Any, result: Mapping[str, Any], settings: Any, own: str) -> dict[str, Any]:
+    """The paper's keys, from the configuration `own` that the row is of, and the other one beside it.
+
+    Energies are in kWh, errors of energy in %: `pe_` with their sign, `energy_error_` without, as the paper has them.
+    """
     trips = result["trips"]
-    own = "free" if config.free_run else "step"
     out: dict[str, Any] = {f"trip{t}": trips[t][f"{own}_mse"] for t in trips}
     out["test_mean"] = float(np.mean([trips[t][f"{own}_mse"] for t in config.test]))
     for way in ("step", "free"):
@@ -58,16 +64,17 @@ def _ours(config: Any, result: Mapping[str, Any], settings: Any) -> dict[str, An
             out[f"energy{kind}_trip{t}"] = m[f"{own}_energy{kind}"]
             out[f"measured{kind}_trip{t}"] = m[f"energy{kind}"]
             out[f"pe{kind}_trip{t}"] = m[f"{own}_pe{kind}"]
+            out[f"energy_error{kind}_trip{t}"] = abs(m[f"{own}_pe{kind}"])
             out[f"free_pe{kind}_trip{t}"] = m[f"free_pe{kind}"]
-    out |= {"free_run": config.free_run, "parameters": result["parameters"], "rule": settings.rule}
+    out |= {"free_run": own == "free", "parameters": result["parameters"], "rule": settings.rule}
     if result["settings_found"]:
         out["settings_found"] = result["settings_found"]
     return out
 
 
-def _spread(config: Any, result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _spread(config: Any, result: Mapping[str, Any], way: str) -> dict[str, dict[str, Any]]:
     """MSE of every start, in the order of the loss on the training trip, and of their mean; by trip and over tests."""
-    key = f"{'free' if config.free_run else 'step'}_mse"
+    key = f"{way}_mse"
     every = {f"trip{t}": (np.asarray(m[key]), result["ensemble"][t][key]) for t, m in result["starts"].items()}
     tests = [every[f"trip{t}"] for t in config.test]
     every["test_mean"] = (np.mean([e for e, _ in tests], axis=0), float(np.mean([m for _, m in tests])))
@@ -113,4 +120,14 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     ]
     if several:
         said.append("least, median and most are over the starts, each number by itself, read afterwards")
+    if config.free_run and (ahead := [n for n in found if n in PREDICTION]):
+        said.append(f"{', '.join(ahead)}: one step ahead, as the paper has it here; every other row in free run")
+    for n in found:
+        if found[n]["settings_found"]:
+            best = ", ".join(f"{k.replace('_', ' ')} {_digits(x)}" for k, x in found[n]["settings_found"].items())
+            said.append(
+                f"{n}: the best of {config.models[n].trials} settings (Optuna, by rows of trip 1 left out): {best}"
+            )
+    if "change_percent" in config.show and config.order[0] in found:
+        said.append(f"change percent: of the test mean, against {config.order[0]}")
     return [*said, *(f"{n}: {config.models[n].why}" for n in found if config.models[n].why)]

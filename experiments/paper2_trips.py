@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from experiments.config import Strict
-from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
 from experiments.paper2_drawings import signals_figure, speeds_figure
 from experiments.tables import write_tables
 from hdev_jax.learn.sequences import energy_kwh
@@ -26,7 +26,7 @@ class Config(Strict):
     artefact: str
     caption: str
     figure: Literal["", "speeds", "signals"] = ""
-    trip: str = "1"
+    trip: TripName = "1"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     reasons: dict[str, str] = Field(default_factory=dict)
     rows: int = 0

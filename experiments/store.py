@@ -17,6 +17,7 @@ from hdev_jax.rundir import atomic_file
 __all__ = ["experiment", "experiments_here", "keep", "place", "read", "sources"]
 
 HERE = Path(__file__).parent
+PARTS = ("SOURCES", "Config", "tasks", "run", "collect")  # what an experiment is made of
 PACKAGES = {"hdev_jax": Path(hdev_jax.__file__).parent, "experiments": HERE}
 
 
@@ -34,9 +35,12 @@ def experiment(name: Any, where: str | Path) -> ModuleType:
         return importlib.import_module(f"experiments.{name}")
     if isinstance(name, str) and "." in name and all(part.isidentifier() for part in name.split(".")):
         try:
-            return importlib.import_module(name)
+            module = importlib.import_module(name)
         except ModuleNotFoundError as e:
             raise InputError(f"{where}, key experiment: {name} cannot be imported ({e})") from e
+        if lacks := [part for part in PARTS if not hasattr(module, part)]:
+            raise InputError(f"{where}, key experiment: {name} is no experiment, it has no {', '.join(lacks)}")
+        return module
     here = ", ".join(experiments_here())
     raise InputError(
         f"{where}, key experiment: one of {here}, or the dotted name of a module, is expected, found {name!r}"

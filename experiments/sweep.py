@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.compare import numbers
-from experiments.config import shown
+from experiments.config import shown, shown_point
 from experiments.page import Section, write_html
 from experiments.tables import cells, markdown, tex
 from hdev_jax.rundir import atomic_file
@@ -36,13 +36,9 @@ def write_sweep(out: Path, config: str | Path, found: Sequence[Mapping[str, Any]
     for name, text in files.items():
         with atomic_file(out / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
-    links = [(_point(r["sweep"]), f"{Path(r['folder']).name}/report.html") for r in found]
+    links = [(shown_point(r["sweep"]), f"{Path(r['folder']).name}/report.html") for r in found]
     synthetic = all(r["synthetic"] for r in found)
     write_html(out / "report.html", f"Sweep of {shown(config)}", [Section("", synthetic, links=links, tables=tables)])
-
-
-def _point(delta: Mapping[str, Any]) -> str:
-    return ", ".join(f"{k} = {v}" for k, v in delta.items())
 
 
 def sweep_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

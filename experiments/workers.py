@@ -122,7 +122,10 @@ def on_cluster(jobs: Sequence[Job], address: str, keys: Sequence[str]) -> Iterat
         import distributed
     except ImportError as e:
         raise ClusterError(f"--scheduler {address}: needs Dask; pip install 'hdev_jax[fleet]'") from e
-    at = json.loads(Path(address).read_text())["address"] if Path(address).is_file() else address
+    try:
+        at = json.loads(Path(address).read_text())["address"] if Path(address).is_file() else address
+    except (OSError, ValueError, LookupError, TypeError) as e:
+        raise ClusterError(f"--scheduler {address}: is no scheduler's file") from e
     try:
         client = distributed.Client(at, timeout=PATIENCE, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as e:

@@ -75,6 +75,12 @@ def test_a_config_at_fault_is_one_line_with_its_place(tmp_path, text, sets, word
         ("count = 1\n", "[sweep]\ncount = [1, 1.5]\n", [], ["delta.toml, key count:", "1.5"]),
         ("count = 1\n", "[sweep]\ncount = { first = 0 }\n", [], ["delta.toml, table sweep", "first = 0, count = 16"]),
         ("count = 1\n", "", ["count.x=3"], ["--set 'count.x=3': count is no table"]),
+        ("count = 1\n", "", ["by=nan"], ["--set 'by=nan', key by:", "finite"]),
+        ("count = 1\n", "by = inf\n", [], ["delta.toml, key by:", "finite"]),
+        ("count = 1\n", "", ["count=1\nseed=2"], ["key count:", "integer"]),
+        ("count = 1\n", "", ["sweep.seed=[1, 2, 1]"], ["table sweep", "seed = 1 and seed = 1 are one run"]),
+        ("count = 1\n", "[sweep]\nby = [1, 1.0]\n", [], ["delta.toml, table sweep", "by = 1 and by = 1.0 are one run"]),
+        ("count = 1\n", 'experiment = "os.path"\n', [], ["delta.toml, key experiment", "os.path is no experiment"]),
         ("count = 1\n", 'ablates = ["by"]\ncount = 2\n', [], ["key ablates: names by, but", "changes count"]),
         ("count = 1\n", 'ablates = ["count"]\ncount = 1\n', [], ["key ablates: names count", "changes nothing"]),
         ("count = 1\n", 'ablates = "count"\ncount = 2\n', [], ["key ablates: a list of the keys", "'count'"]),
@@ -117,8 +123,26 @@ def test_a_list_of_configs_is_in_the_order_of_numbers(tmp_path):
     assert listed(tmp_path / "fig4.toml") is None
     with pytest.raises(InputError, match="no such config fig5"):
         listed(write(tmp_path, "list.toml", 'configs = ["fig5.toml"]\n'))
-    assert listed(CONFIGS / "paper.toml") is not None
+    with pytest.raises(InputError, match="key configs: '' is no name and no pattern"):
+        listed(write(tmp_path, "list.toml", 'configs = [""]\n'))
+    with pytest.raises(InputError, match="is no name and no pattern beside this file"):
+        listed(write(tmp_path, "list.toml", f'configs = ["{tmp_path}/*.toml"]\n'))
+    (tmp_path / "other").mkdir()
+    write(tmp_path / "other", "fig4.toml", "a = 2\n")
+    again = listed(write(tmp_path, "list.toml", 'configs = ["fig4.toml", "other/../fig4.toml", "list.toml"]\n'))
+    assert [p.stem for p in again or []] == ["fig4"], "a file comes once, and the list is no config"
+    with pytest.raises(InputError, match="are both called fig4"):
+        listed(write(tmp_path, "list.toml", 'configs = ["fig4.toml", "other/*.toml"]\n'))
     assert artefact(STUDIES / "planted.toml") == "studies/planted"
+
+
+def test_the_list_of_the_papers_has_every_artefact_under_its_own_name():
+    papers = [artefact(p) for p in listed(CONFIGS / "paper.toml") or []]
+    figures = [4, 5, 6, 7, 8, 12, 13]
+    named = [*(f"paper2/table{k}" for k in range(2, 11)), *(f"paper2/fig{k}" for k in figures)]
+    assert [p for p in papers if p.startswith(("paper2/table", "paper2/fig"))] == named
+    told = {artefact(p): resolve(p).get("artefact", artefact(p)) for p in every_config()}
+    assert told == {name: name for name in told}, "metrics.json names the artefact that the config is named after"
 
 
 @pytest.fixture(scope="module")

@@ -98,3 +98,6 @@ def test_no_cluster_is_one_line_and_loses_nothing(tmp_path, capsys, monkeypatch)
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("experiments: --scheduler tcp://127.0.0.1:9: no scheduler answers there")
     assert (tmp_path / "out.partial" / "config.toml").exists()
+    (tmp_path / "none.json").write_text("{}")
+    assert main([*command[:-1], str(tmp_path / "none.json")]) == 2
+    assert "none.json: is no scheduler's file" in capsys.readouterr().err.splitlines()[-1]

@@ -171,8 +171,7 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     assert ran(tmp_path) == ["4"], "a run of an older config gives way, and its tasks are kept"
 
 
-def test_the_list_of_the_papers_runs_as_it_is(tmp_path, capsys):
-    """Tiny, whatever of it is there; without any config it is an empty page."""
+def test_a_list_of_no_config_is_an_empty_page(tmp_path, capsys):
     (tmp_path / "list.toml").write_text('configs = ["paper*/*.toml"]\n')
     assert main([str(tmp_path / "list.toml"), "--out", str(tmp_path / "out")]) == 0
     assert "0 of 0 configs" in capsys.readouterr().out
@@ -184,6 +183,44 @@ def test_no_data_is_one_line_that_says_what_to_do(tmp_path, config, capsys, monk
     assert main([str(config), "--set", "needs=kia_niro", "--out", str(tmp_path / "out")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert all(w in line for w in ("no measured data", "github.com/FMLabSouthampton", "HDEV_DATA"))
+
+
+def test_what_is_kept_is_reported_on_and_nothing_else(tmp_path, config, capsys, monkeypatch):
+    command = [str(config), "--out", str(tmp_path / "a"), "--tasks", str(tmp_path / "kept")]
+    assert main([*command, "--kept"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert all(w in line for w in ("toy.toml", "none of its tasks has been run yet"))
+    assert not (tmp_path / "a").exists()
+    assert main([*command, "--set", "count=2"]) == 0
+    sweep = [*command[:1], "--out", str(tmp_path / "b"), *command[3:], "--kept", "--set", "sweep.by=[1.0, 2.0]"]
+    assert main(sweep) == 0, "the point that has none is left out"
+    (found,) = json.loads((tmp_path / "b" / "sweep.json").read_text())
+    assert (found["sweep"], found["tasks_left_out"]) == ({"by": 1.0}, 2)
+    real = squares.collect
+    monkeypatch.setattr(squares, "collect", lambda c, results, run: real(c, [list(results)[3]], run))
+    capsys.readouterr()
+    assert main([*command[:1], "--out", str(tmp_path / "c"), *command[3:], "--kept"]) == 2
+    assert "toy: cannot be told without the 2 tasks that have not been run" in capsys.readouterr().err
+    with pytest.raises(IndexError):
+        run_config(config, ["count=2"], out=tmp_path / "d")
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_anything_runs(tmp_path, config, capsys):
+    (tmp_path / "file").touch()
+    for option in ("--docs", "--tasks"):
+        assert main([str(config), "--out", str(tmp_path / "out"), option, str(tmp_path / "file")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{option} {tmp_path / 'file'}" in line
+    with pytest.raises(SystemExit, match="2"):
+        main([str(config), "--out", str(tmp_path / "out"), "--workers", "-1"])
+    assert ran(tmp_path) == []
+
+
+def test_the_docs_of_a_sweep_say_which_run_is_which(tmp_path, config):
+    docs = tmp_path / "made" / "docs"
+    assert main([str(config), "--out", str(tmp_path / "out"), "--docs", str(docs), "--set", "sweep.by=[1.0, 2.0]"]) == 0
+    heads = [line for line in (docs / "toy.md").read_text().splitlines() if line.startswith("## ")]
+    assert heads == ["## by = 1.0", "## by = 2.0"]
 
 
 def test_metrics_are_checked():

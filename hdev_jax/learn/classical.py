@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.selection import folds
-from hdev_jax.learn.sequences import Trip, mean_squared
+from hdev_jax.learn.sequences import Scale, Trip, mean_squared
 from hdev_jax.learn.sources import Channels, Source
 
 __all__ = ["CLASSICAL", "ClassicalModel", "search_classical"]
@@ -64,7 +64,7 @@ class _ModelTree:
     def fit(self, x: np.ndarray, y: np.ndarray) -> "_ModelTree":
         from sklearn.tree import DecisionTreeRegressor
 
-        self.middle, self.spread = x.mean(axis=0), x.std(axis=0)
+        self.scale = Scale.of(x)
         self.tree = DecisionTreeRegressor(min_samples_leaf=self.leaf, random_state=self.seed).fit(x, y)
         at, z = self.tree.apply(x), self._columns(x)
         order = np.argsort(at, kind="stable")
@@ -74,7 +74,7 @@ class _ModelTree:
         return self
 
     def _columns(self, x: np.ndarray) -> np.ndarray:
-        return np.c_[np.ones(len(x)), (x - self.middle) / self.spread]
+        return np.c_[np.ones(len(x)), self.scale.apply(x)]
 
     def predict(self, x: np.ndarray) -> np.ndarray:
         lines = np.stack([self.lines[k] for k in self.tree.apply(x)])

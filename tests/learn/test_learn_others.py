@@ -1,5 +1,7 @@
 """Recursive least squares, recurrent networks and searched models."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -78,6 +80,14 @@ def test_searched_models_beat_the_mean(kind):
     error = model.predict(trip) - model.measured(trip)
     assert np.mean(error**2) < np.var(trip.target)
     assert model.parameters > 0
+
+
+@pytest.mark.parametrize("kind", CLASSICAL)
+def test_searched_models_bear_a_constant_input(kind):
+    pytest.importorskip("optuna")
+    trip = drive(300)
+    trip = dataclasses.replace(trip, inputs={**trip.inputs, "speed_mps": np.full(300, 10.0)})
+    assert np.all(np.isfinite(search_classical(kind, trip, trials=1, seed=0).predict(trip)))
 
 
 def test_unknown_model_is_one_line():
