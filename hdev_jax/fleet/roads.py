@@ -33,14 +33,14 @@ _STRETCH_M = np.array([1200.0, 1600.0, 4000.0, 8000.0])
 _LIMITS_KMH = ((30.0, 50.0, 50.0), (50.0, 50.0, 60.0), (60.0, 70.0, 80.0), (80.0, 85.0, 89.0))
 _BEND = np.array([1.5e-3, 1.0e-3, 1.6e-3, 1.5e-4])  # scale of curvature [1/m]
 _TURN = np.array([0.07, 0.04, 0.006, 0.0])  # junctions where it turns, per segment
-_LIGHT = np.array([0.11, 0.05, 0.006, 0.0])  # stops, per segment
+_LIGHT = np.array([0.10, 0.05, 0.006, 0.0])  # stops, per segment
 _ROUNDABOUT = np.array([0.015, 0.03, 0.015, 0.0])
 _JAM = np.array([0.55, 0.40, 0.15, 0.18])  # how much the traffic slows
 _SURFACE = {"construction": (0.35, 0.35, 0.12, 0.18)}
 _SURFACE_USUAL = (0.52, 0.32, 0.12, 0.04)
 _TERRAIN = ((0.30, 0.45, 0.21, 0.04), (0.005, 0.012, 0.022, 0.033))  # share of the routes; sd of the slope
 _STEEPEST = np.array([0.08, 0.08, 0.09, 0.06])
-_BUS_STOP = 0.25  # one in 400 m
+_BUS_STOP = 0.22  # one in 450 m
 _LATERAL = 1.4  # m/s², comfortable in bends
 
 

@@ -108,16 +108,14 @@ def _batch(
     log = _measured(config, rows, trip, truth, payload, rng)
     gear = truth["gear"]
     log_segments = _padded({**log, "gear": gear}, trip, capacity)
-    truth["tabular_wh"] = np.asarray(_predict(vehicle.tabular, log_segments))[:n]
+    tabular = _predict(vehicle.tabular, log_segments)
+    truth |= {k: np.asarray(x)[:n] for k, x in tabular.items()}
     at = np.arange(n)
-    for name in ("up_mps", "down_mps", "center_mps"):
-        line = np.asarray(getattr(lines, name))[:n]
-        line = np.concatenate([line, np.full((n, 1), np.inf)], axis=1)
-        if name == "up_mps":
-            truth["shift_up_mps"] = line[at, gear - 1]
-        elif name == "down_mps":
-            truth["shift_down_mps"] = np.where(gear > 1, line[at, np.maximum(gear - 2, 0)], 0.0)
+    up = np.concatenate([np.asarray(lines.up_mps)[:n], np.full((n, 1), np.inf)], axis=1)
+    truth["shift_up_mps"] = up[at, gear - 1]
+    truth["shift_down_mps"] = np.where(gear > 1, np.asarray(lines.down_mps)[at, np.maximum(gear - 2, 0)], 0.0)
     kept = rng.uniform(size=n) >= config.log.dropout_share
+    kept |= np.r_[True, trip[1:] != trip[:-1]]  # no trip is lost
     log["gear"], log["trip"] = gear.astype(float), trip + first
     return Batch(
         vehicle,
@@ -228,8 +226,10 @@ def _padded(rows: dict[str, np.ndarray], trip: np.ndarray, capacity: int) -> Seg
 
 
 @eqx.filter_jit
-def _predict(vehicle: Vehicle, segments: Segments) -> Any:
-    return vehicle.energy(segments)
+def _predict(vehicle: Vehicle, segments: Segments) -> dict[str, Any]:
+    """What the sheet says: battery energy (paper 1, equation 5) and energy at the wheels alone (equation 4)."""
+    wheel = vehicle.force(segments) * segments.distance_m / 3600.0
+    return {"tabular_wh": vehicle.energy(segments), "tabular_wheel_wh": wheel}
 
 
 @eqx.filter_jit
