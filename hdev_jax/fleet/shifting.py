@@ -78,13 +78,11 @@ def shift_lines(program: Program, speed_mps: Array, load: Array, grade: Array) -
 
 
 def engaged(lowest: Array, highest: Array, starts: Array) -> Int[Array, " row"]:
-    """The gear of each row: clip(previous, lowest, highest), from `lowest` where a trip starts.
+    """The gear of each row: clip(previous, lowest, highest), from `lowest` where a trip starts."""
+    return jax.lax.scan(_engage, jnp.ones((), lowest.dtype), (lowest, jnp.where(starts, lowest, highest)))[1]
 
-    Clips compose into clips, so this is an associative scan.
-    """
-    high = jnp.where(starts, lowest, highest)
 
-    def after(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-        return jnp.clip(first[0], *second), jnp.clip(first[1], *second)
-
-    return jax.lax.associative_scan(after, (lowest, high))[0]
+def _engage(gear: Array, allowed: tuple[Array, Array]) -> tuple[Array, Array]:
+    """One row further."""
+    gear = jnp.clip(gear, *allowed)
+    return gear, gear

@@ -19,7 +19,8 @@ from hdev_jax.fleet.hidden import ROTATING_MASS_FACTOR, hidden_effects, shift_pr
 from hdev_jax.fleet.roads import SEGMENT_M, STEPS, RouteBatch, draw_routes
 from hdev_jax.fleet.shifting import Program, engaged, load_share, shift_lines
 from hdev_jax.fleet.variants import AXLE_LOAD_SHARE, Variant
-from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
+from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Machine, Vehicle
+from hdev_jax.physics.across import DISTANCE_SINCE_START, FIRST, LAST
 from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Segments
 
@@ -216,13 +217,23 @@ def _padded(rows: dict[str, np.ndarray], trip: np.ndarray, capacity: int) -> Seg
         return jnp.asarray(np.concatenate([x, np.full(capacity - len(x), fill, dtype=x.dtype)]), dtype=float)
 
     ids = np.concatenate([trip, np.full(capacity - len(trip), -1)])
-    return Segments(
+    start = np.r_[True, ids[1:] != ids[:-1]]
+    first = np.maximum.accumulate(np.where(start, np.arange(capacity), 0))
+    last = np.r_[np.flatnonzero(start)[1:], capacity][np.cumsum(start) - 1] - 1
+    metres = np.concatenate([rows["distance_m"], np.zeros(capacity - len(trip))])
+    before = np.cumsum(metres) - metres
+    channels = {k: column(rows[k], 1.0) for k in _CHANNELS if k in rows}
+    channels[DISTANCE_SINCE_START] = column(before - before[first] + 0.5 * metres, 0.0)
+    segments = Segments(
         jnp.asarray(ids),
         jnp.zeros(capacity, int),
         *(column(rows[k], 1.0 if k == "duration_s" else 0.0)
           for k in ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps")),
-        {k: column(rows[k], 1.0) for k in _CHANNELS if k in rows},
+        channels,
     )  # fmt: skip
+    # what effects derive by trip is worked out here: compiling it takes longer than all the rest
+    bounds = {FIRST: jnp.asarray(first), LAST: jnp.asarray(last)}
+    return eqx.tree_at(lambda s: s.channels, segments, {**channels, **bounds})
 
 
 @eqx.filter_jit
@@ -237,20 +248,23 @@ def _energy(vehicle: Vehicle, program: Program, segments: Segments) -> tuple[Any
     """Gear, energy and what it is made of, for every row, by the kernel."""
     plain = vehicle.minus("time_skew") if vehicle.has("time_skew") else vehicle
     speed, grade = segments.speed_mps, segments.channels["grade_rad"]
-    force = plain.force(segments)
+    force = jnp.where(segments.distance_m > 0, _at_the_wheels(plain).force(segments), 0.0)  # brakes hold it at rest
     load = load_share(program, force, speed)
     lines = shift_lines(program, speed, load, grade)
     starts = jnp.concatenate([jnp.array([True]), segments.trip[1:] != segments.trip[:-1]])
     gear = engaged(lines.lowest, lines.highest, starts)
-    previous = jnp.where(starts, gear, jnp.roll(gear, 1))
     segments = segments.with_channels(gear=gear.astype(speed.dtype))
     parts = plain.breakdown(segments)
+    energy = sum(parts.values())
+    shown = energy
+    if vehicle.has("time_skew"):
+        hours = segments.duration_s / 3600.0
+        shown = vehicle.effect("time_skew").observe(energy / hours, segments) * hours
     ratio = program.ratio_radpm[gear - 1]
     motor_speed, torque = speed * ratio, force / ratio
-    eta = jax.vmap(vehicle.driveline.efficiency)(gear, motor_speed, torque)
     out = {
         "gear": gear,
-        "gear_previous": previous,
+        "gear_previous": jnp.where(starts, gear, jnp.roll(gear, 1)),
         "gear_lowest": lines.lowest,
         "gear_highest": lines.highest,
         "gear_static": lines.static,
@@ -258,9 +272,9 @@ def _energy(vehicle: Vehicle, program: Program, segments: Segments) -> tuple[Any
         "requested_torque_nm": force * vehicle.driveline.wheel_radius_m,
         "motor_speed_radps": motor_speed,
         "motor_torque_nm": torque,
-        "efficiency": eta,
-        "energy_true_wh": plain.energy(segments),
-        "energy_shown_wh": vehicle.energy(segments),
+        "efficiency": jax.vmap(vehicle.driveline.efficiency)(gear, motor_speed, torque),
+        "energy_true_wh": energy,
+        "energy_shown_wh": shown,
         "mass_kg": segments.channels["mass_kg"],
         "grade_rad": grade,
         **_coefficients(plain, segments, parts),
@@ -269,15 +283,23 @@ def _energy(vehicle: Vehicle, program: Program, segments: Segments) -> tuple[Any
     return lines, out
 
 
+def _at_the_wheels(vehicle: Vehicle) -> Vehicle:
+    """The same vehicle up to its wheels: the same forces, and less to compile."""
+    road = tuple(e for e in vehicle.effects if e.stage == "road")
+    one = jnp.ones_like(vehicle.mass_kg)
+    return Vehicle(road, mass_kg=vehicle.mass_kg, driveline=Driveline(one), machine=Machine(one, one))
+
+
 def _coefficients(vehicle: Vehicle, segments: Segments, parts: dict[str, Any]) -> dict[str, Any]:
     """c_rr and C_d·A that hold in each row: all effects that go with the weight, and all that go with the air."""
     weight = vehicle.mass(segments) * GRAVITY_MPS2 * jnp.cos(segments.channels["grade_rad"])
     square = mean_square_speed(segments)
     metres = jnp.where(segments.distance_m > 0, segments.distance_m, 1.0)
-    spray = jnp.zeros_like(metres)
+    spray: Any = 0.0
     if vehicle.has("wet_road"):  # half of that effect is rolling, half is air
-        dry = eqx.tree_at(lambda v: v.effect("wet_road").spray, vehicle, jnp.zeros_like(weight[0]))
-        spray = vehicle.force(segments) - dry.force(segments)
+        wet = vehicle.effect("wet_road")
+        air = eqx.tree_at(lambda e: e.excess, wet, jnp.zeros_like(wet.excess))
+        spray = jax.vmap(lambda row: air.force(row, vehicle))(segments)
 
     def force(ids: tuple[str, ...]) -> Any:
         return sum(parts[k] for k in ids if k in parts) * (3600.0 / metres)
