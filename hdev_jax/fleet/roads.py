@@ -68,7 +68,7 @@ class RouteBatch:
     wind_from_rad: np.ndarray
     wet_road: np.ndarray
     accel_mps2: np.ndarray
-    brake_mps2: np.ndarray
+    brake_mps2: np.ndarray  # [r, n·STEPS]
     friction: np.ndarray
     drag_factor: np.ndarray
 
@@ -92,6 +92,7 @@ def draw_routes(v: Variant, config: FleetConfig, routes: int, width: int, rng: n
     temp, wind, wind_from, wet = _weather(altitude[:, :-1:STEPS], config, rng)
     heavy = (mass[:, 0] - v.mass_kg[0]) / (v.mass_kg[1] - v.mass_kg[0])
     eager = rng.uniform(0.8, 1.2, routes) * config.driving.comfort
+    brake = np.exp(0.3 * _smooth(rng, routes, width * _NODES + 1, 2.0))  # no two halts are alike
     return RouteBatch(
         length=length, cap_mps=cap, grade_step=grade_step, halt_s=halt, mass_kg=mass,
         grade_rad=np.arcsin(np.clip(climb / SEGMENT_M, -0.3, 0.3)),
@@ -100,8 +101,8 @@ def draw_routes(v: Variant, config: FleetConfig, routes: int, width: int, rng: n
         heading_rad=np.mod(heading_nodes[:, STEPS // 2 :: STEPS][:, :width], 2 * np.pi),
         road_kind=kind, road_surface=surface, limit_mps=limit,
         ambient_temp_c=temp, wind_speed_mps=wind, wind_from_rad=wind_from, wet_road=wet,
-        accel_mps2=((1.05 if v.bus else 0.95) - 0.35 * heavy) * eager,
-        brake_mps2=((0.95 if v.bus else 0.80) - 0.1 * heavy) * eager,
+        accel_mps2=((1.0 if v.bus else 0.95) - 0.35 * heavy) * eager,
+        brake_mps2=_to_steps(brake, STEPS // _NODES) * (((1.0 if v.bus else 0.85) - 0.1 * heavy) * eager)[:, None],
         friction=np.where(wet.max(axis=1) > 0, 0.45, 0.70),
         drag_factor=np.maximum(1 + 0.1 * rng.standard_normal(routes), 0.7),
     )  # fmt: skip
