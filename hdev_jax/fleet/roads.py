@@ -36,6 +36,7 @@ _TURN = np.array([0.07, 0.04, 0.006, 0.0])  # junctions where it turns, per segm
 _LIGHT = np.array([0.10, 0.05, 0.006, 0.0])  # stops, per segment
 _ROUNDABOUT = np.array([0.015, 0.03, 0.015, 0.0])
 _JAM = np.array([0.55, 0.40, 0.15, 0.18])  # how much the traffic slows
+_JAMMED = 0.8  # of the speed that a jam takes at most
 _SURFACE = {"construction": (0.35, 0.35, 0.12, 0.18)}
 _SURFACE_USUAL = (0.52, 0.32, 0.12, 0.04)
 _TERRAIN = ((0.30, 0.45, 0.21, 0.04), (0.005, 0.012, 0.022, 0.033))  # share of the routes; sd of the slope
@@ -190,7 +191,8 @@ def _caps(v: Variant, kind: np.ndarray, limit: np.ndarray, curvature: np.ndarray
     habit = rng.normal(0.985, 0.03, (routes, 1))
     law = np.minimum(limit, 0.97 * v.top_speed_mps) * habit
     jam = np.maximum(_smooth(rng, routes, width * _NODES + 1, 5.0) + rng.normal(-0.4, 0.6, (routes, 1)), 0.0)
-    slowed = 1 - np.minimum(_to_steps(jam, STEPS // _NODES) * np.repeat(_JAM[kind], STEPS, axis=1) * config.driving.traffic, 0.85)
+    dense = _to_steps(jam, STEPS // _NODES) * np.repeat(_JAM[kind], STEPS, axis=1) * config.driving.traffic
+    slowed = 1 - _JAMMED * np.tanh(dense / _JAMMED)
     wander = 1 + 0.012 * _to_steps(_smooth(rng, routes, width * _NODES + 1, 4.0), STEPS // _NODES)
     cap = np.maximum(np.repeat(law, STEPS, axis=1) * slowed * wander, 2.0)
     cap = np.minimum(cap, np.sqrt(_LATERAL / np.maximum(np.abs(curvature), 1e-6)))

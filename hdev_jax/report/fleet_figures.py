@@ -100,7 +100,7 @@ def cycles(fleet: Sequence[Tally]) -> Any:
             share = sum(getattr(t, name) for t in ts)
             ax.stairs(100 * share / share.sum(), edges, color=colour, linewidth=1.4, label=words)
     for ax, share, edges in ((slope, ZTBUS_GRADE, GRADE_EDGES), (accel, ZTBUS_ACCEL, ACCEL_EDGES)):
-        ax.stairs(100 * np.array(share), edges, color=INK, linewidth=1.2, linestyle=(0, (3, 1.5)), label=f"measured: {ZTBUS}")
+        ax.stairs(100 * np.array(share), edges, color=INK, linewidth=1.2, linestyle=(0, (3, 1.5)), label=ZTBUS)
         ax.set_ylim(bottom=0)
         tidy(ax)
     top = accel.get_ylim()[1]
@@ -108,7 +108,7 @@ def cycles(fleet: Sequence[Tally]) -> Any:
         y = top * (0.97 - 0.075 * i)
         accel.plot([low, high], [y, y], "|-", color=GREY, linewidth=0.9, markersize=6)
         accel.annotate(name, (low, y), (-3, 0), textcoords="offset points", fontsize=7, color=GREY, ha="right", va="center")
-    accel.set_xlim(-2.9, 2.1)
+    accel.set_xlim(-3.3, 2.1)
     slope.set_title("Slope of the road")
     slope.set_xlabel("slope [%]")
     slope.set_ylabel("share of the distance [%]")
@@ -126,7 +126,8 @@ def _speeds(ax: Any, fleet: Sequence[Tally]) -> None:
     for i, (name, value) in enumerate(CYCLE_SPEEDS_KMH.items()):
         ax.axvline(value, color="#c4ccd3", linewidth=1.0, zorder=1)
         level = len(uses) - 0.25 + 0.55 * (i % 3)
-        ax.annotate(name, (value, level), fontsize=7, color=GREY, ha="center", va="bottom")
+        ax.annotate(name, (value, level), fontsize=7, color=GREY, ha="center", va="bottom",
+                    bbox={"facecolor": "white", "linewidth": 0, "pad": 0.8})  # fmt: skip
     for i, (use, ts) in enumerate(uses.items()):
         x = [t.sums["km"] / t.sums["hours"] for t in ts]
         ax.plot(x, np.full(len(x), len(uses) - 1 - i), "o", color=_USES[use][1], markersize=5, alpha=0.85)
