@@ -56,7 +56,7 @@ def _write_vehicle(config: FleetConfig, part: VehiclePart, folder: Path) -> Tall
             for kind, table in (("log", _log(batch, names)), ("truth", _truth(batch, names))):
                 if kind not in writers:
                     path = folder / f"{kind}.parquet" / f"{part.variant.id}.parquet"
-                    texts = ["trip_id", "vehicle_id"]
+                    texts: Any = ["trip_id", "vehicle_id"]
                     writer = pq.ParquetWriter(path, table.schema, compression="zstd", use_dictionary=texts)
                     writers[kind] = stack.enter_context(writer)
                 writers[kind].write_table(table)

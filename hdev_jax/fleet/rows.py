@@ -7,18 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.fleet.config import FleetConfig
-from hdev_jax.fleet.driver import STEP_M, Driven
+from hdev_jax.fleet.driver import STEP_M
 from hdev_jax.fleet.roads import SEGMENT_M, STEPS, RouteBatch
 from hdev_jax.physics.across import DISTANCE_SINCE_START, FIRST, LAST
 from hdev_jax.segments import Segments
 
-__all__ = ["TRUTH_ONLY", "log_rows", "measured", "padded"]
+__all__ = ["ROW_FIELDS", "TRUTH_ONLY", "log_rows", "measured", "padded"]
+
+ROW_FIELDS = ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps")
 
 TRUTH_ONLY = ("road_kind", "limit_mps", "shifts", "gear_middle", "wheel_energy_fine_wh")
 
 
-def log_rows(r: RouteBatch, d: Driven, used: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Columns of the rows in order, halts in between, and the route that each belongs to."""
+def log_rows(r: RouteBatch, d: Any, used: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Columns of the rows in order, halts in between, and the route that each belongs to; `d` a `Driven` of NumPy."""
     routes, width = r.mass_kg.shape
     shape = (routes, width, STEPS)
     seconds = d.step_s.T.reshape(shape)
@@ -74,13 +76,8 @@ def padded(rows: dict[str, np.ndarray], trip: np.ndarray, capacity: int) -> Segm
     before = np.cumsum(metres) - metres
     channels = {k: column(rows[k], 1.0) for k in _CHANNELS if k in rows}
     channels[DISTANCE_SINCE_START] = column(before - before[first] + 0.5 * metres, 0.0)
-    segments = Segments(
-        jnp.asarray(ids),
-        jnp.zeros(capacity, int),
-        *(column(rows[k], 1.0 if k == "duration_s" else 0.0)
-          for k in ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps")),
-        channels,
-    )  # fmt: skip
+    ends = {k: column(rows[k], 1.0 if k == "duration_s" else 0.0) for k in ROW_FIELDS}
+    segments = Segments(trip=jnp.asarray(ids), vehicle=jnp.zeros(capacity, int), channels=channels, **ends)
     # what effects derive by trip is worked out here: compiling it takes longer than all the rest
     bounds = {FIRST: jnp.asarray(first), LAST: jnp.asarray(last)}
     return eqx.tree_at(lambda s: s.channels, segments, {**channels, **bounds})

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.fleet.config import FleetConfig, load_config, parse_config
+from hdev_jax.fleet.rows import ROW_FIELDS
 from hdev_jax.fleet.simulator import Batch, VehiclePart, batches, shares
 from hdev_jax.fleet.variants import Variant
 from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 
 __all__ = ["Fleet", "FleetVehicle", "joined", "simulate", "trip_name"]
-
-_FIELDS = ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps")
 
 
 @dataclass(frozen=True)
@@ -106,9 +105,11 @@ def joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 def _vehicle(part: VehiclePart, made: list[Batch]) -> FleetVehicle:
     log, truth = joined([b.log for b in made]), joined([b.truth for b in made])
-    channels = {k: x.astype(float) for k, x in log.items() if k not in (*_FIELDS, "trip", "energy_wh")}
-    segments = Segments(
-        log["trip"], np.full(len(log["trip"]), part.index), *(log[k] for k in _FIELDS), channels
-    )  # ids of NumPy: nothing is traced here
+    channels: dict[str, Any] = {
+        k: x.astype(float) for k, x in log.items() if k not in (*ROW_FIELDS, "trip", "energy_wh")
+    }
+    ends = {k: log[k] for k in ROW_FIELDS}
+    vehicle = np.full(len(log["trip"]), part.index)
+    segments = Segments(trip=log["trip"], vehicle=vehicle, channels=channels, **ends)
     names = tuple(trip_name(part, k) for k in range(part.routes))
     return FleetVehicle(part.variant, segments, log["energy_wh"], truth, names, part.tabular, part.true, part.effects)

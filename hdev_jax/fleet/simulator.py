@@ -180,7 +180,7 @@ def _predict(vehicle: Vehicle, segments: Segments) -> dict[str, Any]:
 def _energy(vehicle: Vehicle, program: Program, segments: Segments) -> tuple[Any, dict[str, Any]]:
     """Gear, energy and what it is made of, for every row, by the kernel."""
     plain = vehicle.minus("time_skew") if vehicle.has("time_skew") else vehicle
-    speed, grade = segments.speed_mps, segments.channels["grade_rad"]
+    speed, grade = jnp.asarray(segments.speed_mps), jnp.asarray(segments.channels["grade_rad"])
     force = jnp.where(segments.distance_m > 0, _at_the_wheels(plain).force(segments), 0.0)  # brakes hold it at rest
     load = load_share(program, force, speed)
     lines = jax.vmap(partial(shift_lines, program))(speed, load, grade)

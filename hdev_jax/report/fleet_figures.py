@@ -98,7 +98,7 @@ def cycles(fleet: Sequence[Tally]) -> Any:
     for use, ts in usages(fleet).items():
         words, colour = _USES[use]
         for ax, name, edges in ((slope, "grade", GRADE_EDGES), (accel, "accel", ACCEL_EDGES)):
-            share = sum(getattr(t, name) for t in ts)
+            share = np.sum([getattr(t, name) for t in ts], axis=0)
             ax.stairs(100 * share / share.sum(), edges, color=colour, linewidth=1.4, label=words)
     for ax, share, edges in ((slope, ZTBUS_GRADE, GRADE_EDGES), (accel, ZTBUS_ACCEL, ACCEL_EDGES)):
         ax.stairs(100 * np.array(share), edges, color=INK, linewidth=1.2, linestyle=(0, (3, 1.5)), label=ZTBUS)
