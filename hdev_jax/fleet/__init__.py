@@ -26,13 +26,15 @@ driveline).
 
 The truth, by row: `energy_true_wh` (what the vehicle took), `energy_shown_wh` (the same with the target's clock skew,
 without noise), `energy_wh:<effect>` (its parts, which add up), `tabular_wh` (what the sheet predicts from the log),
-`c_rr`, `cda_m2` (that hold in the row, with all effects), `efficiency` (wheel to battery), `mass_kg`, `payload_error`
-(true mass over logged, less one), `grade_rad`, `motor_speed_radps`, `motor_torque_nm`, `requested_torque_nm`,
-`load_share` (power at the wheels over rated, 0 … 1); for the gears `gear`, `gear_previous`, `gear_lowest` and
-`gear_highest` (gear = clip(previous, lowest, highest): where they agree the row alone tells the gear), `gear_static`
-(the program without hysteresis), `shift_up_mps`, `shift_down_mps` (the speeds at which it leaves this gear at this
-row's load and grade; infinite and 0 where it cannot); `road_kind`, `limit_mps`, and of the drive in steps of 5 m:
-`shifts` in the row, `gear_middle` (in its middle), `wheel_energy_fine_wh`."""
+`tabular_wheel_wh` (the same at the wheels, paper 1, equation 4), `c_rr`, `cda_m2` (that hold in the row, with all
+effects), `efficiency` (wheel to battery), `mass_kg`, `payload_error` (true mass over logged, less one), `grade_rad`,
+`motor_speed_radps`, `motor_torque_nm`, `requested_torque_nm`, `load_share` (power at the wheels over rated, 0 … 1);
+for the gears `gear`, `gear_previous`, `gear_lowest` and `gear_highest` (gear = clip(previous, lowest, highest): where
+they agree the row alone tells the gear), `gear_static` (the program without hysteresis), `shift_up_mps`,
+`shift_down_mps` (the speeds at which it leaves this gear at this row's load and grade; infinite and 0 where it
+cannot); `road_kind`, `limit_mps`, and of the drive in steps of 5 m: `shifts` in the row, `gear_middle` (in its
+middle), `wheel_energy_fine_wh`.
+"""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
