@@ -1,7 +1,7 @@
 """Estimators on top of the kernel: one parameter table, calibration, clusters, the closed form."""
 
 from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, jacobian, padded, padded_rows, predict
-from hdev_jax.inference.clusters import Clusters, cluster_rows, clusters_of
+from hdev_jax.inference.clusters import Clusters, cluster_rows, clusters_of, sum_inflation
 from hdev_jax.inference.design import LinearFit, Rows, design, linear_fit
 from hdev_jax.inference.identified import caveats
 from hdev_jax.inference.linear import (
@@ -44,5 +44,6 @@ __all__ = [
     "posterior",
     "predict",
     "statistics",
+    "sum_inflation",
     "update",
 ]

@@ -7,7 +7,16 @@ from jaxtyping import Float, Int
 
 from hdev_jax.segments import Segments, trip_slices
 
-__all__ = ["BLOCK_S", "FEW_TRIPS", "MOST_CLUSTERS", "Clusters", "cluster_rows", "clustered", "clusters_of"]
+__all__ = [
+    "BLOCK_S",
+    "FEW_TRIPS",
+    "MOST_CLUSTERS",
+    "Clusters",
+    "cluster_rows",
+    "clustered",
+    "clusters_of",
+    "sum_inflation",
+]
 
 FEW_TRIPS = 8  # below this many training trips a trip is too coarse a unit (design, step 5)
 MOST_CLUSTERS = 256  # tell a variance to 9 %; each more costs a Gram matrix of all candidates
@@ -89,3 +98,12 @@ def clustered(
     precision = np.linalg.inv(robust + 1e-12 * np.diag(np.diag(naive)) + 1e-300 * np.eye(len(d)))
     prior = np.diag(1.0 / (prior_sd * d) ** 2)
     return np.linalg.inv(precision + prior) / np.outer(d, d), inflation
+
+
+def sum_inflation(residual: Float[np.ndarray, " row"], clusters: Clusters) -> float:
+    """How much wider the error of a cluster's sum is, as a variance, than independent rows would make it; at least 1.
+
+    `residual` weighed as it is summed.
+    """
+    alone = float(np.sum(residual**2))
+    return max(1.0, float(np.sum(clusters.sums(residual) ** 2)) / alone) if alone > 0 else 1.0

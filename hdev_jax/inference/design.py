@@ -208,7 +208,7 @@ def _of_piece(
     """A piece's statistics by cluster, or by group."""
     fit, size = piece.fit, np.shape(piece.fit.weight)[0]
 
-    def whole(ids: Any) -> np.ndarray:
+    def whole(ids: Any) -> Any:
         return np.concatenate([np.asarray(ids), np.zeros(size - fit.rows, dtype=int)]) if ids is not None else ids
 
     group = whole(piece.group) if grouped else None

@@ -45,7 +45,7 @@ class Statistics(eqx.Module):
             lambda a: a * jnp.reshape(factor, jnp.shape(factor) + (1,) * (a.ndim - jnp.ndim(factor))), self
         )
 
-    def about(self, step: Float[Array, "*group k"]) -> "Statistics":
+    def about(self, step: Float[Any, "*group k"]) -> "Statistics":
         """The same rows with r counted from a point `step` further on: exact where the model is linear."""
         along = jnp.einsum("...ij,...j->...i", self.gram, step)
         square = self.square - jnp.sum(step * (2.0 * self.moment - along), axis=-1)
