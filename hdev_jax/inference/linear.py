@@ -223,10 +223,14 @@ def follow(
     predict of it, the scale of that (Student t), and the coefficients after it. For several vehicles, `jax.vmap`.
     """
 
-    def step(state: Statistics, row: tuple[Array, Array]) -> tuple[Statistics, Any]:
-        before = posterior(prior, state)
-        told, wide = before.predicted(row[0][None])
-        state = update(state, row[0], row[1], forgetting=forgetting)
-        return state, (told[0], wide[0], posterior(prior, state).mean)
+    def step(carry: tuple[Statistics, Posterior], row: tuple[Array, Array]) -> Any:
+        state, before = carry
+        x, r = row
+        wide = jnp.sqrt(before.rate / before.shape * (1.0 + x @ _solved(before.precision, x)))
+        state = update(state, x, r, forgetting=forgetting)
+        after = posterior(prior, state)
+        return (state, after), (x @ before.mean, wide, after.mean)
 
-    return jax.lax.scan(step, state, (jnp.asarray(x), jnp.asarray(r)))
+    begin = (state, posterior(prior, state))
+    (last, _), told = jax.lax.scan(step, begin, (jnp.asarray(x), jnp.asarray(r)))
+    return last, told
