@@ -169,7 +169,7 @@ def many_rows(rows: int) -> list[list[str]]:
 
     from hdev_jax.inference import Rows, linear_fit
 
-    car, table, one, vehicle, _ = fleet(20, 3277, hills=-1.0, tails=False)
+    car, table, one, _, _ = fleet(20, 3277, hills=-1.0, tails=False)
     count = -(-rows // one.rows)
     piece = Rows(one, np.zeros(one.rows, dtype=int))
 

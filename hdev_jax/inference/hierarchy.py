@@ -20,7 +20,7 @@ from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.linear import LEAST_ROWS
 from hdev_jax.inference.models import POOL_FREEDOM
 
-__all__ = ["Sums", "fleet_draws", "marginal"]
+__all__ = ["Sums", "drawn", "fleet_draws", "marginal"]
 
 PROPOSAL_FREEDOM = 6.0  # tails of the proposal: heavier than the posterior's, so that no draw sticks
 WIDER = 1.1  # and a little wider
@@ -67,7 +67,7 @@ def _backward(low: list[Columns], b: Columns) -> Columns:
     return out
 
 
-def _parts(phi: Float[np.ndarray, "n k+1"], data: Sums) -> Any:
+def _parts(phi: Float[np.ndarray, "n dim"], data: Sums) -> Any:
     """Of (log τ, log σ²): τ⁻², roots and half-solved right sides by vehicle; root and right side of the mean."""
     vehicles, k = data.moment.shape
     tight, variance = np.exp(-2.0 * phi[:, :k]), np.exp(phi[:, k])
@@ -82,7 +82,7 @@ def _parts(phi: Float[np.ndarray, "n k+1"], data: Sums) -> Any:
     return tight, variance, low, half, _lower(own), right
 
 
-def marginal(phi: Float[np.ndarray, "n k+1"], data: Sums) -> Float[np.ndarray, " n"]:
+def marginal(phi: Float[np.ndarray, "n dim"], data: Sums) -> Float[np.ndarray, " n"]:
     """Log posterior of (log τ, log σ²), coefficients integrated out, up to a constant."""
     vehicles, k = data.moment.shape
     tight, variance, low, half, root, right = _parts(phi, data)
@@ -98,7 +98,7 @@ def marginal(phi: Float[np.ndarray, "n k+1"], data: Sums) -> Float[np.ndarray, "
 
 
 def _given(
-    phi: Float[np.ndarray, "n k+1"], data: Sums, rng: np.random.Generator
+    phi: Float[np.ndarray, "n dim"], data: Sums, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n vehicle k"]]:
     """The fleet's mean and the vehicles' coefficients, exactly, given (log τ, log σ²)."""
     (vehicles, k), n = data.moment.shape, len(phi)
@@ -157,9 +157,15 @@ def _accepted(weight: np.ndarray, odds: np.ndarray) -> np.ndarray:
     return kept
 
 
-def _drawn(
-    data: Sums, mode: np.ndarray, root: np.ndarray, rng: np.random.Generator, chains: int, draws: int
+def drawn(
+    data: Sums, start: Float[np.ndarray, " dim"], rng: np.random.Generator, *, chains: int, draws: int
 ) -> dict[str, np.ndarray]:
+    """Draws `[chain, draw, …]` of `mean`, `spread`, `theta`, `variance` in the units of `data`; `kept`, how often a
+    proposal was taken. `start`: a guess of (log τ, log σ²).
+    """
+    vehicles, k = data.moment.shape
+    width = np.r_[np.full(k, 1.0 / np.sqrt(2.0 * vehicles + 2.0)), np.sqrt(2.0 / (data.rows + LEAST_ROWS))]
+    mode, root = _mode(data, start, width)
     dim, freedom, n = len(mode), PROPOSAL_FREEDOM, chains * draws
     stretch = np.sqrt(freedom / rng.chisquare(freedom, (n, 1)))
     z = WIDER * stretch * rng.standard_normal((n, dim))
@@ -194,9 +200,7 @@ def fleet_draws(fit: LinearFit, *, key: Array, chains: int = 4, draws: int = 100
     k = len(own)
     seen = np.asarray(fit.posterior.mean) + (fit.at - value) / scale
     start = np.r_[np.log(np.clip(np.std(seen, axis=0), 0.1, 10.0)), 0.0]
-    width = np.r_[np.full(k, 1.0 / np.sqrt(2.0 * len(fit.at) + 2.0)), np.sqrt(2.0 / (rows + LEAST_ROWS))]
-    mode, root = _mode(data, start, width)
-    sites = _drawn(data, mode, root, rng, chains, draws)
+    sites = drawn(data, start, rng, chains=chains, draws=draws)
     kept = float(sites.pop("kept"))
     sites["theta"], sites["mean"] = value + scale * sites["theta"], value + scale * sites["mean"]
     sites["spread"], sites["variance"] = scale * sites["spread"], noise**2 * sites["variance"]

@@ -22,7 +22,6 @@ from hdev_jax.segments import Segments
 __all__ = ["MassFit", "loads", "mass_posterior", "with_sd"]
 
 
-
 @dataclass(frozen=True)
 class MassFit:
     """Mass of each group [kg] with its sd, distance [km], and what the log does not tell of it."""
@@ -75,7 +74,12 @@ def mass_posterior(
     fit = padded(bare, measured)
     fit = eqx.tree_at(lambda f: f.weight, fit, np.asarray(fit.weight) / np.sqrt(inflation))
     found = linear_fit(
-        car, ParameterTable((own, *rest)), lambda: [Rows(fit, ids, ids)], target, groups=int(ids.max()) + 1, robust=robust
+        car,
+        ParameterTable((own, *rest)),
+        lambda: [Rows(fit, ids, ids)],
+        target,
+        groups=int(ids.max()) + 1,
+        robust=robust,
     )
     km = np.bincount(ids, weights=np.asarray(segments.distance_m, dtype=float)) / 1e3
     return MassFit(found.values[:, 0], found.sd[:, 0], km, found, _about_mass(found))
