@@ -84,16 +84,16 @@ def test_nuts_through_the_kernel_agrees_with_the_statistics():
     model = Model.of(
         truck(), tabular(), fit, "battery_power_kw", noise=noise, group=own, groups=4, student=False, grows=False
     )
-    long = sampled(model, line.values, key=jax.random.key(0), chains=2, draws=700, noise=noise)
+    long = sampled(model, line.values, key=jax.random.key(0), chains=2, draws=400, warm_up=200, noise=noise)
     short = fleet_draws(line, key=jax.random.key(1), chains=4, draws=5000)
     assert short.faults() == []
     assert "sufficient statistics" in short.how
     assert "full likelihood" in long.how
-    assert long.quality()["r_hat"] < 1.03
+    assert long.quality()["r_hat"] < 1.05
     assert long.divergent == 0
     for name in ("mean", "spread", "theta", "variance"):
         a, b = long.flat(name), short.flat(name)
-        error = np.std(a, axis=0) / np.sqrt(300)
+        error = np.std(a, axis=0) / np.sqrt(150)
         assert np.all(np.abs(a.mean(0) - b.mean(0)) < 4.5 * error), name
         np.testing.assert_allclose(np.std(a, axis=0), np.std(b, axis=0), rtol=0.25)
 
@@ -114,6 +114,7 @@ def test_a_bad_fit_is_not_called_good():
     assert "finite" in faults(np.where(good > 3, np.nan, good))
 
 
+@pytest.mark.slow
 def test_mass_by_trip_is_the_one_that_was_driven():
     """Trips of known mass on hills, the log's own mass unknown; and by stop where passengers change."""
     s = driving(*[150] * 6, seed=4)
