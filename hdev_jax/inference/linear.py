@@ -126,6 +126,12 @@ class Posterior(eqx.Module):
         wide = jnp.einsum("rk,kl,rl->r", x, _inverse(self.precision), x)
         return x @ self.mean, jnp.sqrt(self.rate / self.shape * (1.0 + wide))
 
+    def total(self, x: Float[Array, "row k"], weight: Float[Array, " row"]) -> tuple[Array, Array]:
+        """The weighed sum of rows x beyond the linearisation point, and its scale with the rows' noise (Student t)."""
+        along = weight @ x
+        wide = along @ _inverse(self.precision) @ along
+        return along @ self.mean, jnp.sqrt(self.rate / self.shape * (jnp.sum(weight**2) + wide))
+
 
 def _inverse(a: Float[Array, "*group k k"]) -> Float[Array, "*group k k"]:
     """Of a symmetric positive matrix, through its eigenvalues after scaling its diagonal to 1: never NaN."""

@@ -20,6 +20,7 @@ from hdev_jax.inference import (
     calibrate,
     caveats,
     cluster_rows,
+    design,
     follow,
     least_squares,
     linear_fit,
@@ -293,6 +294,26 @@ def test_ranks_of_the_truth_are_uniform():
     for column in ranks.T:
         counts = np.histogram(column, bins=20, range=(0, 100))[0]
         assert stats.chisquare(counts).pvalue > 1e-3
+
+
+def test_intervals_of_the_second_half_hold_in_nine_of_ten_trips():
+    """500 trips drawn from the prior on the kernel's own design: the total of the second half from the first."""
+    s = driving(*[60] * 500, seed=9)
+    x, _ = design(truck(), tabular(), padded(s, np.zeros(len(s))).segments, "battery_power_kw", PRIOR)
+    x = (np.asarray(x)[: len(s)] * PRIOR_SD).reshape(500, 60, 2)
+    prior = Prior.of_table([0.0, 0.0], [1.0, 1.0], 3.0, 8.0)
+
+    def trip(key: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        one, two = jax.random.split(key)
+        theta, sigma = posterior(prior, Statistics.zero(2)).draws(one, 1)
+        y = x @ theta[0] + sigma[0] * jax.random.normal(two, (60,))
+        first = posterior(prior, statistics(x[:30], y[:30], y[:30], jnp.ones(30)))
+        mean, scale = first.total(x[30:], jnp.ones(30))
+        return (jnp.sum(y[30:]) - mean) / scale, first.freedom
+
+    off, freedom = jax.jit(jax.vmap(trip))(jax.random.split(jax.random.key(4), 500), jnp.asarray(x))
+    inside = np.abs(np.asarray(off)) < stats.t.ppf(0.95, np.asarray(freedom))
+    assert 0.87 <= np.mean(inside) <= 0.93
 
 
 def test_a_free_efficiency_is_iterated_to_the_map():
