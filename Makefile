@@ -37,7 +37,7 @@ $(READY): pyproject.toml constraints.txt $(if $(wildcard $(PY)),,FORCE)
 	@touch $(CUT_OFF)
 	@echo "installing $$(grep -c == constraints.txt) pinned packages into $(VENV)/ (a few minutes the first time)"
 	@$(PIP) hatchling editables
-	@$(PIP) --no-build-isolation -e '.[test,dev,experiments,fleet]'
+	@$(PIP) --no-build-isolation -e '.[test,dev,experiments,fleet,nuts]'
 	@rm -f $(CUT_OFF)
 	@touch $@
 	@echo "$(VENV)/ is ready"

@@ -1,33 +1,26 @@
 """The verbs: what `hdev VERB` does, as functions of the same names and arguments."""
 
 import json
-import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import jax
 import numpy as np
 
 from hdev_jax import progress
 from hdev_jax.diagnosis.diagnose import Diagnosis
 from hdev_jax.diagnosis.diagnose import diagnose as run_loop
-from hdev_jax.diagnosis.metrics import metrics
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.stages import add_stages
-from hdev_jax.diagnosis.summary import baseline_block
-from hdev_jax.errors import InputError
-from hdev_jax.inference import calibrate as fit_map
-from hdev_jax.inference import cluster_rows, padded
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.inference.sheet_text import augmented_sheet
 from hdev_jax.logs import read_log, write_adapter_skeleton
 from hdev_jax.opening import Paths, chosen_effects, command_line, known_effects, opened
 from hdev_jax.physics import LIBRARY
-from hdev_jax.report.build import answer_text, of_diagnosis, report_data
-from hdev_jax.report.page import write_calibration_report, write_report
-from hdev_jax.rundir import atomic_file, open_run
+from hdev_jax.posterior import calibrate, predict
+from hdev_jax.report.build import answer_text, of_diagnosis
+from hdev_jax.report.page import write_report
+from hdev_jax.rundir import open_run
 
 __all__ = ["calibrate", "check", "diagnose", "effects", "predict", "simulate"]
 
@@ -77,138 +70,6 @@ def diagnose(
         answer = answer_text(data, Path(out))
         run.path("answer.txt").write_text(answer)
     return answer
-
-
-def calibrate(
-    logs: Paths,
-    vehicle: str | Path,
-    adapter: str | Path | None = None,
-    target: str | None = None,
-    train_trips: Sequence[str] | None = None,
-    test_trips: Sequence[str] | None = None,
-    effects: str | Path | None = None,
-    method: str = "map",
-    noise: str = "normal",
-    *,
-    out: str | Path,
-    seed: int = 0,
-) -> str:
-    """Coefficients of the sheet with uncertainty, from their tabular priors and the training trips of the logs.
-
-    `method` "map": Levenberg-Marquardt to the most probable values, standard errors clustered by trip. `noise`
-    "student_t" weighs outliers down. **Returns:** a table as text; `calibration.json`, a report and
-    `calibrated_vehicle.toml` are in `out`. Raises `InputError`.
-    """
-    if method != "map":
-        raise InputError(f"--method {method!r}: accepted is map")
-    if noise not in ("normal", "student_t"):
-        raise InputError(f"--noise {noise!r}: accepted are normal, student_t")
-    started = time.time()
-    start = opened("calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed)
-    problem, split = start.problem, start.split
-    if not problem.table.free:
-        raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")
-    config = {**start.config, "method": method, "noise": noise}
-    with open_run(out, config, seed=seed) as run:
-        if run.done:
-            return (run.work / "answer.txt").read_text()
-        progress.step(f"{start.read}; calibrating")
-        train, test = problem.rows(split.train), problem.rows(split.test)
-        rows = padded(problem.segments.take(train), problem.measured[train])
-        fit = fit_map(
-            problem.vehicle, problem.table, rows, problem.target, cluster_rows(problem.segments.take(train)),
-            noise=noise,  # pyright: ignore[reportArgumentType]
-        )  # fmt: skip
-        predicted = problem.predict(fit.vehicle)
-        y, w = problem.measured, problem.weight()
-        summary = {
-            "schema": "hdev-calibration/1",
-            "target": problem.target,
-            "method": method,
-            "noise": noise,
-            "split": {
-                "train_trips": split.names(split.train),
-                "test_trips": split.names(split.test),
-                "unused_trips": split.names(split.unused),
-            },
-            "baseline": {"parameters": baseline_block(fit, {})},
-            "before": {
-                "train": metrics(y[train], predicted[train], w[train]),
-                "test": metrics(y[test], predicted[test], w[test]),
-                "test_by_trip": {
-                    split.log.trip_names[i]: metrics(*(a[problem.rows([i])] for a in (y, predicted, w)))
-                    for i in split.test
-                },
-            },
-            "converged": fit.converged,
-            "solver": fit.message,
-            "notes": list(problem.notes) + ([] if fit.converged else [f"the fit stopped early: {fit.message}"]),
-        }
-        values = {c.name: (float(v), float(s)) for c, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)}
-        run.path("calibration.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
-        run.path("calibrated_vehicle.toml").write_text(augmented_sheet(start.sheet, values, {}))
-        data = report_data(problem, split, summary, predicted, predicted, command_line("calibrate", run), started)
-        write_calibration_report(data, run.work)
-        lines = [f"{name:32s} {v:12.6g} ± {s:.3g}" for name, (v, s) in values.items()]
-        test_rmse = summary["before"]["test"]["rmse"]
-        answer = "\n".join([*lines, f"test RMSE {test_rmse:.4g} {problem.unit}; {fit.message}; {out}/report.html"])
-        run.path("answer.txt").write_text(answer)
-    return answer
-
-
-def predict(
-    logs: Paths,
-    vehicle: str | Path,
-    adapter: str | Path | None = None,
-    target: str | None = None,
-    effects: str | Path | None = None,
-    level: float = 0.9,
-    *,
-    out: str | Path,
-) -> str:
-    """One line for each row of the logs: `trip_id, time_s, predicted, lower, upper, level` in the target's unit.
-
-    The interval holds what the coefficients leave open (their sds in the sheet, through the kernel's Jacobian) and,
-    where the log measures the target, the spread of its residual. Raises `InputError`.
-    """
-    import pandas as pd
-    from scipy import stats
-
-    from hdev_jax.inference import jacobian
-
-    if not 0 < level < 1:
-        raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
-    log = read_log(list(logs), adapter)
-    sheet = read_sheet(vehicle, library=known_effects(effects))
-    measures = target in log.targets if target else bool(log.targets)
-    name = target or (log.default_target if measures else "energy_wh")
-    derived = name == "traction_force_n" and log.segments.has("motor_torque_nm")
-    problem = prepare(log, sheet, name, need_measured=measures or derived)
-    predicted = problem.predict(problem.vehicle)
-    sd = np.array([c.sd or 0.0 for c in problem.table.free])
-    rows = padded(problem.segments, problem.measured)
-    jac = jacobian(problem.vehicle, problem.table, rows.segments, problem.target)[: len(log)]
-    variance = np.sum((jac * sd) ** 2, axis=1) if len(sd) else np.zeros(len(log))
-    if measures or derived:
-        variance = variance + float(np.mean((problem.measured - predicted) ** 2))
-    half = stats.norm.ppf(0.5 + level / 2) * np.sqrt(variance)
-    frame = pd.DataFrame(
-        {
-            "trip_id": np.asarray(log.trip_names, dtype=object)[log.segments.trip],
-            "time_s": log.segments.time_s,
-            "predicted": predicted,
-            "lower": predicted - half,
-            "upper": predicted + half,
-            "level": level,
-        }
-    )
-    with atomic_file(out) as temporary:
-        if str(out).endswith(".parquet"):
-            frame.to_parquet(temporary, index=False)
-        else:
-            compression: Any = "gzip" if str(out).endswith(".gz") else None
-            frame.to_csv(temporary, index=False, float_format="%.8g", compression=compression)
-    return f"{len(frame)} rows of {problem.target} -> {out}"
 
 
 def simulate(config: str | Path, *, out: str | Path) -> str:

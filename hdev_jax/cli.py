@@ -104,13 +104,18 @@ def parser() -> argparse.ArgumentParser:
         help="the sheet's coefficients with their uncertainty, from the tabular values and the log",
         description="Estimate the coefficients to which the sheet gives an sd, from their tabular values and the "
         "training trips, with standard errors. No effect is added.",
-        epilog="example:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated",
+        epilog="examples:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated\n"
+        "  hdev calibrate trips.csv --vehicle truck.toml --method nuts --noise student_t --out drawn",
     )
     _logs(calibrate)
     _split(calibrate)
     _effects(calibrate)
     calibrate.add_argument(
-        "--method", choices=["map"], default="map", help="map: Levenberg-Marquardt with the priors (default: map)"
+        "--method",
+        choices=["map", "linear", "nuts"],
+        default="map",
+        help="map: Levenberg-Marquardt with the priors; linear: Bayesian regression in closed form; nuts: draws of the "
+        "posterior, from sufficient statistics or through the kernel (default: map)",
     )
     calibrate.add_argument(
         "--noise",
@@ -123,7 +128,8 @@ def parser() -> argparse.ArgumentParser:
     predict = verbs.add_parser(
         "predict",
         help="what a vehicle sheet predicts for each row of a log, with an interval",
-        description="Predict the target for each row of the logs, which need not have measured it.",
+        description="Predict the target for each row of the logs, which need not have measured it, and the total of "
+        "each trip, with intervals. A sheet that hdev calibrate wrote, in its folder, brings its posterior with it.",
         epilog="example:\n  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out predicted.csv",
     )
     _logs(predict)

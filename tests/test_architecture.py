@@ -24,6 +24,7 @@ LAYERS = [
     {"diagnosis"},
     {"report"},
     {"opening"},
+    {"posterior"},
     {"api"},
     {"demo", "cli", "experiments"},
 ]

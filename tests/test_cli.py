@@ -146,7 +146,7 @@ def test_version(capsys):
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--seed", "-1"], "expected a whole number"),
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--train-trips", "1,,2"], "commas between them, found '1,,2'"),
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--target", "power"], "invalid choice: 'power'"),
-        (["calibrate", "a.csv", *SHEET, "--out", "d", "--method", "nuts"], "invalid choice: 'nuts'"),
+        (["calibrate", "a.csv", *SHEET, "--out", "d", "--method", "ols"], "invalid choice: 'ols'"),
     ],
 )
 def test_usage_errors_are_one_line_and_exit_2(api, capsys, argv, says):

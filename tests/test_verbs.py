@@ -6,6 +6,7 @@ import io
 import json
 import math
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -311,6 +312,45 @@ def test_calibrate(noise, first, given, out):
         test = rows.trip_id.isin(found["split"]["test_trips"])
         rmse = math.sqrt(np.mean((rows.predicted - log.energy_wh)[test] ** 2))
         assert rmse == pytest.approx(found["before"]["test"]["rmse"], rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["linear", "nuts"])
+def test_the_other_methods_agree_with_the_map(method, given, tmp_path):
+    """Values, the files, what predict makes of the posterior beside the sheet; draws that ArviZ reads."""
+    found, text = {}, ""
+    for m in ("map", method):
+        status, text = hdev("calibrate", *given, "--method", m, "--out", tmp_path / m)
+        assert status == 0
+        found[m] = json.loads((tmp_path / m / "calibration.json").read_text())
+    assert "sufficient statistics" in text
+    for name, p in found["map"]["baseline"]["parameters"].items():
+        other = found[method]["baseline"]["parameters"][name]
+        assert other["value"] == pytest.approx(p["value"], abs=0.2 * p["sd"])
+        assert other["sd"] == pytest.approx(p["sd"], rel=0.3)
+    assert (tmp_path / method / "figures" / "posterior.png").stat().st_size > 1000
+    if method == "nuts":
+        draws = found["nuts"]["draws"]
+        assert draws["faults"] == []
+        assert draws["r_hat"] < 1.01
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import arviz
+
+            data = arviz.from_netcdf(tmp_path / "nuts" / "posterior.nc")
+        assert list(data.posterior["coefficient"].values) == ["road.c_rr", "road.cda_m2"]
+        value = found["nuts"]["baseline"]["parameters"]["road.cda_m2"]["value"]
+        assert float(data.posterior["theta"][..., 1].mean()) == pytest.approx(value, rel=1e-9)
+    sheet = tmp_path / method / "calibrated_vehicle.toml"
+    status, text = hdev("predict", given[0], "--vehicle", sheet, "--out", tmp_path / "p.csv")
+    log = pd.read_csv(str(given[0]))
+    inside = 0
+    for trip, rows in log.groupby("trip_id"):
+        words = next(line for line in text.splitlines() if line.startswith(f"{trip} ")).split()
+        low, high = float(words[3]), float(words[5])
+        assert low < float(words[1]) < high
+        inside += low <= rows.energy_wh.sum() / 1e3 <= high
+    assert inside >= 6, "of nine trips, by an interval of 90 %"
 
 
 def test_nothing_to_calibrate(files, tmp_path, capsys, out):

@@ -1,22 +1,49 @@
-"""Estimators on top of the kernel: one parameter table, calibration, clusters."""
+"""Estimators on top of the kernel: one parameter table, calibration, clusters, the closed form."""
 
 from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, jacobian, padded, padded_rows, predict
-from hdev_jax.inference.clusters import Clusters, cluster_rows, clusters_of
-from hdev_jax.inference.parameters import Coefficient, ParameterTable, effect_coefficients, insert
+from hdev_jax.inference.clusters import Clusters, cluster_rows, clusters_of, sum_inflation
+from hdev_jax.inference.design import LinearFit, Rows, design, linear_fit
+from hdev_jax.inference.identified import caveats
+from hdev_jax.inference.linear import (
+    Posterior,
+    Prior,
+    Statistics,
+    follow,
+    least_squares,
+    posterior,
+    statistics,
+    update,
+)
+from hdev_jax.inference.parameters import Coefficient, ParameterTable, effect_coefficients, insert, insert_by
 
 __all__ = [
     "Calibration",
     "Clusters",
     "Coefficient",
     "Fit",
+    "LinearFit",
     "ParameterTable",
+    "Posterior",
+    "Prior",
+    "Rows",
+    "Statistics",
     "calibrate",
+    "caveats",
     "cluster_rows",
     "clusters_of",
+    "design",
     "effect_coefficients",
+    "follow",
     "insert",
+    "insert_by",
     "jacobian",
+    "least_squares",
+    "linear_fit",
     "padded",
     "padded_rows",
+    "posterior",
     "predict",
+    "statistics",
+    "sum_inflation",
+    "update",
 ]

@@ -11,13 +11,15 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from hdev_jax.inference.clusters import Clusters
+from hdev_jax.inference.clusters import Clusters, clustered
 from hdev_jax.inference.parameters import ParameterTable, insert
 from hdev_jax.physics import Vehicle, derived
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["Calibration", "Fit", "calibrate", "jacobian", "padded", "padded_rows", "predict"]
+__all__ = [
+    "STUDENT_DF", "WEAK", "Calibration", "Fit", "calibrate", "inside", "jacobian", "padded", "padded_rows", "predict",
+]  # fmt: skip
 
 STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
@@ -183,7 +185,7 @@ def calibrate(
     scale = np.array([c.scale for c in free])
     prior = np.array([c.value for c in free])
     prior_sd = np.array([c.sd if c.sd is not None else WEAK * c.scale for c in free])
-    theta = np.array([_inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
+    theta = np.array([inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
     structure = table.structure
 
     sigma, inflation, tail = 1.0, 1.0, np.ones(rows)
@@ -215,7 +217,8 @@ def calibrate(
             new_sigma = float(np.sqrt(np.mean(r**2))) + 1e-12
         jac = np.asarray(_jacobian(vehicle, structure, target, fit.segments, jnp.asarray(theta)))[:rows]
         w = np.sqrt(tail)[:, None] * base[:, None]
-        covariance, new_inflation = _clustered(w * jac, np.sqrt(tail) * r, new_sigma, prior_sd, clusters)
+        grams, scores = clusters.grams(w * jac), clusters.sums(w * jac * (np.sqrt(tail) * r)[:, None])
+        covariance, new_inflation = clustered(grams, scores, new_sigma, prior_sd)
         if noise == "student_t":
             settled = abs(np.log(new_sigma / sigma)) < 1e-3 and change < 1e-4
         else:  # new weights of the likelihood move the optimum only as far as the prior pulls on it
@@ -230,7 +233,7 @@ def calibrate(
     return Calibration(fitted, table, theta, sd, covariance, predicted, sigma, inflation, converged, message, steps)
 
 
-def _inside(x: float, lower: float, upper: float) -> float:
+def inside(x: float, lower: float, upper: float) -> float:
     """A start inside the support, off its edges, where the solver's transform has no slope."""
     if np.isinf(lower) and np.isinf(upper):
         return x
@@ -238,32 +241,6 @@ def _inside(x: float, lower: float, upper: float) -> float:
         return max(x, lower + 1e-6 * max(1.0, abs(lower)))
     edge = 1e-3 * (upper - lower)
     return float(np.clip(x, lower + edge, upper - edge))
-
-
-def _clustered(
-    jac: np.ndarray, r: np.ndarray, sigma: float, prior_sd: np.ndarray, clusters: Clusters
-) -> tuple[np.ndarray, float]:
-    """Covariance with errors clustered, and how much wider it is than the naive one (at least 1)."""
-    g = clusters.count
-    grams = np.stack([part.T @ part for part in np.split(jac, np.flatnonzero(np.diff(clusters.ids)) + 1)])
-    scores = clusters.sums(jac * r[:, None])
-    # conditioning: work in units of the naive standard errors
-    information = grams.sum(axis=0)
-    d = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    information, grams, scores = information / np.outer(d, d), grams / np.outer(d, d), scores / d
-    ridge = 1e-10 * np.eye(len(d))
-    bread = np.linalg.inv(information + ridge)
-    # about the log's own optimum: what the prior pulls on every cluster alike is no disagreement between them
-    scores = scores - grams @ (bread @ scores.sum(axis=0))
-    # the estimate without each cluster, in one step: jackknifed, since a sandwich of few clusters is too narrow
-    moves = np.linalg.solve(information + ridge - (1 - 1e-6) * grams, scores[:, :, None])[:, :, 0]
-    robust = (g - 1) / g * moves.T @ moves if g > 1 else sigma**2 * bread
-    naive = sigma**2 * bread
-    inflation = max(1.0, float(np.mean(np.diag(robust) / np.maximum(np.diag(naive), 1e-300))))
-    # the clustered likelihood, as a normal around its own maximum, times the prior
-    precision = np.linalg.inv(robust + 1e-12 * np.diag(np.diag(naive)) + 1e-300 * np.eye(len(d)))
-    prior = np.diag(1.0 / (prior_sd * d) ** 2)
-    return np.linalg.inv(precision + prior) / np.outer(d, d), inflation
 
 
 @eqx.filter_jit

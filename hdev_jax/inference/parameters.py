@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hdev_jax.physics import Effect, Grouped, Vehicle
 
-__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert"]
+__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert", "insert_by"]
 
 _DECLARED = {  # path in the sheet → (effect that holds it, its field)
     "road.c_rr": ("rolling", "c_rr"),
@@ -117,6 +117,23 @@ def insert(vehicle: Vehicle, structure: Any, values: Any) -> Vehicle:
             old = _leaf(vehicle, path)
             new = Grouped(jnp.asarray(old.values).at[group].set(values[k]), old.by)
         vehicle = eqx.tree_at(where, vehicle, new, is_leaf=lambda x: isinstance(x, Grouped))
+    return vehicle
+
+
+def insert_by(vehicle: Vehicle, structure: Any, values: Any, by: str) -> Vehicle:
+    """A vehicle with values `[group, free]`, of each row those of the group that its channel `by` names.
+
+    Raises `ValueError` for a coefficient that has groups already, or acts across rows.
+    """
+    for k, (path, group, _, _) in enumerate(structure):
+        if group is not None:
+            raise ValueError(f"{path} has values by gear, vehicle or surface already; hold it, or take one of each row")
+        if path.startswith("effects."):
+            effect = vehicle.effect(path.split(".")[1])
+            if effect.overrides("across") or effect.overrides("observe"):
+                raise ValueError(f"{path} acts across rows; one value for all groups is accepted")
+        where = lambda v, p=path: _leaf(v, p)  # noqa: E731
+        vehicle = eqx.tree_at(where, vehicle, Grouped(values[:, k], by))
     return vehicle
 
 

@@ -18,6 +18,7 @@ from hdev_jax.report.figures import (
     residual_by_trip,
     trip_errors,
 )
+from hdev_jax.report.posterior import prior_likelihood_posterior
 from hdev_jax.report.residuals import panels, residual_by_channel, residual_in_time
 from hdev_jax.report.statistics import TRIPS_ENOUGH, row_seconds
 
@@ -88,6 +89,7 @@ def write_calibration_report(data: ReportData, directory: Path) -> None:
     with style():
         figures = {
             "coefficients": coefficients(data),
+            "posterior": prior_likelihood_posterior(data),
             "measured_predicted": measured_predicted(data),
             "residual_by_trip": residual_by_trip(data),
             "energy_by_effect": energy_by_effect(data),

@@ -1,0 +1,137 @@
+"""Draws: the fleet's on statistics against a dense derivation and by ranks; NUTS against both; what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, driving, tabular, truck
+from scipy import stats
+
+from hdev_jax.inference import Rows, linear_fit, padded
+from hdev_jax.inference.draws import Draws
+from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal
+from hdev_jax.inference.mass import loads, mass_posterior, with_sd
+from hdev_jax.inference.models import Model
+from hdev_jax.inference.nuts import sampled
+from hdev_jax.physics import Grouped
+
+
+def world(rng: np.random.Generator, vehicles: int, rows: int, k: int = 2) -> tuple[Sums, dict, list]:
+    """A fleet from the prior, and its statistics in the tables' units with a believed noise of 1."""
+    spread = np.abs(stats.t.rvs(4, size=k, random_state=rng))
+    mean = rng.standard_normal(k)
+    theta = mean + spread * rng.standard_normal((vehicles, k))
+    variance = stats.invgamma.rvs(2, scale=1.0, random_state=rng)
+    data = []
+    for t in theta:
+        x = rng.standard_normal((rows, k)) + 0.3
+        data.append((x, x @ t + np.sqrt(variance) * rng.standard_normal(rows)))
+    gram, moment = np.stack([x.T @ x for x, _ in data]), np.stack([x.T @ y for x, y in data])
+    sums = Sums(gram, moment, float(sum(y @ y for _, y in data)), float(vehicles * rows))
+    return sums, {"mean": mean, "spread": spread, "theta": theta, "variance": variance}, data
+
+
+def test_the_marginal_is_the_dense_normals():
+    """All rows of all vehicles as one normal, whose covariance is written out."""
+    rng = np.random.default_rng(0)
+    sums, _, data = world(rng, 3, 5)
+    x = np.concatenate([x for x, _ in data])
+    y = np.concatenate([y for _, y in data])
+    own = np.repeat(np.arange(3), 5)
+    phi = rng.normal(0, 0.7, (6, 3))
+    dense = []
+    for p in phi:
+        spread, variance = np.exp(p[:2]), np.exp(p[2])
+        same = (own[:, None] == own[None, :]).astype(float)
+        cov = x @ x.T + same * ((x * spread**2) @ x.T) + variance * np.eye(15)
+        value = stats.multivariate_normal.logpdf(y, np.zeros(15), cov)
+        value += np.sum(stats.t.logpdf(spread, 4) + p[:2]) + stats.invgamma.logpdf(variance, 2, scale=1.0) + p[2]
+        dense.append(value)
+    found = marginal(phi, sums)
+    np.testing.assert_allclose(found - found[0], np.array(dense) - dense[0], rtol=1e-9, atol=1e-9)
+
+
+def test_ranks_of_a_fleets_truth_are_uniform():
+    """Simulation-based calibration of the fleet model."""
+    ranks: dict[str, list[int]] = {"mean": [], "spread": [], "theta": [], "variance": []}
+    for seed in range(300):
+        rng = np.random.default_rng([5, seed])
+        sums, truth, _ = world(rng, 5, 8)
+        made = drawn(sums, np.zeros(3), rng, chains=1, draws=950)
+        for name, values in ranks.items():
+            column = made[name][0].reshape(950, -1)[::50, 0]  # 19, far enough apart to be independent
+            values.append(int(np.sum(column < np.ravel(truth[name])[0])))
+    for name, values in ranks.items():
+        counts = np.bincount(values, minlength=20)
+        assert stats.chisquare(counts).pvalue > 1e-3, (name, counts)
+
+
+def fleet(vehicles: int, rows: int, noise: float = 4.0) -> tuple:
+    s = driving(*[rows] * vehicles, seed=2)
+    rng = np.random.default_rng(3)
+    theta = np.array([C_RR, CDA]) + np.array([C_RR_SD, CDA_SD]) * (0.5 + 0.6 * rng.standard_normal((vehicles, 2)))
+    car = truck(*(Grouped(jnp.asarray(theta[:, k]), "trip") for k in (0, 1)))
+    y = np.asarray(car.predict(s, "battery_power_kw")) + noise * rng.standard_normal(len(s))
+    return padded(s, y), np.asarray(s.trip), theta
+
+
+@pytest.mark.slow
+def test_nuts_through_the_kernel_agrees_with_the_statistics():
+    """The same model, drawn on every row and on sums: means apart by no more than Monte-Carlo error."""
+    fit, own, _ = fleet(4, 60)
+    line = linear_fit(truck(), tabular(), lambda: [Rows(fit, own, own)], "battery_power_kw", groups=4)
+    noise = float(np.median(np.asarray(line.posterior.sigma)))
+    model = Model.of(
+        truck(), tabular(), fit, "battery_power_kw", noise=noise, group=own, groups=4, student=False, grows=False
+    )
+    long = sampled(model, line.values, key=jax.random.key(0), chains=2, draws=400, warm_up=200, noise=noise)
+    short = fleet_draws(line, key=jax.random.key(1), chains=4, draws=5000)
+    assert short.faults() == []
+    assert "sufficient statistics" in short.how
+    assert "full likelihood" in long.how
+    assert long.quality()["r_hat"] < 1.05
+    assert long.divergent == 0
+    for name in ("mean", "spread", "theta", "variance"):
+        a, b = long.flat(name), short.flat(name)
+        error = np.std(a, axis=0) / np.sqrt(150)
+        assert np.all(np.abs(a.mean(0) - b.mean(0)) < 4.5 * error), name
+        np.testing.assert_allclose(np.std(a, axis=0), np.std(b, axis=0), rtol=0.25)
+
+
+def test_a_bad_fit_is_not_called_good():
+    rng = np.random.default_rng(0)
+    good = rng.standard_normal((4, 1000, 1))
+    labels = {"coefficient": ["road.c_rr"]}
+
+    def faults(values: np.ndarray, **more) -> str:
+        return " | ".join(Draws({"theta": values}, "by hand", {"theta": ("coefficient",)}, labels, **more).faults())
+
+    assert faults(good) == ""
+    assert "chains disagree" in faults(good + np.arange(4)[:, None, None])
+    assert "too few effective draws" in faults(np.cumsum(good, axis=1) * 0.02 + good * 1e-3)
+    assert "diverged" in faults(good, divergent=100)
+    assert "one chain" in faults(good[:1])
+    assert "finite" in faults(np.where(good > 3, np.nan, good))
+
+
+@pytest.mark.slow
+def test_mass_by_trip_is_the_one_that_was_driven():
+    """Trips of known mass on hills, the log's own mass unknown; and by stop where passengers change."""
+    s = driving(*[150] * 6, seed=4)
+    true = np.array([18e3, 22e3, 25e3, 29e3, 33e3, 20e3])
+    s = s.with_channels(
+        mass_kg=true[s.trip], grade_rad=np.random.default_rng(0).uniform(-0.03, 0.03, len(s)),
+        passengers=np.repeat(np.arange(12.0) % 5, 75),
+    )  # fmt: skip
+    y = np.asarray(truck().predict(s, "battery_power_kw")) + 2.0 * np.random.default_rng(1).standard_normal(len(s))
+    options = {"mass_kg": 24e3, "sd_kg": 6e3}
+    found = mass_posterior(truck(), tabular(), s, y, "battery_power_kw", **options)
+    assert np.median(np.abs(found.mass_kg / true - 1)) < 0.02
+    assert np.all(np.abs(found.mass_kg - true) < 4 * found.sd_kg)
+    assert found.notes == []
+    stops = loads(s)
+    assert stops.max() == 11
+    by_stop = mass_posterior(truck(), tabular(), s, y, "battery_power_kw", group=stops, **options)
+    assert np.all(np.abs(by_stop.mass_kg - np.repeat(true, 2)) < 4 * by_stop.sd_kg)
+    known = with_sd(tabular(), [C_RR, CDA], [1e-5, 1e-2])
+    assert np.all(mass_posterior(truck(), known, s, y, "battery_power_kw", **options).sd_kg < found.sd_kg)
