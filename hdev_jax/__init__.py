@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hdev_jax.api import calibrate, check, diagnose, effects, predict
+    from hdev_jax.api import calibrate, check, diagnose, effects, predict, simulate
     from hdev_jax.logs import read_log
     from hdev_jax.physics.vehicle import Vehicle
     from hdev_jax.segments import Segments
@@ -21,6 +21,7 @@ __all__ = [
     "effects",
     "predict",
     "read_log",
+    "simulate",
 ]
 
 _HOME = {
@@ -32,6 +33,7 @@ _HOME = {
     "diagnose": "hdev_jax.api",
     "effects": "hdev_jax.api",
     "predict": "hdev_jax.api",
+    "simulate": "hdev_jax.api",
 }
 
 

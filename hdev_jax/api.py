@@ -1,11 +1,13 @@
 """The verbs: what `hdev VERB` does, as functions of the same names and arguments."""
 
 import json
+import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from hdev_jax import progress
@@ -27,7 +29,7 @@ from hdev_jax.report.build import answer_text, of_diagnosis, report_data
 from hdev_jax.report.page import write_calibration_report, write_report
 from hdev_jax.rundir import atomic_file, open_run
 
-__all__ = ["calibrate", "check", "diagnose", "effects", "predict"]
+__all__ = ["calibrate", "check", "diagnose", "effects", "predict", "simulate"]
 
 
 def diagnose(
@@ -207,6 +209,34 @@ def predict(
             compression: Any = "gzip" if str(out).endswith(".gz") else None
             frame.to_csv(temporary, index=False, float_format="%.8g", compression=compression)
     return f"{len(frame)} rows of {problem.target} -> {out}"
+
+
+def simulate(config: str | Path, *, out: str | Path) -> str:
+    """A synthetic fleet with known truth, from its configuration (a TOML file), into the folder `out`.
+
+    `log.parquet`, `truth.parquet` and `sheets` hold a file for each vehicle; `fleet.json`, a report and figures say what
+    is in them. **Returns:** a summary as text. Raises `InputError`. The fleet in memory is `hdev_jax.fleet.simulate`.
+    """
+    from hdev_jax.fleet.config import load_config
+    from hdev_jax.fleet.files import write_fleet
+    from hdev_jax.report.fleet_page import fleet_summary, fleet_text, write_fleet_report
+
+    started = time.time()
+    wanted = load_config(config)
+    resolved = {"verb": "simulate", **wanted.table(), "x64": bool(jax.config.read("jax_enable_x64"))}
+    with open_run(out, resolved, seed=wanted.seed) as run:
+        if run.done:
+            return (run.work / "answer.txt").read_text()
+        progress.step(f"{wanted.routes} routes of {len(wanted.chosen)} vehicles")
+        fleet = write_fleet(wanted, run.work, progress.step)
+        progress.step("writing the report")
+        summary = fleet_summary(fleet, wanted)
+        run.path("fleet.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+        command = shlex.join(["hdev", "simulate", str(config), "--out", str(run.out)])
+        write_fleet_report(fleet, wanted, command, time.time() - started, run.work)
+        answer = fleet_text(summary, Path(out))
+        run.path("answer.txt").write_text(answer)
+    return answer
 
 
 def check(

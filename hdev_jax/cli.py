@@ -140,6 +140,17 @@ def parser() -> argparse.ArgumentParser:
         "--level", type=_share, default=0.9, metavar="P", help="probability inside the interval (default: 0.9)"
     )
 
+    simulate = verbs.add_parser(
+        "simulate",
+        help="a synthetic fleet with known truth: logs, what was true, vehicle sheets",
+        description="Drive a fleet of invented trucks and buses over thousands of routes and write what their loggers "
+        "would have: log.parquet and truth.parquet with a file for each vehicle, its sheet, and a report.",
+        epilog="examples:\n  hdev simulate configs/studies/fleet.toml --out out/fleet\n"
+        "  hdev check out/fleet/log.parquet/A.parquet --vehicle out/fleet/sheets/A.toml",
+    )
+    simulate.add_argument("config", type=Path, metavar="CONFIG", help="what to simulate: a TOML file with at least a seed")
+    simulate.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
+
     verbs.add_parser(
         "effects",
         help="the library of effects: id, stage, equation, parameters and units, channels needed",

@@ -21,6 +21,7 @@ __all__ = ["STEP_M", "Car", "Driven", "Roads", "drive"]
 STEP_M = 5.0
 _JERK = 0.6  # m/s³, a comfortable start of a standing passenger's bus (Hoberock, J. Dyn. Sys. Meas. Control 99, 1977)
 _CRAWL_MPS = 1.0
+_ROLLING_IN, _ROLLING_FROM_MPS = 0.45, 8.0  # share of the deceleration that is used from speed, and what speed is
 _ETA = 0.9  # of the drive, for what reaches the wheels at full load
 
 
@@ -31,7 +32,7 @@ class Roads(eqx.Module):
     grade: Float[Array, "step route"]
     mass_kg: Float[Array, "step route"]
     accel_mps2: Float[Array, " route"]
-    brake_mps2: Float[Array, " route"]
+    brake_mps2: Float[Array, "step route"]
     friction: Float[Array, " route"]
     drag_factor: Float[Array, " route"]
 
@@ -66,17 +67,17 @@ class _State(NamedTuple):
 
 
 def _envelope(ahead: Array, here: tuple[Array, Array]) -> tuple[Array, Array]:
-    """One node further back: v² ≤ v²(ahead) + 2·b·ds, and the cap."""
+    """One node further back: v² ≤ v²(ahead) + 2·b·ds, and the cap; from speed the driver first lets it roll."""
     cap, brake = here
-    square = jnp.minimum(cap**2, ahead + 2 * brake * STEP_M)
+    share = _ROLLING_IN + (1 - _ROLLING_IN) * jnp.exp(-ahead / _ROLLING_FROM_MPS**2)
+    square = jnp.minimum(cap**2, ahead + 2 * share * brake * STEP_M)
     return square, square
 
 
 def drive(car: Car, roads: Roads) -> Driven:
     """Speed over distance of every route, from standstill at its start."""
     end = roads.cap_mps[-1] ** 2
-    brake = jnp.broadcast_to(roads.brake_mps2, roads.cap_mps[:-1].shape)
-    _, squares = jax.lax.scan(_envelope, end, (roads.cap_mps[:-1], brake), reverse=True)
+    _, squares = jax.lax.scan(_envelope, end, (roads.cap_mps[:-1], roads.brake_mps2), reverse=True)
     ahead = jnp.concatenate([squares[1:], end[None]])
 
     def step(state: _State, x: tuple[Array, Array, Array]) -> tuple[_State, tuple[Array, ...]]:
@@ -92,7 +93,7 @@ def _step(car: Car, roads: Roads, s: _State, x: tuple[Array, Array, Array]) -> t
     """One step of `STEP_M` for every route."""
     ahead2, grade, mass = x
     v, v2 = s.speed, s.speed**2
-    wanted = roads.accel_mps2 * (1 - (v2 / jnp.maximum(ahead2, 0.25)) ** 2)
+    wanted = roads.accel_mps2 * jnp.maximum(1 - (v2 / jnp.maximum(ahead2, 0.25)) ** 2, 0.0)
     wanted = jnp.minimum(wanted, s.accel + _JERK * STEP_M / jnp.maximum(v, _CRAWL_MPS))
     wanted = jnp.minimum(wanted, (ahead2 - v2) / (2 * STEP_M))
     inertia = car.rotating * mass

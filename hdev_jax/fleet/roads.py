@@ -36,6 +36,7 @@ _TURN = np.array([0.07, 0.04, 0.006, 0.0])  # junctions where it turns, per segm
 _LIGHT = np.array([0.10, 0.05, 0.006, 0.0])  # stops, per segment
 _ROUNDABOUT = np.array([0.015, 0.03, 0.015, 0.0])
 _JAM = np.array([0.55, 0.40, 0.15, 0.18])  # how much the traffic slows
+_JAMMED = 0.8  # of the speed that a jam takes at most
 _SURFACE = {"construction": (0.35, 0.35, 0.12, 0.18)}
 _SURFACE_USUAL = (0.52, 0.32, 0.12, 0.04)
 _TERRAIN = ((0.30, 0.45, 0.21, 0.04), (0.005, 0.012, 0.022, 0.033))  # share of the routes; sd of the slope
@@ -68,7 +69,7 @@ class RouteBatch:
     wind_from_rad: np.ndarray
     wet_road: np.ndarray
     accel_mps2: np.ndarray
-    brake_mps2: np.ndarray
+    brake_mps2: np.ndarray  # [r, n·STEPS]
     friction: np.ndarray
     drag_factor: np.ndarray
 
@@ -92,6 +93,7 @@ def draw_routes(v: Variant, config: FleetConfig, routes: int, width: int, rng: n
     temp, wind, wind_from, wet = _weather(altitude[:, :-1:STEPS], config, rng)
     heavy = (mass[:, 0] - v.mass_kg[0]) / (v.mass_kg[1] - v.mass_kg[0])
     eager = rng.uniform(0.8, 1.2, routes) * config.driving.comfort
+    brake = np.exp(0.3 * _smooth(rng, routes, width * _NODES + 1, 2.0))  # no two halts are alike
     return RouteBatch(
         length=length, cap_mps=cap, grade_step=grade_step, halt_s=halt, mass_kg=mass,
         grade_rad=np.arcsin(np.clip(climb / SEGMENT_M, -0.3, 0.3)),
@@ -100,8 +102,8 @@ def draw_routes(v: Variant, config: FleetConfig, routes: int, width: int, rng: n
         heading_rad=np.mod(heading_nodes[:, STEPS // 2 :: STEPS][:, :width], 2 * np.pi),
         road_kind=kind, road_surface=surface, limit_mps=limit,
         ambient_temp_c=temp, wind_speed_mps=wind, wind_from_rad=wind_from, wet_road=wet,
-        accel_mps2=((1.05 if v.bus else 0.95) - 0.35 * heavy) * eager,
-        brake_mps2=((0.95 if v.bus else 0.80) - 0.1 * heavy) * eager,
+        accel_mps2=((1.0 if v.bus else 0.95) - 0.35 * heavy) * eager,
+        brake_mps2=_to_steps(brake, STEPS // _NODES) * (((1.0 if v.bus else 0.85) - 0.1 * heavy) * eager)[:, None],
         friction=np.where(wet.max(axis=1) > 0, 0.45, 0.70),
         drag_factor=np.maximum(1 + 0.1 * rng.standard_normal(routes), 0.7),
     )  # fmt: skip
@@ -189,7 +191,8 @@ def _caps(v: Variant, kind: np.ndarray, limit: np.ndarray, curvature: np.ndarray
     habit = rng.normal(0.985, 0.03, (routes, 1))
     law = np.minimum(limit, 0.97 * v.top_speed_mps) * habit
     jam = np.maximum(_smooth(rng, routes, width * _NODES + 1, 5.0) + rng.normal(-0.4, 0.6, (routes, 1)), 0.0)
-    slowed = 1 - np.minimum(_to_steps(jam, STEPS // _NODES) * np.repeat(_JAM[kind], STEPS, axis=1) * config.driving.traffic, 0.85)
+    dense = _to_steps(jam, STEPS // _NODES) * np.repeat(_JAM[kind], STEPS, axis=1) * config.driving.traffic
+    slowed = 1 - _JAMMED * np.tanh(dense / _JAMMED)
     wander = 1 + 0.012 * _to_steps(_smooth(rng, routes, width * _NODES + 1, 4.0), STEPS // _NODES)
     cap = np.maximum(np.repeat(law, STEPS, axis=1) * slowed * wander, 2.0)
     cap = np.minimum(cap, np.sqrt(_LATERAL / np.maximum(np.abs(curvature), 1e-6)))

@@ -159,7 +159,10 @@ def _roads(r: RouteBatch) -> Roads:
         by_step(r.cap_mps),
         by_step(r.grade_step),
         by_step(np.repeat(r.mass_kg, STEPS, axis=1)),
-        *(jnp.asarray(x, dtype=float) for x in (r.accel_mps2, r.brake_mps2, r.friction, r.drag_factor)),
+        jnp.asarray(r.accel_mps2, dtype=float),
+        by_step(r.brake_mps2),
+        jnp.asarray(r.friction, dtype=float),
+        jnp.asarray(r.drag_factor, dtype=float),
     )
 
 

@@ -49,7 +49,6 @@ class Tally:
             self._plus(name, truth[name].sum())
             self._plus(f"{name}_squares", np.sum((truth[name] - y) ** 2))
         self._plus("noise_squares", np.sum((truth["energy_true_wh"] - y) ** 2))
-        self._plus("fine_wheel_wh", truth["wheel_energy_fine_wh"].sum())
         for k, x in truth.items():
             if k.startswith("energy_wh:"):
                 name = k.removeprefix("energy_wh:")

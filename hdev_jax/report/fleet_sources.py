@@ -23,7 +23,7 @@ PAPER_FLEET_PE = -40.4
 # Shares by bin as benchmarks/fleet_references.py prints them: slopes by distance, accelerations by time in motion.
 GRADE_EDGES = np.linspace(-10.0, 10.0, 21)  # %
 ACCEL_EDGES = np.linspace(-2.0, 2.0, 17)  # m/s²
-ZTBUS = "ZTBus, 19 m trolleybus (Widmer et al. 2023)"
+ZTBUS = "measured: ZTBus\n(Widmer et al. 2023)"
 ZTBUS_GRADE = (0.0016, 0.0046, 0.0052, 0.0148, 0.0198, 0.0131, 0.0091, 0.0242, 0.0898, 0.3261, 0.3021, 0.0863, 0.0321,
                0.0160, 0.0059, 0.0205, 0.0168, 0.0104, 0.0013, 0.0003)  # fmt: skip
 ZTBUS_ACCEL = (0.0003, 0.0011, 0.0074, 0.0293, 0.0607, 0.0822, 0.1070, 0.2159, 0.1819, 0.1028, 0.0983, 0.1133, 0.0, 0.0,

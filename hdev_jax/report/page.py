@@ -21,7 +21,7 @@ from hdev_jax.report.figures import (
 from hdev_jax.report.residuals import panels, residual_by_channel, residual_in_time
 from hdev_jax.report.statistics import TRIPS_ENOUGH, row_seconds
 
-__all__ = ["write_calibration_report", "write_report"]
+__all__ = ["write_calibration_report", "write_page", "write_report"]
 
 _TEMPLATES = Path(__file__).parent / "templates"
 CANDIDATES_SHOWN = 8
@@ -73,7 +73,7 @@ def write_report(data: ReportData, directory: Path) -> None:
         "stages": _blocks(summary.get("stages", {})),
         "subsets": _blocks(summary.get("subsets", {})),
     }
-    _write("diagnosis.html.j2", context, images, directory)
+    write_page("diagnosis.html.j2", context, images, directory)
 
 
 def write_calibration_report(data: ReportData, directory: Path) -> None:
@@ -96,7 +96,7 @@ def write_calibration_report(data: ReportData, directory: Path) -> None:
     context = {**_common(data), "method": data.summary.get("method", ""), "n_shown": int(test_rows(data).sum())}
     context["what"] = f"calibrated on its {context['target']}"
     context["answer"] = _calibrated(data, context["coefficients"])
-    _write("calibration.html.j2", context, images, directory)
+    write_page("calibration.html.j2", context, images, directory)
 
 
 def _calibrated(data: ReportData, rows: list[dict[str, Any]]) -> list[tuple[str, bool]]:
@@ -137,7 +137,8 @@ def _common(data: ReportData) -> dict[str, Any]:
     }
 
 
-def _write(template: str, context: dict[str, Any], images: dict[str, bytes], directory: Path) -> None:
+def write_page(template: str, context: dict[str, Any], images: dict[str, bytes], directory: Path) -> None:
+    """`report.html` from a template with the images inside it, and `figures/*.png` beside it."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     env = Environment(
