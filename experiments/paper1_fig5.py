@@ -19,7 +19,7 @@ from experiments.paper1_gears import Rows, fleet_rows, scores
 from hdev_jax.learn.classifiers import Classifier, search_classifier
 from hdev_jax.learn.gears import FEATURES, MOST_GEARS, filtered, markov
 
-__all__ = ["SOURCES", "Config", "collect", "run", "tasks", "together"]
+__all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
 SOURCES = ("paper1_fig5.py", "paper1_gears.py", "paper1_gear_bound.py", "paper1_gear_energy.py")
 
@@ -35,13 +35,13 @@ class Config(Strict):
     variants: list[str] = Field(default_factory=lambda: ["all"])
     held_variants: list[str]
     left_out: int = 4  # one route in so many is never trained on
-    train_rows: int = 60_000  # at most; whole routes
+    train_rows: int = 40_000  # at most; whole routes
     classifiers: list[str]
     sets: list[str] = Field(default_factory=lambda: ["paper", "sheet"])
     memory: list[str] = Field(default_factory=list)  # classifiers that also get the measured previous gear
     trials: int = 3
-    folds: int = 3
-    search_rows: int = 15_000
+    folds: int = 2
+    search_rows: int = 8_000
     figure: str = "catboost"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
 
@@ -59,11 +59,6 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
             yield {**common, **budget, "kind": kind, "set": name, "previous": False}
         if kind in config.memory:
             yield {**common, **budget, "kind": kind, "set": config.sets[-1], "previous": True}
-
-
-def together(task: dict[str, Any]) -> str:
-    """All in one process: they share the fleet."""
-    return f"{task['seed']} {task['routes']} {task['variants']}"
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:

@@ -87,14 +87,14 @@ def _random_forest(trial: Any, seed: int) -> Fit:
 
 def _lightgbm(trial: Any, seed: int) -> Fit:
     settings = {
-        "learning_rate": trial.suggest_float("learning_rate", 0.05, 0.15, log=True),
+        "learning_rate": trial.suggest_float("learning_rate", 0.08, 0.15, log=True),
         "num_leaves": trial.suggest_int("num_leaves", 12, 31),
         "min_data_in_leaf": trial.suggest_int("min_data_in_leaf", 20, 200, log=True),
         # without it a class of few rows gets leaves without bound, and the loss runs away
         "min_sum_hessian_in_leaf": trial.suggest_float("min_sum_hessian_in_leaf", 0.1, 5.0, log=True),
         "lambda_l2": trial.suggest_float("lambda_l2", 0.1, 10.0, log=True),
     }
-    rounds = trial.suggest_int("rounds", 30, 60)
+    rounds = trial.suggest_int("rounds", 30, 50)
     fixed = {"verbosity": -1, "deterministic": True, "force_row_wise": True, "num_threads": 1, "seed": seed, "max_bin": 127}
 
     def fit(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Any:

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hdev_jax.segments import Segments
@@ -33,6 +34,14 @@ class EfficiencyMap(eqx.Module):
     speeds_radps: Float[Array, " speed"]
     torques_nm: Float[Array, " torque"]
     values: Float[Array, "gear speed torque"]
+
+    def __check_init__(self) -> None:
+        axes = (self.gears, self.speeds_radps, self.torques_nm)
+        for name, axis in zip(("gears", "speeds_radps", "torques_nm"), axes, strict=True):
+            if not isinstance(axis, jax.core.Tracer) and not np.all(np.diff(np.asarray(axis)) > 0):
+                raise ValueError(f"efficiency map: {name} must increase from one to the next, found {np.asarray(axis)}")
+        if self.values.shape != tuple(a.shape[0] for a in axes):
+            raise ValueError(f"efficiency map: values of shape {self.values.shape} for axes of {[len(a) for a in axes]}")
 
     def __call__(self, gear: Any, speed_radps: Any, torque_nm: Any) -> Any:
         """Efficiency at one operating point. Beyond the edges it is that of the edge, and its slope across it is 0."""
