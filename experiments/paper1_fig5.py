@@ -17,7 +17,7 @@ from experiments.paper1_gear_energy import energy_cost
 from experiments.paper1_gear_tables import collect
 from experiments.paper1_gears import Rows, fleet_rows, scores
 from hdev_jax.learn.classifiers import Classifier, search_classifier
-from hdev_jax.learn.gears import FEATURES, MOST_GEARS, filtered, markov
+from hdev_jax.learn.gears import EVERY, FEATURES, MOST_GEARS, PLACE, absolute, chained, filtered, markov
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
@@ -35,9 +35,9 @@ class Config(Strict):
     variants: list[str] = Field(default_factory=lambda: ["all"])
     held_variants: list[str]
     left_out: int = 4  # one route in so many is never trained on
-    train_rows: int = 40_000  # at most; whole routes
+    train_rows: int = 70_000  # at most; whole routes
     classifiers: list[str]
-    sets: list[str] = Field(default_factory=lambda: ["paper", "sheet"])
+    sets: list[str] = Field(default_factory=lambda: ["paper", "sheet", "relative"])
     memory: list[str] = Field(default_factory=list)  # classifiers that also get the measured previous gear
     trials: int = 3
     folds: int = 2
@@ -69,19 +69,28 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         return {"bounds": bounds(rows, task["seed"]), "rows": [int(m.sum()) for m in (rows.train, rows.unseen_routes,
                 rows.unseen_variants)]}  # fmt: skip
     names = FEATURES[task["set"]]
-    x = rows.x[:, [FEATURES["road"].index(n) for n in names]]
+    x = rows.x[:, [EVERY.index(n) for n in names]]
+    reference = _reference(rows) if PLACE in names else np.zeros(len(rows.gear), dtype=int)
+    target = rows.gear - reference
     if task["previous"]:
-        names, x = (*names, "previous_gear"), np.c_[x, rows.previous.astype(np.float32)]
+        names, x = (*names, "previous_gear"), np.c_[x, (rows.previous - reference).astype(np.float32)]
     fit = _first_routes(rows, task["train_rows"])
     started = time.perf_counter()
+    lowest = int(target[fit].min()) if PLACE in names else 1
     model = search_classifier(
-        task["kind"], x[fit], rows.gear[fit], rows.route[fit], features=names, trials=task["trials"],
+        task["kind"], x[fit], target[fit] - lowest + 1, rows.route[fit], features=names, by=rows.gear[fit], trials=task["trials"],
         folds=task["folds"], seed=task["seed"], search_rows=task["search_rows"],
     )  # fmt: skip
     seconds = time.perf_counter() - started
     p = np.zeros((len(rows.gear), MOST_GEARS))
     test = np.flatnonzero(~rows.train)
-    p[test] = _of_the_box(model.probabilities(x[test]), rows.gears[test])
+    classes = tuple(float(c + lowest - 1) for c in model.gears)
+
+    def told_at(at: np.ndarray, x: np.ndarray = x) -> np.ndarray:
+        known = reference[at] if PLACE in names else None
+        return _of_the_box(model.probabilities(x[at]), classes, known, rows.gears[at])
+
+    p[test] = told_at(test)
     told = 1 + np.argmax(p, axis=1)
     out = {
         "scores": scores(rows, told), "confusion": _confusion(rows, told), "settings": model.settings,
@@ -89,9 +98,13 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         "energy": energy_cost(rows, np.where(p.sum(axis=1, keepdims=True) > 0, p, 1.0), fleet),
         "sample": _sample(rows, told),
     }  # fmt: skip
-    if not task["previous"]:
+    if task["previous"]:
+        remembered = 1 + np.argmax(_chain(rows, test, x, reference, told_at), axis=1)
+        out["memory"] = scores(rows, remembered)
+        out["sample"]["filter"] = _sample(rows, remembered)["told"]
+    else:
         seen = fit[:: max(1, len(fit) // 20_000)]
-        share = _of_the_box(model.probabilities(x[seen]), rows.gears[seen])
+        share = told_at(seen)
         remembered = 1 + np.argmax(_filter(rows, p, test, seen, share), axis=1)
         out["memory"] = scores(rows, remembered)
         out["sample"]["filter"] = _sample(rows, remembered)["told"]
@@ -110,13 +123,18 @@ def _first_routes(rows: Rows, most: int) -> np.ndarray:
     return np.concatenate(kept)
 
 
-def _of_the_box(p: np.ndarray, gears: np.ndarray) -> np.ndarray:
-    """Probabilities of the gears that the row's box has; a gear that training did not have is never told."""
-    wide = np.zeros((len(p), MOST_GEARS))
-    wide[:, : p.shape[1]] = p
-    wide = np.where(np.arange(MOST_GEARS) < gears[:, None], wide, 0.0) + 1e-12
-    wide = np.where(np.arange(MOST_GEARS) < gears[:, None], wide, 0.0)
-    return wide / wide.sum(axis=1, keepdims=True)
+def _reference(rows: Rows) -> np.ndarray:
+    return rows.x[:, EVERY.index("reference_gear")].astype(int)
+
+
+def _of_the_box(p: np.ndarray, classes: tuple[float, ...], reference: Any, gears: np.ndarray) -> np.ndarray:
+    """Probabilities of the gears that each row's box has."""
+    out = np.zeros((len(p), MOST_GEARS))
+    for count in np.unique(gears):
+        at = gears == count
+        known = None if reference is None else reference[at]
+        out[at, :count] = np.asarray(absolute(p[at], classes, known, int(count)))
+    return out
 
 
 def _filter(rows: Rows, p: np.ndarray, test: np.ndarray, seen: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -131,6 +149,23 @@ def _filter(rows: Rows, p: np.ndarray, test: np.ndarray, seen: np.ndarray, share
         at = test[rows.gears[test] == gears]
         if len(at):
             out[at, :gears] = run_filter(p[at][:, :gears], rows.route[at], change, prior / prior.sum())
+    return out
+
+
+def _chain(rows: Rows, test: np.ndarray, x: np.ndarray, reference: np.ndarray, told_at: Any) -> np.ndarray:
+    """The gear by the classifier that sees the previous gear, which it only knows from its own telling so far."""
+    out = np.zeros((len(rows.gear), MOST_GEARS))
+    run_chain = jax.jit(chained)
+    for gears in np.unique(rows.gears):
+        at = test[rows.gears[test] == gears]
+        if not len(at):
+            continue
+        given = []
+        for before in range(1, int(gears) + 1):
+            supposed = x.copy()
+            supposed[:, -1] = before - reference
+            given.append(told_at(at, supposed)[:, :gears])
+        out[at, :gears] = run_chain(np.stack(given, axis=1), rows.route[at])
     return out
 
 

@@ -33,9 +33,7 @@ def _filled(segments: Any, capacity: int) -> Any:
     return jax.tree.map(jnp.asarray, eqx.tree_at(lambda s: s.trip, filled, trip))
 
 
-def energy_cost(
-    rows: Rows, probability: np.ndarray, of: tuple[int, int, tuple[str, ...]]
-) -> dict[str, dict[str, Any]]:
+def energy_cost(rows: Rows, probability: np.ndarray, of: tuple[int, int, tuple[str, ...]]) -> dict[str, dict[str, Any]]:
     """By vehicle and way to take the gear: energy against that with the true gear, and against the measured.
 
     **Arguments:** `probability` [row, gear] of `Rows`' rows, `of` the arguments of `the_fleet`; only rows that were not trained on count.

@@ -8,7 +8,7 @@ import numpy as np
 
 from hdev_jax.fleet import Fleet, simulate
 from hdev_jax.learn.classifiers import balanced_accuracy, route_folds
-from hdev_jax.learn.gears import FEATURES, MOST_GEARS, Gearbox, features
+from hdev_jax.learn.gears import EVERY, MOST_GEARS, Gearbox, features
 
 __all__ = ["GROUPS", "Rows", "box_of", "fleet_rows", "scores", "the_fleet"]
 
@@ -17,7 +17,7 @@ GROUPS = ("all", "2 to 4 speeds", "12 speeds")
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of all vehicles with more than one speed. `x` by `FEATURES["road"]`; `vehicle` is the place in the fleet.
+    """Rows of all vehicles with more than one speed. `x` by `EVERY` name of a feature; `vehicle` is the place in the fleet.
 
     `lowest` and `highest` are the gears that the shift program allows in the row, from the simulator's truth. `oracle`
     are the features that the bound is estimated with: those that decide within the hysteresis band, without noise.
@@ -66,12 +66,12 @@ def fleet_rows(fleet: tuple[int, int, tuple[str, ...]], held: tuple[str, ...], l
     for k, v in enumerate(the_fleet(*fleet).vehicles):
         if v.variant.gears > 1:
             torque = np.asarray(v.segments.channels["requested_torque_nm"])
-            x = np.asarray(features(FEATURES["road"], box_of(v.variant), v.segments, torque))
+            x = np.asarray(features(EVERY, box_of(v.variant), v.segments, torque))
             t, gear = v.truth, v.truth["gear"].astype(int)
             speed = np.asarray(v.segments.speed_mps)
             oracle = np.stack(
                 [t["gear_lowest"], t["gear_highest"], speed, t["load_share"], t["grade_rad"], t["mass_kg"],
-                 t["requested_torque_nm"], *x.T[3:17]], axis=1,
+                 t["requested_torque_nm"], *x.T[5:17]], axis=1,
             )  # fmt: skip
             whole = lambda a, n=len(gear): np.full(n, a)  # noqa: E731
             parts.append((

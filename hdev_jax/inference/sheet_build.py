@@ -9,7 +9,17 @@ from hdev_jax.inference.map_range import read_against_map
 from hdev_jax.inference.parameters import Coefficient, ParameterTable
 from hdev_jax.inference.sheet import BATTERY_TARGETS, Built, Sheet
 from hdev_jax.inference.sheet_schema import KEYS, SECTIONS, Declared, Key, effect_key
-from hdev_jax.physics import Driveline, Effect, EfficiencyMap, Grouped, Machine, Vehicle, at_null, most_group, unavailable
+from hdev_jax.physics import (
+    Driveline,
+    Effect,
+    EfficiencyMap,
+    Grouped,
+    Machine,
+    Vehicle,
+    at_null,
+    most_group,
+    unavailable,
+)
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.loads import Auxiliary

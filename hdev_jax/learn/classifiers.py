@@ -40,7 +40,9 @@ class Classifier:
     def trees(self) -> Trees:
         """The same model as arrays for the kernel. Raises `InputError` for a kind that is not boosted trees."""
         if self.kind not in ("lightgbm", "catboost"):
-            raise InputError(f"gear model {self.kind!r}: boosted trees (lightgbm or catboost) are expected in the kernel")
+            raise InputError(
+                f"gear model {self.kind!r}: boosted trees (lightgbm or catboost) are expected in the kernel"
+            )
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "model"
             if self.kind == "lightgbm":
@@ -95,7 +97,14 @@ def _lightgbm(trial: Any, seed: int) -> Fit:
         "lambda_l2": trial.suggest_float("lambda_l2", 0.1, 10.0, log=True),
     }
     rounds = trial.suggest_int("rounds", 30, 50)
-    fixed = {"verbosity": -1, "deterministic": True, "force_row_wise": True, "num_threads": 1, "seed": seed, "max_bin": 127}
+    fixed = {
+        "verbosity": -1,
+        "deterministic": True,
+        "force_row_wise": True,
+        "num_threads": 1,
+        "seed": seed,
+        "max_bin": 127,
+    }
 
     def fit(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Any:
         import lightgbm as lgb
@@ -110,9 +119,9 @@ def _catboost(trial: Any, seed: int) -> Fit:
     from catboost import CatBoostClassifier
 
     model = CatBoostClassifier(
-        iterations=trial.suggest_int("trees", 40, 60),
+        iterations=trial.suggest_int("trees", 60, 110),
         depth=trial.suggest_int("depth", 5, 6),
-        learning_rate=trial.suggest_float("learning_rate", 0.25, 0.5),
+        learning_rate=trial.suggest_float("learning_rate", 0.15, 0.4),
         l2_leaf_reg=trial.suggest_float("l2_leaf_reg", 1.0, 10.0, log=True),
         border_count=254, random_seed=seed, thread_count=1, verbose=0, allow_writing_files=False,
     )  # fmt: skip
@@ -130,7 +139,11 @@ CLASSIFIERS: dict[str, Callable[[Any, int], Fit]] = {
 
 def balanced_accuracy(gear: Int[np.ndarray, " row"], told: Int[np.ndarray, " row"]) -> float:
     """Mean over the gears that occur of the share of their rows that are told rightly."""
-    return float(np.mean([np.mean(told[gear == g] == g) for g in np.unique(gear)]))
+    return _balanced(told == gear, gear)
+
+
+def _balanced(right: np.ndarray, by: np.ndarray) -> float:
+    return float(np.mean([np.mean(right[by == g]) for g in np.unique(by)]))
 
 
 def route_folds(route: Int[np.ndarray, " row"], count: int, seed: int) -> Iterator[np.ndarray]:
@@ -152,8 +165,12 @@ def search_classifier(
     folds: int,
     seed: int,
     search_rows: int = 30_000,
+    by: Int[np.ndarray, " row"] | None = None,
 ) -> Classifier:
     """A search of `trials` settings by routes left out, then a fit of the best on all rows.
+
+    **Arguments:** `gear`, what is told, 1 and up; `by`: what rows are balanced by where that is something else (the gear,
+    where its distance from another is told).
 
     Rows are weighted by the frequency of their gear to the power −`balance`, which is searched too (0: none, 1:
     balanced). The score is the mean of accuracy and balanced accuracy. Of more than `search_rows` rows the search sees
@@ -171,10 +188,11 @@ def search_classifier(
             f"gear {missing[0]} is missing from the {len(gear)} rows of training, which go up to gear {every.max()}; train "
             "on more routes, or on vehicles that use it"
         )
-    share = np.bincount(gear)[1:] / len(gear)
+    by = gear if by is None else by
+    share = np.bincount(by) / len(by)
 
     def fitted(trial: Any, rows: np.ndarray) -> Any:
-        weight = share[gear[rows] - 1] ** -trial.suggest_float("balance", 0.0, 1.0)
+        weight = share[by[rows]] ** -trial.suggest_float("balance", 0.0, 1.0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return CLASSIFIERS[kind](trial, seed)(x[rows], gear[rows] - 1, weight / weight.mean())
@@ -191,8 +209,8 @@ def search_classifier(
             if len(np.unique(gear[rows])) < len(every):
                 continue  # a fold that holds all rows of a gear says nothing
             told = 1 + np.argmax(made(fitted(trial, rows), {}, 0.0).probabilities(x[used & left_out]), axis=1)
-            truth = gear[used & left_out]
-            scores.append(0.5 * np.mean(told == truth) + 0.5 * balanced_accuracy(truth, told))
+            right = told == gear[used & left_out]
+            scores.append(0.5 * np.mean(right) + 0.5 * _balanced(right, by[used & left_out]))
         return float(np.mean(scores)) if scores else 0.0
 
     verbosity = optuna.logging.get_verbosity()

@@ -224,7 +224,10 @@ def _catboost(table: Mapping[str, Any], where: str) -> Trees:
         splits = t.get("splits") or []
         if any(s["split_type"] != "FloatFeature" for s in splits):
             raise InputError(f"{where}: splits by categories; numbers are expected")
-        asked = [(s["float_feature_index"], missing[s["float_feature_index"]], below(float(np.float32(s["border"])))) for s in splits]
+        asked = [
+            (s["float_feature_index"], missing[s["float_feature_index"]], below(float(np.float32(s["border"]))))
+            for s in splits
+        ]
         trees.append((asked, np.reshape(np.asarray(t["leaf_values"], dtype=float), (1 << len(splits), len(offset)))))
     names = [f.get("feature_id") or f"f{f['flat_feature_index']}" for f in floats]
     forest, reading = oblivious(trees)

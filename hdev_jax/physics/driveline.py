@@ -41,7 +41,9 @@ class EfficiencyMap(eqx.Module):
             if not isinstance(axis, jax.core.Tracer) and not np.all(np.diff(np.asarray(axis)) > 0):
                 raise ValueError(f"efficiency map: {name} must increase from one to the next, found {np.asarray(axis)}")
         if self.values.shape != tuple(a.shape[0] for a in axes):
-            raise ValueError(f"efficiency map: values of shape {self.values.shape} for axes of {[len(a) for a in axes]}")
+            raise ValueError(
+                f"efficiency map: values of shape {self.values.shape} for axes of {[len(a) for a in axes]}"
+            )
 
     def __call__(self, gear: Any, speed_radps: Any, torque_nm: Any) -> Any:
         """Efficiency at one operating point. Beyond the edges it is that of the edge, and its slope across it is 0."""
@@ -161,5 +163,7 @@ class Driveline(eqx.Module):
         shares = jnp.asarray(row.channels[GEAR_PROBABILITY])
         if self.gear_ratios is None or shares.shape != self.gear_ratios.shape:
             found = 0 if self.gear_ratios is None else self.gear_ratios.shape[0]
-            raise ValueError(f"{GEAR_PROBABILITY} has shape {shares.shape} for {found} gear ratios; one each is expected")
+            raise ValueError(
+                f"{GEAR_PROBABILITY} has shape {shares.shape} for {found} gear ratios; one each is expected"
+            )
         return shares

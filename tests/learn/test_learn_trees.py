@@ -1,4 +1,4 @@
-"""Boosted trees in jit against the libraries that made them, at their thresholds too; files that are not what they say."""
+"""Boosted trees in jit against the libraries that made them, at their thresholds too; files that are refused."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Rows whose gear is known as probabilities: one-hot is the gear itself, the rest a mean, and everything has a gradient."""
+"""Rows whose gear is known as probabilities: one-hot is the gear itself, the rest a mean, all with a gradient."""
 
 import equinox as eqx
 import jax
