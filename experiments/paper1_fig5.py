@@ -78,7 +78,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     started = time.perf_counter()
     lowest = int(target[fit].min()) if PLACE in names else 1
     model = search_classifier(
-        task["kind"], x[fit], target[fit] - lowest + 1, rows.route[fit], features=names, by=rows.gear[fit], trials=task["trials"],
+        task["kind"], x[fit], target[fit] - lowest + 1, rows.route[fit], features=names, by=rows.gear[fit],
+        trials=task["trials"],
         folds=task["folds"], seed=task["seed"], search_rows=task["search_rows"],
     )  # fmt: skip
     seconds = time.perf_counter() - started
@@ -94,7 +95,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     told = 1 + np.argmax(p, axis=1)
     out = {
         "scores": scores(rows, told), "confusion": _confusion(rows, told), "settings": model.settings,
-        "fit_seconds": seconds, "train_rows": int(len(fit)), "speed": _speed(model, x[test]),
+        "fit_seconds": seconds, "train_rows": len(fit), "speed": _speed(model, x[test]),
         "energy": energy_cost(rows, np.where(p.sum(axis=1, keepdims=True) > 0, p, 1.0), fleet),
         "sample": _sample(rows, told),
     }  # fmt: skip
@@ -144,7 +145,7 @@ def _filter(rows: Rows, p: np.ndarray, test: np.ndarray, seen: np.ndarray, share
     for gears in np.unique(rows.gears):
         train = rows.where(rows.train, rows.gears == gears)
         change, _ = markov(rows.gear[train], rows.route[train], int(gears))
-        # the prior that is in the classifier's probabilities, weights of classes included: their mean on the training rows
+        # the prior in the classifier's probabilities, weights of classes included: their mean on training rows
         prior = share[rows.gears[seen] == gears][:, :gears].mean(axis=0) + 1e-6
         at = test[rows.gears[test] == gears]
         if len(at):
@@ -211,5 +212,6 @@ def _sample(rows: Rows, told: np.ndarray) -> dict[str, Any]:
     routes, count = np.unique(rows.route[rows.where(~rows.train, most)], return_counts=True)
     at = np.flatnonzero(rows.route == routes[np.argmax(count)])
     return {
-        "gear": rows.gear[at].tolist(), "told": told[at].tolist(), "speed_kmh": np.round(3.6 * rows.x[at, 0], 1).tolist()
+        "gear": rows.gear[at].tolist(), "told": told[at].tolist(),
+        "speed_kmh": np.round(3.6 * rows.x[at, 0], 1).tolist(),
     }  # fmt: skip

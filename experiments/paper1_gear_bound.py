@@ -1,10 +1,10 @@
 """What no classifier of single rows can pass: in the hysteresis band only the past tells the gear.
 
 The simulator's gear is clip(previous, lowest, highest) with `lowest` and `highest` functions of the row. Where they
-agree the row tells the gear. Where they differ, the best guess is the likelier of the two given all that the row and the
-sheet tell; how good it is, is estimated by a classifier of just that choice, trained on the training routes' rows in the
-band with noiseless features, `lowest` and `highest` among them, and scored on the held-out rows. A held-out accuracy is
-never above the Bayes bound but by chance, so the bound may lie somewhat higher than the estimate, not lower.
+agree the row tells the gear. Where they differ, the best guess is the likelier of the two given all that the row and
+the sheet tell; how good it is, is estimated by a classifier of just that choice, trained on the training routes' rows
+in the band with noiseless features, `lowest` and `highest` among them, and scored on the held-out rows. A held-out
+accuracy is never above the Bayes bound but by chance: the bound may lie somewhat higher than the estimate, not lower.
 """
 
 import numpy as np

@@ -25,7 +25,7 @@ def _capacity(fleet: tuple[int, int, tuple[str, ...]]) -> int:
 
 
 def _filled(segments: Any, capacity: int) -> Any:
-    """Rows to one length for all vehicles, so that they share a compiled program: the last row again, as another trip."""
+    """Rows to one length for all vehicles, which then share a compiled program: the last row again, as another trip."""
     more = capacity - len(segments)
     filled = jax.tree.map(lambda a: np.concatenate([a, np.repeat(np.asarray(a)[-1:], more, axis=0)]), segments)
     trip = np.asarray(filled.trip).copy()
@@ -36,7 +36,8 @@ def _filled(segments: Any, capacity: int) -> Any:
 def energy_cost(rows: Rows, probability: np.ndarray, of: tuple[int, int, tuple[str, ...]]) -> dict[str, dict[str, Any]]:
     """By vehicle and way to take the gear: energy against that with the true gear, and against the measured.
 
-    **Arguments:** `probability` [row, gear] of `Rows`' rows, `of` the arguments of `the_fleet`; only rows that were not trained on count.
+    **Arguments:** `probability` [row, gear] of `Rows`' rows; `of`, the arguments of `the_fleet`. Only rows that were
+    not trained on count.
 
     **Returns** by vehicle: `added_percent` for `hard`, `soft` and `none` (always the highest gear); `rmse_wh` and
     `trip_percent` (mean over routes of the absolute error of the route's energy) of these and of the `true` gear.
@@ -50,7 +51,8 @@ def energy_cost(rows: Rows, probability: np.ndarray, of: tuple[int, int, tuple[s
             continue
         n, use = len(at), test[at]
         told, gears = probability[at], int(rows.gears[at[0]])
-        width = v.true.driveline.gear_ratios.shape[0]
+        ratios = v.true.driveline.gear_ratios
+        width = gears if ratios is None else ratios.shape[0]
         soft = np.pad(told[:, :gears], ((0, 0), (0, width - gears)))
         soft = soft / soft.sum(axis=1, keepdims=True)
         segments = v.segments.with_channels(gear=rows.gear[at].astype(float))

@@ -1,4 +1,4 @@
-"""Tables and figure 5 of the gear study: accuracies beside their bound, confusion, speed, and what a wrong gear costs."""
+"""Tables and figure 5 of the gear study: accuracies beside their bound, confusion, speed, the cost of a wrong gear."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -73,13 +73,13 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         "notes": [
             f"Synthetic fleet. Rows: {', '.join(map(str, counts))} of training, of unseen routes, of unseen variants "
             f"({', '.join(config.held_variants)}); vehicles of one speed are left out",
-            "bound: rows outside the hysteresis band are certain; inside it, the held-out accuracy of a classifier that is "
-            "given the two gears and all that decides in the band, without noise. The Bayes bound is not below it",
+            "bound: rows outside the hysteresis band are certain; inside it, the held-out accuracy of a classifier "
+            "that is given the two gears and all that decides in the band, without noise. The Bayes bound is not lower",
             "equation 1: as the paper prints it, with true negatives in every class's sum, it is the accuracy over the "
             "number of classes (12), at most 1/12; the paper's 'over 90 %' is the usual accuracy",
-            "paper: speed, requested torque and mass alone cannot tell variants apart: the same speed is another gear in "
-            "another gearbox; sheet: with motor speed by gear and power over rated, and the number of gears; relative: what is "
-            "told is the distance from the gear of rated motor speed, and the slope of the road is read too",
+            "paper: speed, requested torque and mass alone cannot tell variants apart: the same speed is another gear "
+            "in another gearbox; sheet: with motor speed by gear and power over rated, and the number of gears; "
+            "relative: what is told is the distance from the gear of rated motor speed, and the slope is read too",
             "filter: a hidden Markov filter over the row-by-row probabilities; previous_gear: the measured one as a "
             "feature; chain: that classifier with the previous gear known only from its own telling",
             f"searches: Optuna, {config.trials} trials, {config.folds} folds of whole routes, on at most "
@@ -89,8 +89,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
 
 
 _ENERGY = (
-    "What a wrong gear costs (synthetic): energy against that with the true gear, worst vehicle and mean, and against the "
-    "measured energy; hard: the likeliest gear; soft: probabilities in the kernel; none: always the highest gear"
+    "What a wrong gear costs (synthetic): energy against that with the true gear, worst vehicle and mean, and against "
+    "the measured energy; hard: the likeliest gear; soft: probabilities in the kernel; none: always the highest gear"
 )
 
 
@@ -112,7 +112,8 @@ def _line(row: Mapping[str, Any]) -> dict[str, Any]:
     o = row["ours"]
     percent = lambda k: None if o.get(k) is None else f"{100 * o[k]:.1f}"  # noqa: E731
     return {
-        "model": row["name"], "paper": None if not row["paper"] else f"{100 * row['paper']['accuracy_unseen_routes']:.0f}",
+        "model": row["name"],
+        "paper": f"{100 * row['paper']['accuracy_unseen_routes']:.0f}" if row["paper"] else None,
         "unseen routes": percent("accuracy_unseen_routes"), "bound": percent("bound"),
         "unseen variants": percent("accuracy_unseen_variants"), "balanced, routes": percent("balanced_unseen_routes"),
         "balanced bound": percent("bound_balanced"), "balanced, variants": percent("balanced_unseen_variants"),

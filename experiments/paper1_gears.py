@@ -1,4 +1,4 @@
-"""The fleet as the gear study reads it: rows with their gear, split by route and by variant; how a prediction scores."""
+"""The fleet as the gear study reads it: rows with their gear, split by route and variant; how a prediction scores."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +17,7 @@ GROUPS = ("all", "2 to 4 speeds", "12 speeds")
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of all vehicles with more than one speed. `x` by `EVERY` name of a feature; `vehicle` is the place in the fleet.
+    """Rows of all vehicles with more than one speed. `x` by `EVERY` feature; `vehicle` is the place in the fleet.
 
     `lowest` and `highest` are the gears that the shift program allows in the row, from the simulator's truth. `oracle`
     are the features that the bound is estimated with: those that decide within the hysteresis band, without noise.
@@ -60,7 +60,8 @@ def box_of(variant: Any) -> Gearbox:
 
 @cache
 def fleet_rows(fleet: tuple[int, int, tuple[str, ...]], held: tuple[str, ...], left_out: int) -> Rows:
-    """The rows of `the_fleet` of these arguments: of the variants `held` none is trained on; of the others one route in `left_out` is not."""
+    """The rows of `the_fleet` of these arguments. Of the variants `held` none is trained on, of the others one route in
+    `left_out` is not."""
     parts: list[tuple[np.ndarray, ...]] = []
     first = 0
     for k, v in enumerate(the_fleet(*fleet).vehicles):
@@ -73,16 +74,18 @@ def fleet_rows(fleet: tuple[int, int, tuple[str, ...]], held: tuple[str, ...], l
                 [t["gear_lowest"], t["gear_highest"], speed, t["load_share"], t["grade_rad"], t["mass_kg"],
                  t["requested_torque_nm"], *x.T[5:17]], axis=1,
             )  # fmt: skip
-            whole = lambda a, n=len(gear): np.full(n, a)  # noqa: E731
+            whole = lambda a, like=gear: np.full(like.shape, a)  # noqa: E731
             parts.append((
                 x, oracle, gear, t["gear_previous"].astype(int), t["gear_lowest"], t["gear_highest"],
                 np.asarray(v.segments.trip) + first, whole(k), whole(v.variant.gears), whole(v.id in held),
             ))  # fmt: skip
         first += len(v.trip_names)
     columns = [np.concatenate(c) for c in zip(*parts, strict=True)]
-    *known, route, vehicle, gears, kept = columns
+    x, oracle, gear, previous, lowest, highest, route, vehicle, gears, kept = columns
     test = next(route_folds(route, left_out, fleet[0]))
-    return Rows(*known, route, vehicle, gears, ~kept & ~test, ~kept & test, kept)
+    return Rows(
+        x, oracle, gear, previous, lowest, highest, route, vehicle, gears, ~kept & ~test, ~kept & test, kept
+    )  # fmt: skip
 
 
 def scores(rows: Rows, told: np.ndarray) -> dict[str, float]:

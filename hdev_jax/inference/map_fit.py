@@ -1,14 +1,14 @@
 """An efficiency map learned from a log: penalised least squares on the kernel, the penalty a smooth random field.
 
-The unknowns are the efficiencies at the nodes of a given grid. A priori they are Gaussian with mean `mean` and precision
+The unknowns are the efficiencies at the nodes of a given grid. A priori they are Gaussian of mean `mean` and precision
 
     P = smooth·(D_ss'D_ss + D_tt'D_tt + D_st'D_st) + gears·D_g'D_g + I/wide²,
 
 second differences along speed and torque (steps of one node; not across the change of sign of the torque, where braking
 ends and driving begins) and first differences from gear to gear: a Gaussian Markov random field (Rue and Held, Gaussian
 Markov Random Fields, section 3.4). `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the
-noise. Each step solves the normal equations with the kernel's own gradient; rows are told apart by the bilinear weights of
-their nodes in the curvature alone, which decides the pace and the uncertainty and not where the fit ends.
+noise. Each step solves the normal equations with the kernel's own gradient; the bilinear weights of the nodes stand for
+the map's own in the curvature alone, which decides the pace and the uncertainty and not where the fit ends.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ SMOOTH = tuple(float(s) for s in np.geomspace(1e1, 1e5, 5))  # tried, in units o
 
 @dataclass(frozen=True)
 class LearnedMap:
-    """The map; `sd` of its nodes [gear, speed, torque]; `rows`, how many of the log lie in each cell [gear, cell, cell].
+    """The map; `sd` of its nodes [gear, speed, torque]; `rows`, how many of the log each cell has [gear, cell, cell].
 
     `noise_wh` is the estimated noise of a row's energy, `smooth` the chosen strength, `evidence` the log marginal
     likelihood by strength tried. `converged`: the last step moved no node by more than 1e-4.
@@ -122,7 +122,7 @@ class _Problem:
         return np.asarray(self._pull(jnp.asarray(theta), jnp.asarray(residual)))
 
     def curvature(self, theta: np.ndarray) -> np.ndarray:
-        """J'J. A shift of all nodes shifts each row's efficiency by as much: that gives ∂E/∂η, the weights do the rest."""
+        """J'J. A shift of all nodes shifts each row's efficiency by as much: that is ∂E/∂η, the weights do the rest."""
         j = self.weights.multiply(np.asarray(self._slope(jnp.asarray(theta)))[:, None]).tocsr()
         return (j.T @ j).toarray()
 

@@ -39,8 +39,8 @@ def read_against_map(sheet: "Sheet", vehicle: Vehicle, segments: Segments) -> li
     most = max(beyond, key=lambda k: np.sum(np.asarray(beyond[k]) & moving))
     s, t = (f"{float(a[0]):.4g} to {float(a[-1]):.4g}" for a in (found.speeds_radps, found.torques_nm))
     return [
-        f"the efficiency map is read beyond its edge in {100 * every.sum() / moving.sum():.2g} % of the moving rows, most "
-        f"often for {most}: there its edge holds (it has {s} rad/s and {t} Nm)"
+        f"the efficiency map is read beyond its edge in {100 * every.sum() / moving.sum():.2g} % of the moving rows, "
+        f"most often for {most}: there its edge holds (it has {s} rad/s and {t} Nm)"
     ]
 
 

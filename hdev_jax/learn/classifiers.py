@@ -169,8 +169,8 @@ def search_classifier(
 ) -> Classifier:
     """A search of `trials` settings by routes left out, then a fit of the best on all rows.
 
-    **Arguments:** `gear`, what is told, 1 and up; `by`: what rows are balanced by where that is something else (the gear,
-    where its distance from another is told).
+    **Arguments:** `gear`, what is told, 1 and up; `by`: what rows are balanced by where that is another thing (the
+    gear, where its distance from another is told).
 
     Rows are weighted by the frequency of their gear to the power −`balance`, which is searched too (0: none, 1:
     balanced). The score is the mean of accuracy and balanced accuracy. Of more than `search_rows` rows the search sees
@@ -185,8 +185,8 @@ def search_classifier(
     every = np.unique(gear)
     if missing := sorted(set(range(1, int(every.max()) + 1)) - set(every.tolist())):
         raise InputError(
-            f"gear {missing[0]} is missing from the {len(gear)} rows of training, which go up to gear {every.max()}; train "
-            "on more routes, or on vehicles that use it"
+            f"gear {missing[0]} is missing from the {len(gear)} rows of training, which go up to gear {every.max()}; "
+            "train on more routes, or on vehicles that use it"
         )
     by = gear if by is None else by
     share = np.bincount(by) / len(by)

@@ -1,7 +1,7 @@
 """The gear as a surrogate: features of a row, trees that tell the gear, and the channel that the kernel reads.
 
-Paper 1, section 3.1: speed, requested torque and mass. What the sheet knows makes rows of different vehicles comparable:
-the motor speed that each gear would give and the power that is requested, over rated, and how many gears there are. Two
+Paper 1, section 3.1: speed, requested torque and mass. What the sheet knows makes rows of different vehicles alike: the
+motor speed that each gear would give and the power that is requested, over rated, and how many gears there are. Two
 ways: the trees tell the gear's number; or they tell by how many gears it is away from the one in which the motor would
 turn at its rated speed (`relative`), so that what is learned of one gear holds for all, in gearboxes never seen too.
 """
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from hdev_jax.errors import InputError
 from hdev_jax.learn.trees import Trees
 from hdev_jax.physics import GEAR_PROBABILITY, Vehicle
-from hdev_jax.segments import Segments
+from hdev_jax.segments import Column, Segments
 
 __all__ = [
     "FEATURES",
@@ -65,13 +65,13 @@ class Gearbox(eqx.Module):
         """How many there are."""
         return self.ratio_radpm.shape[0]
 
-
     def reference(self, speed_mps: Array) -> tuple[Array, Array]:
-        """The highest gear in which the motor would turn at its rated speed or faster, at least the first; and the log of
-        what it turns faster [both by row]."""
-        log_speed = jnp.log(jnp.maximum(speed_mps, 0.1))[..., None] + jnp.log(self.ratio_radpm / self.rated_radps)
+        """The highest gear in which the motor would turn at its rated speed or faster, at least the first; and the log
+        of how much faster [both by row]."""
+        turns = jnp.log(self.ratio_radpm / self.rated_radps)
+        log_speed = jnp.log(jnp.maximum(speed_mps, 0.1))[:, None] + turns[None, :]
         gear = jnp.clip(jnp.sum(log_speed >= 0, axis=-1), 1, self.gears)
-        return gear, jnp.take_along_axis(log_speed, gear[..., None] - 1, axis=-1)[..., 0]
+        return gear, jnp.take_along_axis(log_speed, gear[:, None] - 1, axis=-1)[:, 0]
 
 
 def requested_torque(vehicle: Vehicle, segments: Segments) -> Float[Array, " row"]:
@@ -81,7 +81,7 @@ def requested_torque(vehicle: Vehicle, segments: Segments) -> Float[Array, " row
     return vehicle.force(segments) * vehicle.driveline.wheel_radius_m
 
 
-def features(names: tuple[str, ...], box: Gearbox, segments: Segments, torque_nm: Array) -> Float[Array, "row feature"]:
+def features(names: tuple[str, ...], box: Gearbox, segments: Segments, torque_nm: Any) -> Float[Array, "row feature"]:
     """Columns of `FEATURES` [row, feature], float32. A gear that the box lacks turns the motor at 0.
 
     **Raises:** `ValueError` for an unknown name; `KeyError` for a channel that the log lacks.
@@ -136,7 +136,9 @@ class Surrogate(eqx.Module):
         from training.
         """
         if odd := [n for n in trees.features if n not in EVERY]:
-            raise InputError(f"gear model: trained on {odd[0]!r}, which is no gear feature; they are {', '.join(EVERY)}")
+            raise InputError(
+                f"gear model: trained on {odd[0]!r}, which is no gear feature; they are {', '.join(EVERY)}"
+            )
         known = [int(c) for c in trees.classes]
         if PLACE not in trees.features and (missing := sorted({*range(1, box.gears + 1)} - {*known})):
             raise InputError(
@@ -155,20 +157,18 @@ class Surrogate(eqx.Module):
         return p.astype(jnp.asarray(segments.duration_s).dtype)
 
     def __call__(self, vehicle: Vehicle, segments: Segments, *, soft: bool = True) -> Segments:
-        """The rows with their gears: how likely each is, or (`soft=False`) the likeliest. All within one jit if asked."""
+        """The rows with their gears: how likely each is, or (`soft=False`) the likeliest. May be all within one jit."""
         return in_gears(segments, self.probabilities(segments, requested_torque(vehicle, segments)), soft=soft)
 
 
-def absolute(
-    probability: Float[Array, "row class"], classes: tuple[float, ...], reference: Any, gears: int
-) -> Float[Array, "row gear"]:
+def absolute(probability: Column, classes: tuple[float, ...], reference: Any, gears: int) -> Float[Array, "row gear"]:
     """Probabilities of the box's gears: of the classes that are gears of it, or (`reference` [row]) of distances from
     the reference gear, those beyond the ends counting for the last gear there is."""
     told = jnp.asarray(classes, jnp.int32)[None, :]
     if reference is not None:
         told = jnp.clip(told + reference[:, None], 1, gears)
     # one gear after the other: the sum over classes stays in registers
-    columns = [jnp.sum(jnp.where(told == g, probability, 0), axis=1) for g in range(1, gears + 1)]
+    columns = [jnp.sum(jnp.where(told == g, jnp.asarray(probability), 0), axis=1) for g in range(1, gears + 1)]
     p = jnp.stack(columns, axis=1)
     return p / jnp.maximum(jnp.sum(p, axis=1, keepdims=True), jnp.finfo(p.dtype).tiny)
 

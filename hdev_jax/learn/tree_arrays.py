@@ -41,7 +41,8 @@ class _Columns:
 
     def reading(self) -> Reading:
         every = [*self.found] or [(0, Reading.LOW)]
-        return Reading(*(jnp.asarray(k, jnp.int32) for k in zip(*every, strict=True)))
+        feature, missing = (jnp.asarray(k, jnp.int32) for k in zip(*every, strict=True))
+        return Reading(feature, missing)
 
 
 def _walk(tree: Node | Leaf) -> Iterator[tuple[Node, int, int, int]]:
@@ -89,7 +90,8 @@ def branching(trees: Sequence[Node | Leaf], adds_to: Sequence[int], classes: int
             kept[first:middle] = False
             keeps[i, k] = np.packbits(kept.reshape(words, 32), axis=1, bitorder="little").view("<u4")[:, 0]
     arrays = (column, threshold, keeps, leaves, np.asarray(adds_to, np.int32))
-    return Branching(*map(jnp.asarray, arrays), classes), columns.reading()
+    a, b, c, d, e = map(jnp.asarray, arrays)
+    return Branching(a, b, c, d, e, classes), columns.reading()
 
 
 def oblivious(trees: Sequence[tuple[Sequence[tuple[int, int, int]], np.ndarray]]) -> tuple[Oblivious, Reading]:

@@ -87,7 +87,7 @@ def _named(trees: Trees, classes: Sequence[float | int] | None, where: str) -> T
     return Trees(trees.reading, trees.forest, trees.offset, trees.scale, trees.features, named, trees.link)
 
 
-# --- LightGBM ----------------------------------------------------------------------------------------------------------
+# --- LightGBM ----------------------------------------------------------------------------------------------------
 
 
 def _fields(block: str) -> dict[str, str]:
@@ -114,8 +114,8 @@ def _lightgbm(text: str, where: str) -> Trees:
     forest, reading = branching(trees, [k % scores for k in range(len(trees))], scores)
     classes = max(scores, 2 if links[objective] == "logistic" else 1)
     return _trees(
-        Reading(reading.feature, reading.missing, rounds_to_zero=True), forest, np.zeros(scores), scores / len(trees) if averaged else 1.0, about["feature_names"].split(),
-        range(classes), links[objective],
+        Reading(reading.feature, reading.missing, rounds_to_zero=True), forest, np.zeros(scores),
+        scores / len(trees) if averaged else 1.0, about["feature_names"].split(), range(classes), links[objective],
     )  # fmt: skip
 
 
@@ -148,7 +148,7 @@ def _lightgbm_tree(t: Mapping[str, str], where: str) -> Node | Leaf:
     return part(0)
 
 
-# --- XGBoost -----------------------------------------------------------------------------------------------------------
+# --- XGBoost -----------------------------------------------------------------------------------------------------
 
 
 def _xgboost(table: Mapping[str, Any], where: str) -> Trees:
@@ -202,7 +202,7 @@ def _xgboost_tree(t: Mapping[str, Any], where: str) -> Node | Leaf:
     return part(0)
 
 
-# --- CatBoost ----------------------------------------------------------------------------------------------------------
+# --- CatBoost ----------------------------------------------------------------------------------------------------
 
 
 def _catboost(table: Mapping[str, Any], where: str) -> Trees:

@@ -108,7 +108,7 @@ class Branching(eqx.Module):
     def __call__(self, z: Int[Array, "column row"]) -> Float[Array, "row class"]:
         """The sum of the leaves."""
         every = jnp.uint32(0xFFFFFFFF)
-        trees, nodes, words = self.keeps.shape
+        trees, _, words = self.keeps.shape
         if z.shape[1] <= FEW:
             right = (z[self.column] > self.threshold[..., None])[..., None]
             sets = jnp.where(right, self.keeps[:, :, None, :], every)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from hdev_jax.segments import Segments
@@ -21,10 +22,10 @@ WHEEL_RADIUS_M = (22.5 * 0.0254 / 2) + 0.70 * 0.275  # 275/70 R22.5, the common 
 class EfficiencyMap(eqx.Module):
     """Efficiency over gear, motor speed and torque: monotone cubic inside a gear's grid, clamped at its edges.
 
-    A bicubic Hermite patch on each cell, its slopes at the nodes those of the monotone cubic along each axis (Fritsch and
-    Butland, SIAM J. Sci. Stat. Comput. 5, 1984). Chosen over the bilinear patch for its gradient, which is continuous
-    inside the grid, and over a spline for having no waves: along the lines of the grid it stays between its nodes,
-    also beside the cliff at small torque. A plane that is sampled on even axes comes back as that plane.
+    A bicubic Hermite patch on each cell, its slopes at the nodes those of the monotone cubic along each axis (Fritsch
+    and Butland, SIAM J. Sci. Stat. Comput. 5, 1984). Chosen over the bilinear patch for its gradient, continuous inside
+    the grid, and over a spline for having no waves: along the lines of the grid it stays between its nodes, also beside
+    the cliff at small torque. A plane that is sampled on even axes comes back as that plane.
 
     **Arguments:** `gears` [g], `speeds_radps` [s] and `torques_nm` [t], increasing; `values` [g, s, t] in (0, 1].
     A gear between two of the map takes the nearest.
@@ -38,12 +39,8 @@ class EfficiencyMap(eqx.Module):
     def __check_init__(self) -> None:
         axes = (self.gears, self.speeds_radps, self.torques_nm)
         for name, axis in zip(("gears", "speeds_radps", "torques_nm"), axes, strict=True):
-            if not isinstance(axis, jax.core.Tracer) and not np.all(np.diff(np.asarray(axis)) > 0):
+            if not isinstance(axis, Tracer) and not np.all(np.diff(np.asarray(axis)) > 0):
                 raise ValueError(f"efficiency map: {name} must increase from one to the next, found {np.asarray(axis)}")
-        if self.values.shape != tuple(a.shape[0] for a in axes):
-            raise ValueError(
-                f"efficiency map: values of shape {self.values.shape} for axes of {[len(a) for a in axes]}"
-            )
 
     def __call__(self, gear: Any, speed_radps: Any, torque_nm: Any) -> Any:
         """Efficiency at one operating point. Beyond the edges it is that of the edge, and its slope across it is 0."""

@@ -10,7 +10,19 @@ from jax.test_util import check_grads
 from experiments.paper1_gear_tables import equation_1, macro_f1
 from hdev_jax.errors import InputError
 from hdev_jax.learn.classifiers import balanced_accuracy, route_folds, search_classifier
-from hdev_jax.learn.gears import FEATURES, Gearbox, Surrogate, features, filtered, in_gears, markov, requested_torque
+from hdev_jax.learn.gears import (
+    EVERY,
+    FEATURES,
+    PLACE,
+    Gearbox,
+    Surrogate,
+    chained,
+    features,
+    filtered,
+    in_gears,
+    markov,
+    requested_torque,
+)
 from hdev_jax.learn.tree_arrays import oblivious
 from hdev_jax.learn.trees import Reading, Trees
 from hdev_jax.physics import AIR_DENSITY_KGPM3, GEAR_PROBABILITY, Driveline, EfficiencyMap, Machine, Vehicle
@@ -59,16 +71,20 @@ def trees(classes: tuple[float, ...] = (1.0, 2.0, 3.0)) -> Trees:
 def test_features_are_what_they_are_called():
     log = rows(40)
     torque = np.linspace(-5e3, 2e4, 40)
-    x = features(FEATURES["road"], BOX, log, jnp.asarray(torque))
+    x = features(EVERY, BOX, log, jnp.asarray(torque))
     assert x.dtype == jnp.float32
-    speed = log.distance_m / log.duration_s
+    speed, turns = log.distance_m / log.duration_s, np.array(RATIOS) * FINAL / RADIUS
+    reference = np.maximum(1, np.sum(speed[:, None] * turns >= 150, axis=1))
     expected = {
-        "speed_mps": speed, "requested_torque_nm": torque, "mass_kg": log.channels["mass_kg"], "gears": np.full(40, 3.0),
+        "speed_mps": speed, "requested_torque_nm": torque, "mass_kg": log.channels["mass_kg"],
+        "gears": np.full(40, 3.0), "reference_gear": reference, PLACE: np.log(speed * turns[reference - 1] / 150),
+        "step_above": np.log(np.array([6 / 2.5, 2.5, 2.5]))[reference - 1],
+        "step_below": np.log(np.array([6 / 2.5, 6 / 2.5, 2.5]))[reference - 1],
         "power_over_rated": torque / RADIUS * speed / 200e3, "motor_speed_over_rated_2": speed * 2.5 * 5 / 0.5 / 150,
         "motor_speed_over_rated_4": np.zeros(40), "grade_rad": log.channels["grade_rad"],
     }  # fmt: skip
     for name, column in expected.items():
-        np.testing.assert_allclose(x[:, FEATURES["road"].index(name)], column, rtol=1e-6)
+        np.testing.assert_allclose(x[:, EVERY.index(name)], column, rtol=1e-6)
 
 
 def test_one_compiled_function_from_the_row_to_its_energy():
@@ -136,6 +152,32 @@ def test_filter_is_the_loop_by_hand_and_starts_anew_by_trip():
     np.testing.assert_allclose(found, expected, rtol=1e-10)
 
 
+def test_trees_that_tell_the_distance_from_the_reference_gear():
+    log, base = rows(60, seed=5), trees((0.0, 1.0, 2.0))
+    names = (*FEATURES["relative"], *base.features[len(FEATURES["relative"]) :])[: len(base.features)]
+    asked = Trees(base.reading, base.forest, base.offset, base.scale, names, base.classes, base.link)
+    told = Surrogate.of(asked, BOX)
+    torque = jnp.full(60, 900.0)
+    p = np.asarray(told.probabilities(log, torque))
+    raw = np.asarray(asked.probabilities(features(names, BOX, log, torque)))
+    reference = np.asarray(BOX.reference(jnp.asarray(log.speed_mps))[0])
+    expected = np.zeros((60, 3))
+    for k in range(60):
+        for away in range(3):
+            expected[k, min(reference[k] + away, 3) - 1] += raw[k, away]
+    np.testing.assert_allclose(p, expected, rtol=1e-5, atol=1e-7)
+    assert len(np.unique(reference)) > 1
+
+
+def test_chain_is_the_loop_by_hand():
+    rng = np.random.default_rng(0)
+    given, trip = rng.dirichlet(np.ones(3), (20, 3)), np.repeat([0, 1], 10)
+    expected = np.zeros((20, 3))
+    for k in range(20):
+        expected[k] = (np.full(3, 1 / 3) if k % 10 == 0 else expected[k - 1]) @ given[k]
+    np.testing.assert_allclose(chained(jnp.asarray(given), trip), expected, rtol=1e-10)
+
+
 def test_folds_keep_routes_whole():
     route = np.repeat(np.arange(11), 5)
     folds = [*route_folds(route, 3, 0)]
@@ -166,5 +208,6 @@ def test_a_search_finds_gears_and_its_trees_are_the_library(kind):
         with pytest.raises(InputError, match="boosted trees"):
             model.trees()
     else:
-        np.testing.assert_allclose(jax.jit(lambda z, t=model.trees(): t.probabilities(z))(x), p, atol=1e-5)
-        assert model.trees().classes == (1.0, 2.0, 3.0)
+        trees = model.trees()
+        np.testing.assert_allclose(jax.jit(lambda z: trees.probabilities(z))(x), p, atol=1e-5)
+        assert trees.classes == (1.0, 2.0, 3.0)
