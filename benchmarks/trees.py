@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--rate", type=float, default=0.2256)
     parser.add_argument("--l2", type=float, default=1.402)
     parser.add_argument("--balance", type=float, default=0.417)
-    parser.add_argument("--lightgbm-rounds", type=int, default=60)
+    parser.add_argument("--lightgbm-rounds", type=int, default=100)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)

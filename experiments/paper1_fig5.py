@@ -55,7 +55,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     yield {**common, "bound": True}
     budget = {k: getattr(config, k) for k in ("train_rows", "trials", "folds", "search_rows")}
     for kind in config.classifiers:
-        for name in config.sets:
+        for name in reversed(config.sets):
             yield {**common, **budget, "kind": kind, "set": name, "previous": False}
         if kind in config.memory:
             yield {**common, **budget, "kind": kind, "set": config.sets[-1], "previous": True}

@@ -205,7 +205,9 @@ def search_classifier(
     def objective(trial: Any) -> float:
         scores = []
         for left_out in route_folds(route, folds, seed):
-            rows = used & ~left_out
+            # what few rows have is in all of them that are not left out
+            rare = ~np.isin(gear, np.unique(gear[used & ~left_out]))
+            rows = (used | rare) & ~left_out
             if len(np.unique(gear[rows])) < len(every):
                 continue  # a fold that holds all rows of a gear says nothing
             told = 1 + np.argmax(made(fitted(trial, rows), {}, 0.0).probabilities(x[used & left_out]), axis=1)
@@ -218,6 +220,11 @@ def search_classifier(
     try:
         study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
         study.optimize(objective, n_trials=trials)
+        if study.best_value == 0.0:
+            raise InputError(
+                f"gear classifier: in none of {folds} folds of whole routes do the others have every gear; "
+                "train on more routes"
+            )
     finally:
         optuna.logging.set_verbosity(verbosity)
     model = fitted(optuna.trial.FixedTrial(study.best_params), np.ones(len(gear), dtype=bool))
