@@ -1,6 +1,6 @@
 """Histograms of a published drive cycle for the fleet's page: slopes and accelerations of the ZTBus missions.
 
-    python benchmarks/fleet_references.py            # reads HDEV_DATA/ztbus, prints what hdev_jax/report/fleet_sources.py holds
+python benchmarks/fleet_references.py     # prints what hdev_jax/report/fleet_sources.py holds
 """
 
 import os

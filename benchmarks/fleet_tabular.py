@@ -2,10 +2,9 @@
 
     python benchmarks/fleet_tabular.py            # prints the c_rr and C_d·A that hdev_jax/fleet/variants.py holds
 
-Models A to D are brought to the errors of table 1 (−15.5, −5.18, −7.25, +34.1 %), each by a factor on its tabular c_rr;
-the others get one common factor on both values, with which the whole fleet is at the −40.4 % of table 2. Only the tables move:
-what the vehicles are, and what they take, stays.
-"""
+Models A to D are brought to the errors of table 1 (−15.5, −5.18, −7.25, +34.1 %), each by a factor on its tabular
+c_rr; the others get one common factor on both values, with which the whole fleet is at the −40.4 % of table 2. Only
+the tables move: what the vehicles are, and what they take, stays."""
 
 import equinox as eqx
 import jax

@@ -214,8 +214,8 @@ def predict(
 def simulate(config: str | Path, *, out: str | Path) -> str:
     """A synthetic fleet with known truth, from its configuration (a TOML file), into the folder `out`.
 
-    `log.parquet`, `truth.parquet` and `sheets` hold a file for each vehicle; `fleet.json`, a report and figures say what
-    is in them. **Returns:** a summary as text. Raises `InputError`. The fleet in memory is `hdev_jax.fleet.simulate`.
+    `log.parquet`, `truth.parquet` and `sheets` hold a file for each vehicle; `fleet.json`, a report and figures say
+    what is in them. **Returns:** a summary as text. Raises `InputError`. In memory: `hdev_jax.fleet.simulate`.
     """
     from hdev_jax.fleet.config import load_config
     from hdev_jax.fleet.files import write_fleet

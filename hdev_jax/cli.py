@@ -148,7 +148,9 @@ def parser() -> argparse.ArgumentParser:
         epilog="examples:\n  hdev simulate configs/studies/fleet.toml --out out/fleet\n"
         "  hdev check out/fleet/log.parquet/A.parquet --vehicle out/fleet/sheets/A.toml",
     )
-    simulate.add_argument("config", type=Path, metavar="CONFIG", help="what to simulate: a TOML file with at least a seed")
+    simulate.add_argument(
+        "config", type=Path, metavar="CONFIG", help="what to simulate: a TOML file with at least a seed"
+    )
     simulate.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
 
     verbs.add_parser(

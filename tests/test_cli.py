@@ -15,7 +15,7 @@ import hdev_jax
 from hdev_jax import cli, progress
 from hdev_jax.errors import InputError
 
-VERBS = ("check", "diagnose", "calibrate", "predict", "effects")
+VERBS = ("check", "diagnose", "calibrate", "predict", "simulate", "effects")
 SHEET = ["--vehicle", "v.toml"]
 
 

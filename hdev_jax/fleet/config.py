@@ -14,7 +14,7 @@ from hdev_jax.errors import InputError
 __all__ = ["Driving", "FleetConfig", "Gears", "Log", "Truth", "Weather", "load_config", "parse_config"]
 
 
-def _number(default: float, lower: float, upper: float) -> Any:
+def _number(default: float | int, lower: float | int, upper: float | int) -> Any:
     return field(default=default, metadata={"lower": lower, "upper": upper})
 
 
@@ -42,7 +42,9 @@ class Weather:
 class Gears:
     """The shift program, see `hdev_jax.fleet.shifting`."""
 
-    hysteresis: float = _number(0.10, 0.0, 0.5)  # speed at which it shifts up less that at which it shifts down, relative
+    hysteresis: float = _number(
+        0.10, 0.0, 0.5
+    )  # speed at which it shifts up less that at which it shifts down, relative
     hysteresis_load: float = _number(0.05, 0.0, 0.5)  # more of it, in proportion to the load
     shift_time_s: float = _number(0.5, 0.0, 3.0)  # without torque
     hold_s: float = _number(2.0, 0.0, 10.0)  # between two shifts
@@ -176,6 +178,8 @@ def _check_variants(names: tuple[str, ...], where: str) -> None:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise InputError(f"{where}: variants: no variant {name!r}{hint}; accepted are \"all\" alone, or {', '.join(known)}")
+            raise InputError(
+                f'{where}: variants: no variant {name!r}{hint}; accepted are "all" alone, or {", ".join(known)}'
+            )
     if len(set(names)) < len(names):
         raise InputError(f"{where}: variants: a name is there twice")

@@ -1,11 +1,11 @@
 """Driving a road: a forward simulation in steps of distance, batched over routes, in one `lax.scan`.
 
-The driver looks ahead: an envelope runs back from every stop and slower stretch at the deceleration that the driver likes.
-Below it the driver accelerates by the free-road term of the intelligent driver model, a·(1 − (v/v₀)⁴) (Treiber, Hennecke
-and Helbing, Physical Review E 62 (2000)), with a bounded jerk, and gets no more than the motor gives in the gear that is
-engaged, nothing while it shifts, and no more than the driven wheels carry to the road.
-"""
+The driver looks ahead: an envelope runs back from every stop and slower stretch at the deceleration that the driver
+likes. Below it the driver accelerates by the free-road term of the intelligent driver model, a·(1 − (v/v₀)⁴)
+(Treiber, Hennecke and Helbing, Physical Review E 62 (2000)), with a bounded jerk, and gets no more than the motor
+gives in the gear that is engaged, nothing while it shifts, and no more than the driven wheels carry to the road."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -98,7 +98,8 @@ def _step(car: Car, roads: Roads, s: _State, x: tuple[Array, Array, Array]) -> t
     wanted = jnp.minimum(wanted, (ahead2 - v2) / (2 * STEP_M))
     inertia = car.rotating * mass
     resist = mass * GRAVITY_MPS2 * (jnp.sin(grade) + car.c_rr) + roads.drag_factor * car.drag * v2
-    lines = shift_lines(car.program, v, load_share(car.program, inertia * wanted + resist, v), grade)
+    load = load_share(car.program, inertia * wanted + resist, v)
+    lines = jax.vmap(partial(shift_lines, car.program))(v, load, grade)
     gear = jnp.clip(s.gear, lines.lowest, lines.highest)
     gear = jnp.where((s.since_shift > car.hold_s) | (v <= 0), gear, s.gear)
     shifted = (gear != s.gear) & (v > 0)
@@ -109,6 +110,7 @@ def _step(car: Car, roads: Roads, s: _State, x: tuple[Array, Array, Array]) -> t
     most = jnp.minimum(most * (1 - without), roads.friction * car.axle_share * mass * GRAVITY_MPS2)
     accel = jnp.minimum(wanted, (most - resist) / inertia)
     after2 = jnp.maximum(v2 + 2 * accel * STEP_M, jnp.minimum(_CRAWL_MPS**2, ahead2))
+    after2 = jnp.where(ahead2 > 0, after2, 0.0)  # a halt is one, to the last bit
     after = jnp.sqrt(after2)
     seconds = 2 * STEP_M / jnp.maximum(v + after, 0.5 * _CRAWL_MPS)
     accel = (after2 - v2) / (2 * STEP_M)

@@ -1,11 +1,10 @@
 """Efficiency maps by gear, wheel to battery, from a loss model with published terms.
 
-η = P_out/(P_out + losses) at the motor shaft, with, as Larminie and Lowry, Electric Vehicle Technology Explained, equation 7.23,
-losses = k_c·τ² (copper) + k_i·ω (iron) + k_w·ω³ (windage) + C (electronics), and for the gears a share of the power for
-each mesh in use (Naunheimer, Fahrzeuggetriebe: 0.5 to 1 % a mesh of a helical gear; a direct gear has none in the
-gearbox, the final drive is always there). The shape that follows is the published one: low at little torque, a broad
-optimum of about 0.92 around the base speed at half the torque, falling towards the corners.
-"""
+η = P_out/(P_out + losses) at the motor shaft, with, as Larminie and Lowry, Electric Vehicle Technology Explained,
+equation 7.23, losses = k_c·τ² (copper) + k_i·ω (iron) + k_w·ω³ (windage) + C (electronics), and for the gears a share
+of the power for each mesh in use (Naunheimer, Fahrzeuggetriebe: 0.5 to 1 % a mesh of a helical gear; a direct gear
+has none in the gearbox, the final drive is always there). The shape that follows is the published one: low at little
+torque, a broad optimum of about 0.92 around the base speed at half the torque, falling towards the corners."""
 
 import numpy as np
 
@@ -43,4 +42,9 @@ def padded_map(v: Variant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     """The same with `MAX_GEARS` gears, the last one repeated, so that all variants share one compiled program."""
     _, speeds, torques, values = efficiency_map(v)
     more = MAX_GEARS - v.gears
-    return np.arange(1.0, MAX_GEARS + 1), speeds, torques, np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
+    return (
+        np.arange(1.0, MAX_GEARS + 1),
+        speeds,
+        torques,
+        np.concatenate([values, np.repeat(values[-1:], more, axis=0)]),
+    )

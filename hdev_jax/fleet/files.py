@@ -1,8 +1,7 @@
 """A fleet on disk: a Parquet file of each vehicle for the log and one for the truth, written a batch at a time.
 
-`log.parquet/<vehicle>.parquet` has the columns of the contract; `truth.parquet/<vehicle>.parquet` has the same rows in the
-same order. Folders of such files are what Parquet readers take as one table, and `hdev` as one log.
-"""
+`log.parquet/<vehicle>.parquet` has the columns of the contract; `truth.parquet/<vehicle>.parquet` has the same rows
+in the same order. Folders of such files are what Parquet readers take as one table, and `hdev` as one log."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,9 +20,9 @@ from hdev_jax.fleet.tally import Tally
 __all__ = ["LOG_COLUMNS", "write_fleet"]
 
 LOG_COLUMNS = (
-    "trip_id", "vehicle_id", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "mass_kg", "grade_rad",
-    "altitude_m", "heading_rad", "curvature_1pm", "road_surface", "ambient_temp_c", "wind_speed_mps", "wind_from_rad",
-    "wet_road", "gear", "requested_torque_nm", "energy_wh",
+    "trip_id", "vehicle_id", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "mass_kg",
+    "grade_rad", "altitude_m", "heading_rad", "curvature_1pm", "road_surface", "ambient_temp_c", "wind_speed_mps",
+    "wind_from_rad", "wet_road", "gear", "requested_torque_nm", "energy_wh",
 )  # fmt: skip
 _WORKERS = 2
 
@@ -57,7 +56,7 @@ def _write_vehicle(config: FleetConfig, part: VehiclePart, folder: Path) -> Tall
             for kind, table in (("log", _log(batch, names)), ("truth", _truth(batch, names))):
                 if kind not in writers:
                     path = folder / f"{kind}.parquet" / f"{part.variant.id}.parquet"
-                    texts = ["trip_id", "vehicle_id"]
+                    texts: Any = ["trip_id", "vehicle_id"]
                     writer = pq.ParquetWriter(path, table.schema, compression="zstd", use_dictionary=texts)
                     writers[kind] = stack.enter_context(writer)
                 writers[kind].write_table(table)
@@ -72,7 +71,9 @@ def _ids(batch: Batch, names: np.ndarray) -> dict[str, Any]:
     vehicle = pa.array([batch.vehicle.variant.id], type=pa.string())
     return {
         "trip_id": pa.DictionaryArray.from_arrays(pa.array(trip, type=pa.int32()), pa.array(names)).cast(pa.string()),
-        "vehicle_id": pa.DictionaryArray.from_arrays(pa.array(np.zeros(len(trip), np.int32)), vehicle).cast(pa.string()),
+        "vehicle_id": pa.DictionaryArray.from_arrays(pa.array(np.zeros(len(trip), np.int32)), vehicle).cast(
+            pa.string()
+        ),
     }
 
 

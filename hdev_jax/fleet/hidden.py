@@ -15,8 +15,10 @@ from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 
 __all__ = ["ROTATING_MASS_FACTOR", "hidden_effects", "shift_program", "tabular_vehicle", "true_vehicle"]
 
-ROTATING_MASS_FACTOR = 1.04  # wheels and motor (Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge), known to the sheet
-# More rolling resistance on coarse asphalt, concrete, setts or gravel (Sandberg, MIRIAM (2011), and our assumption for the last)
+ROTATING_MASS_FACTOR = (
+    1.04  # wheels and motor (Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge), known to the sheet
+)
+# More rolling resistance on coarse asphalt, concrete, setts or gravel: Sandberg, MIRIAM (2011); the last is assumed
 _SURFACE_EXCESS = (0.0, 0.10, 0.05, 0.45)
 
 
@@ -70,7 +72,7 @@ def tabular_vehicle(v: Variant, config: FleetConfig) -> Vehicle:
 
 
 def _declared(v: Variant, c_rr: float, cda_m2: float) -> Vehicle:
-    def number(x: float) -> Any:
+    def number(x: float | int) -> Any:
         return jnp.asarray(x, dtype=float)
 
     ratios = np.array(v.gear_ratios + (v.gear_ratios[-1],) * (MAX_GEARS - v.gears))
@@ -88,13 +90,15 @@ def _declared(v: Variant, c_rr: float, cda_m2: float) -> Vehicle:
         Aero(number(cda_m2)),
         Auxiliary(number(v.auxiliary_w)),
     )
-    return Vehicle(effects, mass_kg=number(v.mass_kg[1]), driveline=driveline, machine=Machine(number(1.0), number(1.0)))
+    return Vehicle(
+        effects, mass_kg=number(v.mass_kg[1]), driveline=driveline, machine=Machine(number(1.0), number(1.0))
+    )
 
 
 def shift_program(v: Variant, config: FleetConfig) -> Program:
     """The shift program of the vehicle's gearbox."""
 
-    def number(x: float) -> Any:
+    def number(x: float | int) -> Any:
         return jnp.asarray(x, dtype=float)
 
     ratios = np.array(v.gear_ratios + (v.gear_ratios[-1],) * (MAX_GEARS - v.gears))

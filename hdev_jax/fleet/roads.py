@@ -1,9 +1,8 @@
 """Routes: where the road goes and climbs, what is allowed, where it stops, the traffic, the load and the weather.
 
-Everything is drawn with NumPy from one generator for a batch of routes of one vehicle. Roads are a chain of stretches of four kinds
-(urban, suburban, rural, motorway) in shares that the use of the vehicle sets. Slopes are two smooth Gaussian processes
-(hills of about 300 m and of about 2 km) whose size is that of the terrain.
-"""
+Everything is drawn with NumPy from one generator for a batch of routes of one vehicle. Roads are a chain of stretches
+of four kinds (urban, suburban, rural, motorway) in shares that the use of the vehicle sets. Slopes are two smooth
+Gaussian processes (hills of about 300 m and of about 2 km) whose size is that of the terrain."""
 
 from dataclasses import dataclass
 
@@ -173,7 +172,9 @@ def _bends(kind: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return by_step.reshape(routes, -1)
 
 
-def _halts(v: Variant, kind: np.ndarray, length: np.ndarray, config: FleetConfig, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def _halts(
+    v: Variant, kind: np.ndarray, length: np.ndarray, config: FleetConfig, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Time stood before each segment [s], and whether a passenger stop is there."""
     busy = 0.4 + 0.6 * config.driving.traffic
     lights = rng.uniform(size=kind.shape) < _LIGHT[kind] * busy
@@ -185,8 +186,11 @@ def _halts(v: Variant, kind: np.ndarray, length: np.ndarray, config: FleetConfig
     return wait, served & inside
 
 
-def _caps(v: Variant, kind: np.ndarray, limit: np.ndarray, curvature: np.ndarray, halt: np.ndarray, length: np.ndarray, config: FleetConfig, rng: np.random.Generator) -> np.ndarray:  # fmt: skip
-    """The highest speed at each node that law, bends, traffic, roundabouts and the driver's habit allow; 0 at a halt."""
+def _caps(
+    v: Variant, kind: np.ndarray, limit: np.ndarray, curvature: np.ndarray, halt: np.ndarray, length: np.ndarray,
+    config: FleetConfig, rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
+    """The highest speed at each node that law, bends, traffic, roundabouts and habit allow; 0 at a halt."""
     routes, width = kind.shape
     habit = rng.normal(0.985, 0.03, (routes, 1))
     law = np.minimum(limit, 0.97 * v.top_speed_mps) * habit

@@ -16,10 +16,11 @@ def sheet_text(v: Variant, config: FleetConfig) -> str:
     """The sheet (contract, section 2) of this variant; its map is `<id>_map.csv` beside it."""
     c_rr, cda = (v.c_rr[0], v.cda_m2[0]) if config.truth.tabular_error else (v.true_c_rr, v.true_cda_m2)
     ratios = ", ".join(f"{r:g}" for r in v.gear_ratios)
+    motor = f"{v.power_kw:g} kW, {v.torque_nm:g} Nm, {v.max_speed_radps:g} rad/s at most"
     letter = f", model {v.model}" if v.model else ""
     return f"""\
 name = "synthetic {v.name}{letter}"
-notes = "invented; empty {v.mass_kg[0]:g} kg, full {v.mass_kg[1]:g} kg; {v.power_kw:g} kW, {v.torque_nm:g} Nm, {v.max_speed_radps:g} rad/s at most"
+notes = "invented; empty {v.mass_kg[0]:g} kg, full {v.mass_kg[1]:g} kg; {motor}"
 mass_kg = {v.mass_kg[1]:.1f}
 
 [road]

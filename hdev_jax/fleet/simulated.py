@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.fleet.config import FleetConfig, load_config, parse_config
+from hdev_jax.fleet.rows import ROW_FIELDS
 from hdev_jax.fleet.simulator import Batch, VehiclePart, batches, shares
 from hdev_jax.fleet.variants import Variant
 from hdev_jax.physics import Vehicle
@@ -15,16 +16,14 @@ from hdev_jax.segments import Segments
 
 __all__ = ["Fleet", "FleetVehicle", "joined", "simulate", "trip_name"]
 
-_FIELDS = ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps")
-
 
 @dataclass(frozen=True)
 class FleetVehicle:
     """One vehicle: its log as measured, and what was true.
 
-    `segments` has NumPy columns (`vehicle` is its place in the fleet), `energy_wh` the measured target [row]. `truth` is by
-    name of `truth.parquet` [row]. `tabular` is the vehicle of the sheet, `true` the one that was simulated; both have their
-    gears padded to twelve, and give what the unpadded ones give.
+    `segments` has NumPy columns (`vehicle` is its place in the fleet), `energy_wh` the measured target [row]. `truth`
+    is by name of `truth.parquet` [row]. `tabular` is the vehicle of the sheet, `true` the one that was simulated; both
+    have their gears padded to twelve, and give what the unpadded ones give.
     """
 
     variant: Variant
@@ -66,7 +65,9 @@ class Fleet:
         vehicle's index (`vehicle`) or a trip's number that is its own in the fleet (`trip`)."""
         if name == "trip":
             before = np.cumsum([0] + [len(v.trip_names) for v in self.vehicles])
-            return np.concatenate([np.asarray(v.segments.trip) + b for v, b in zip(self.vehicles, before, strict=False)])
+            return np.concatenate(
+                [np.asarray(v.segments.trip) + b for v, b in zip(self.vehicles, before, strict=False)]
+            )
         if name.startswith("truth:"):
             return np.concatenate([v.truth[name.removeprefix("truth:")] for v in self.vehicles])
         if name == "energy_wh":
@@ -104,9 +105,11 @@ def joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 def _vehicle(part: VehiclePart, made: list[Batch]) -> FleetVehicle:
     log, truth = joined([b.log for b in made]), joined([b.truth for b in made])
-    channels = {k: x for k, x in log.items() if k not in (*_FIELDS, "trip", "energy_wh")}
-    segments = Segments(
-        log["trip"], np.full(len(log["trip"]), part.index), *(log[k] for k in _FIELDS), channels
-    )  # ids of NumPy: nothing is traced here
+    channels: dict[str, Any] = {
+        k: x.astype(float) for k, x in log.items() if k not in (*ROW_FIELDS, "trip", "energy_wh")
+    }
+    ends = {k: log[k] for k in ROW_FIELDS}
+    vehicle = np.full(len(log["trip"]), part.index)
+    segments = Segments(trip=log["trip"], vehicle=vehicle, channels=channels, **ends)
     names = tuple(trip_name(part, k) for k in range(part.routes))
     return FleetVehicle(part.variant, segments, log["energy_wh"], truth, names, part.tabular, part.true, part.effects)

@@ -1,4 +1,4 @@
-"""What is kept of a vehicle's rows for the report: sums, histograms, one route to draw. Its size does not grow with rows."""
+"""What is kept of a vehicle's rows for the report: sums, histograms, one route to draw; no more for more rows."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ class Tally:
         self.points: dict[str, np.ndarray] = {}
         self.route: dict[str, np.ndarray] = {}
 
-    def _plus(self, name: str, value: float) -> None:
+    def _plus(self, name: str, value: Any) -> None:
         self.sums[name] = self.sums.get(name, 0.0) + float(value)
 
     def add(self, batch: Batch) -> None:

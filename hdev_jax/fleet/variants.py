@@ -2,20 +2,21 @@
 
 Where the numbers come from, and which are ours:
 
-- Masses: Council Directive 96/53/EC (18 t for two axles, 26 t for three, 32 t for four, 40 t and 44 t for combinations,
-  28 t and 29 t for articulated buses, two tonnes more for zero-emission vehicles); kerb masses are engineering
-  assumptions with the battery in them.
-- Gearboxes: the ratios of `AMT_12` are those that Volvo Trucks publishes for the direct-drive I-Shift (AT2612). Makers
-  of e-axles publish the number of speeds and the largest torque at the wheels, seldom the ratios: those with 1 to 4
-  speeds are engineering assumptions that give a start at 20 % slope or more and the limited speed within the motor's range.
-- Motors: continuous power as published for vehicles of the class (about 165 kW for a 16 t truck to 490 kW for a
-  heavy tractor); torque and highest speed are assumptions that go with the ratios.
-- Drag areas and rolling resistance: `true_cda_m2` is of the size that Commission Regulation (EU) 2017/2400 lists for the
-  vehicle groups of VECTO (about 5 to 6 m² for tractors with semitrailer), buses as in Hucho, Aerodynamik des Automobils;
-  `true_c_rr` is of tyres of classes B to D of Regulation (EU) 2020/740. The *tabular* values `c_rr` and `cda_m2`, which
-  a sheet declares, are off: set so that the sheets' energy errors are those of paper 1, tables 1 and 2 (models A to D −15.5,
-  −5.18, −7.25 and +34.1 %, the fleet −40.4 %), by `benchmarks/fleet_tabular.py`. So most are of a best-case test site, and D's is
-  that of traction tyres on unmade ground.
+- Masses: Council Directive 96/53/EC (18 t for two axles, 26 t for three, 32 t for four, 40 t and 44 t for
+  combinations, 28 t and 29 t for articulated buses, two tonnes more for zero-emission vehicles); kerb masses are
+  engineering assumptions with the battery in them.
+- Gearboxes: the ratios of `AMT_12` are those that Volvo Trucks publishes for the direct-drive I-Shift (AT2612).
+  Makers of e-axles publish the number of speeds and the largest torque at the wheels, seldom the ratios: those with 1
+  to 4 speeds are engineering assumptions that give a start at 15 % slope or more and the limited speed within the
+  motor's range.
+- Motors: continuous power as published for vehicles of the class (about 165 kW for a 16 t truck to 490 kW for a heavy
+  tractor); torque and highest speed are assumptions that go with the ratios.
+- Drag areas and rolling resistance: `true_cda_m2` is of the size that Commission Regulation (EU) 2017/2400 lists for
+  the vehicle groups of VECTO (about 5 to 6 m² for tractors with semitrailer), buses as in Hucho, Aerodynamik des
+  Automobils; `true_c_rr` is of tyres of classes C to E of Regulation (EU) 2020/740. The *tabular* values `c_rr` and
+  `cda_m2`, which a sheet declares, are off: set so that the sheets' energy errors are those of paper 1, tables 1 and
+  2 (models A to D −15.5, −5.18, −7.25 and +34.1 %, the fleet −40.4 %), by `benchmarks/fleet_tabular.py`. So most are
+  of a best-case test site, and D's is that of traction tyres on unmade ground.
 - Auxiliary and climate loads: assumptions within what Basma et al., Energy 207 (2020), give for buses.
 
 Every vehicle is invented: none of them is a product, and none was measured.
@@ -42,7 +43,8 @@ class Variant:
     """One kind of vehicle: what its sheet declares, and (`true_…`, `extra_…`) what only the simulator knows.
 
     `mass_kg` is the range from empty to full. `usage` chooses the roads: `urban`, `regional`, `long_haul`,
-    `construction`, `city_bus`. `model` is the paper's letter of the four models of its tables. Ratios count from the first gear.
+    `construction`, `city_bus`. `model` is the paper's letter of the four models of its tables. Ratios count from the
+    first gear.
     `hvac_w_per_k` is the load for each kelvin below 18 °C and above 22 °C.
     """
 
@@ -87,13 +89,17 @@ class Variant:
         return self.max_speed_radps * self.wheel_radius_m / (self.gear_ratios[-1] * self.final_drive)
 
 
-def _v(id: str, name: str, axles: str, usage: str, mass: tuple[float, float], tyre: tuple[float, float],
-       air: tuple[float, float], motor: tuple[float, float, float], gears: tuple[float, ...], final: float,
-       radius: float, loads: tuple[float, float, float, float], model: str = "") -> Variant:  # fmt: skip
+def _v(id: str, name: str, axles: str, usage: str, mass: tuple[int, int], tyre: tuple[float, float],
+       air: tuple[float, float], motor: tuple[int, int, int], gears: tuple[float, ...], final: float, radius: float,
+       loads: tuple[int, int, int, int], model: str = "") -> Variant:  # fmt: skip
     """A row: `tyre` and `air` are (tabular, true), `loads` declared, undeclared [W], below, above [W/K]."""
-    sds = (round(0.2 * tyre[0], 5), round(0.15 * air[0], 2))
-    return Variant(id, name, axles, usage, mass, (tyre[0], sds[0]), (air[0], sds[1]), tyre[1], air[1], *motor, gears,
-                   final, radius, loads[0], loads[1], (loads[2], loads[3]), model)  # fmt: skip
+    declared, extra, below, above = (float(x) for x in loads)
+    power, torque, speed = (float(x) for x in motor)
+    return Variant(
+        id, name, axles, usage, (float(mass[0]), float(mass[1])),
+        (tyre[0], round(0.2 * tyre[0], 5)), (air[0], round(0.15 * air[0], 2)), tyre[1], air[1],
+        power, torque, speed, gears, final, radius, declared, extra, (below, above), model,
+    )  # fmt: skip
 
 
 # fmt: off

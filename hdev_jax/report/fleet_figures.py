@@ -1,4 +1,4 @@
-"""The figures of a simulated fleet: routes, slopes and accelerations, consumption, gears, energy, errors of the sheets."""
+"""The figures of a simulated fleet: routes, slopes and accelerations, consumption, gears, energy, errors."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,6 +28,7 @@ _USES = {
     "urban": ("urban delivery, refuse", "#E69F00"),
     "city_bus": ("city bus", "#009E73"),
 }
+_PLURAL = {"tractor": "tractors", "truck": "rigid trucks", "bus": "city buses", "articulated": "articulated buses"}
 _GROUPS = (
     ("rolling", "#7f6a4f", ("rolling",)),
     ("air", "#56B4E9", ("aero",)),
@@ -97,7 +98,7 @@ def cycles(fleet: Sequence[Tally]) -> Any:
     for use, ts in usages(fleet).items():
         words, colour = _USES[use]
         for ax, name, edges in ((slope, "grade", GRADE_EDGES), (accel, "accel", ACCEL_EDGES)):
-            share = sum(getattr(t, name) for t in ts)
+            share = np.sum([getattr(t, name) for t in ts], axis=0)
             ax.stairs(100 * share / share.sum(), edges, color=colour, linewidth=1.4, label=words)
     for ax, share, edges in ((slope, ZTBUS_GRADE, GRADE_EDGES), (accel, ZTBUS_ACCEL, ACCEL_EDGES)):
         ax.stairs(100 * np.array(share), edges, color=INK, linewidth=1.2, linestyle=(0, (3, 1.5)), label=ZTBUS)
@@ -107,7 +108,9 @@ def cycles(fleet: Sequence[Tally]) -> Any:
     for i, (name, (low, high)) in enumerate(CYCLE_LIMITS.items()):
         y = top * (0.97 - 0.075 * i)
         accel.plot([low, high], [y, y], "|-", color=GREY, linewidth=0.9, markersize=6)
-        accel.annotate(name, (low, y), (-3, 0), textcoords="offset points", fontsize=7, color=GREY, ha="right", va="center")
+        accel.annotate(
+            name, (low, y), (-3, 0), textcoords="offset points", fontsize=7, color=GREY, ha="right", va="center"
+        )
     accel.set_xlim(-3.3, 2.1)
     slope.set_title("Slope of the road")
     slope.set_xlabel("slope [%]")
@@ -143,7 +146,9 @@ def _speeds(ax: Any, fleet: Sequence[Tally]) -> None:
 
 def consumption(fleet: Sequence[Tally]) -> Any:
     """kWh/km of each vehicle, over all trips and the spread of the trips, with what was published for its kind."""
-    order = sorted(fleet, key=lambda t: (("tractor", "truck", "bus", "articulated").index(kind(t)), t.variant.mass_kg[1]))
+    order = sorted(
+        fleet, key=lambda t: (("tractor", "truck", "bus", "articulated").index(kind(t)), t.variant.mass_kg[1])
+    )
     rows, y, ticks = [], 0.0, []
     last = ""
     fig = figure(WIDTH, 0.235 * len(order) + 2.4)
@@ -155,7 +160,7 @@ def consumption(fleet: Sequence[Tally]) -> Any:
             y += 1.0
             rows.append((last, y))
         y += 1.0
-        low, quarter, mid, most, high = np.percentile(t.kwh_per_km, [5, 25, 50, 75, 95])
+        low, quarter, most, high = np.percentile(t.kwh_per_km, [5, 25, 75, 95])
         ax.plot([low, high], [y, y], color="#b6c0c9", linewidth=1.2, zorder=2)
         ax.plot([quarter, most], [y, y], color="#8fa3b5", linewidth=5, solid_capstyle="butt", zorder=3)
         ax.plot([t.kwh_km], [y], "o", color=AFTER, markersize=4.5, zorder=4)
@@ -163,9 +168,10 @@ def consumption(fleet: Sequence[Tally]) -> Any:
     for name, at in rows:
         for i, (_, value, _) in enumerate(CONSUMPTION[name]):
             ax.plot([value], [at], "D", color=BEFORE, markersize=5, zorder=4)
-            ax.annotate(str(i + 1), (value, at), (0, 5), textcoords="offset points", fontsize=7, color=BEFORE, ha="center")
-        ticks.append((at, {"tractor": "published, tractors", "truck": "published, rigid trucks", "bus": "published, city buses",
-                           "articulated": "published, articulated buses"}[name]))  # fmt: skip
+            ax.annotate(
+                str(i + 1), (value, at), (0, 5), textcoords="offset points", fontsize=7, color=BEFORE, ha="center"
+            )
+        ticks.append((at, f"published, {_PLURAL[name]}"))
     ticks.sort()
     ax.set_yticks([p for p, _ in ticks], [name for _, name in ticks], fontsize=7.5)
     for label in ax.get_yticklabels():
@@ -173,7 +179,9 @@ def consumption(fleet: Sequence[Tally]) -> Any:
             label.set_color(BEFORE)
     ax.set_ylim(y + 0.8, 0.2)
     ax.set_xlim(left=0)
-    ax.set_xlabel("consumption [kWh/km]      dot: all trips; bar: half of the trips; line: nine in ten; diamond: published")
+    ax.set_xlabel(
+        "consumption [kWh/km]      dot: all trips; bar: half of the trips; line: nine in ten; diamond: published"
+    )
     tidy(ax, grid="x")
     return fig
 
@@ -223,6 +231,7 @@ def energy(fleet: Sequence[Tally]) -> Any:
         left, negative = left + np.maximum(x, 0), negative + np.minimum(x, 0)
     ax.set_yticks(y, [_label(t) for t in fleet], fontsize=7.5)
     ax.set_ylim(-0.7, len(fleet) - 0.3)
+    ax.set_xlim(1.15 * negative.min() if negative.min() < 0 else 0.0, 1.03 * left.max())
     ax.set_xlabel("energy [kWh/km]")
     fig.legend(loc="outside upper center", ncols=3, fontsize=7.5, handlelength=1.2)
     tidy(ax, grid="x")

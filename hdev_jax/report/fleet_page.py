@@ -15,7 +15,12 @@ from hdev_jax.report.page import write_page
 
 __all__ = ["fleet_summary", "fleet_text", "write_fleet_report"]
 
-_KINDS = {"tractor": "tractors with trailers", "truck": "rigid trucks", "bus": "city buses", "articulated": "articulated buses"}
+_KINDS = {
+    "tractor": "tractors with trailers",
+    "truck": "rigid trucks",
+    "bus": "city buses",
+    "articulated": "articulated buses",
+}
 
 
 def fleet_summary(fleet: Sequence[Tally], config: FleetConfig) -> dict[str, Any]:
@@ -36,7 +41,10 @@ def fleet_summary(fleet: Sequence[Tally], config: FleetConfig) -> dict[str, Any]
         "km": total["km"],
         "hours": total["hours"],
         "kwh_per_km": total["energy_wh"] / 1e3 / total["km"],
-        "tabular": {"pe_percent": _error(total, "tabular_wh"), "rmse": float(np.sqrt(total["tabular_wh_squares"] / rows))},
+        "tabular": {
+            "pe_percent": _error(total, "tabular_wh"),
+            "rmse": float(np.sqrt(total["tabular_wh_squares"] / rows)),
+        },
         "tabular_equation_4": {
             "pe_percent": _error(total, "tabular_wheel_wh"),
             "rmse": float(np.sqrt(total["tabular_wheel_wh_squares"] / rows)),
@@ -53,10 +61,11 @@ def fleet_summary(fleet: Sequence[Tally], config: FleetConfig) -> dict[str, Any]
 def fleet_text(summary: dict[str, Any], out: Path) -> str:
     """What `hdev simulate` prints."""
     lines = [
-        f"synthetic fleet: {summary['vehicles']} vehicles, {summary['routes']:,} routes, {summary['segments']:,} segments and "
-        f"{summary['halts']:,} halts, {summary['km']:,.0f} km, {summary['kwh_per_km']:.2f} kWh/km",
-        f"energy by the sheets: {summary['tabular']['pe_percent']:+.1f} % over the fleet (paper: {PAPER_FLEET_PE:+.1f} %), "
-        f"RMSE {summary['tabular']['rmse']:.1f} Wh a row",
+        f"synthetic fleet: {summary['vehicles']} vehicles, {summary['routes']:,} routes, "
+        f"{summary['segments']:,} segments and {summary['halts']:,} halts, {summary['km']:,.0f} km, "
+        f"{summary['kwh_per_km']:.2f} kWh/km",
+        f"energy by the sheets: {summary['tabular']['pe_percent']:+.1f} % over the fleet "
+        f"(paper: {PAPER_FLEET_PE:+.1f} %), RMSE {summary['tabular']['rmse']:.1f} Wh a row",
     ]
     for v in summary["by_vehicle"].values():
         if v["model"]:
@@ -94,7 +103,9 @@ def _vehicle(t: Tally) -> dict[str, Any]:
     }
 
 
-def write_fleet_report(fleet: Sequence[Tally], config: FleetConfig, command: str, seconds: float, directory: Path) -> None:
+def write_fleet_report(
+    fleet: Sequence[Tally], config: FleetConfig, command: str, seconds: float, directory: Path
+) -> None:
     """Write `report.html` and `figures/*.png` into a directory."""
     with style():
         figures = {
@@ -110,7 +121,9 @@ def write_fleet_report(fleet: Sequence[Tally], config: FleetConfig, command: str
         "s": summary,
         "rows": [{**_vehicle(t), "id": t.variant.id, "kind": _KINDS[fleet_figures.kind(t)]} for t in fleet],
         "published": [
-            {"kind": _KINDS[k], "items": CONSUMPTION[k]} for k in _KINDS if any(fleet_figures.kind(t) == k for t in fleet)
+            {"kind": _KINDS[k], "items": CONSUMPTION[k]}
+            for k in _KINDS
+            if any(fleet_figures.kind(t) == k for t in fleet)
         ],
         "switches": [(k, x) for k, x in config.table()["truth"].items()],
         "instruments": list(config.table()["log"].items()),

@@ -19,7 +19,8 @@ __all__ = [
 PAPER_MODEL_PE = {"A": -15.5, "B": -5.18, "C": -7.25, "D": 34.1}
 PAPER_FLEET_PE = -40.4
 
-# ZTBus: 24 missions of two 19 m trolleybuses in Zurich, F. Widmer, A. Ritter, C. H. Onder, Scientific Data 10:687 (2023).
+# ZTBus: 24 missions of two 19 m trolleybuses in Zurich; F. Widmer, A. Ritter, C. H. Onder, Scientific Data 10:687
+# (2023).
 # Shares by bin as benchmarks/fleet_references.py prints them: slopes by distance, accelerations by time in motion.
 GRADE_EDGES = np.linspace(-10.0, 10.0, 21)  # %
 ACCEL_EDGES = np.linspace(-2.0, 2.0, 17)  # m/s²
@@ -29,8 +30,8 @@ ZTBUS_GRADE = (0.0016, 0.0046, 0.0052, 0.0148, 0.0198, 0.0131, 0.0091, 0.0242, 0
 ZTBUS_ACCEL = (0.0003, 0.0011, 0.0074, 0.0293, 0.0607, 0.0822, 0.1070, 0.2159, 0.1819, 0.1028, 0.0983, 0.1133, 0.0, 0.0,
                0.0, 0.0)  # fmt: skip
 
-# DieselNet, Emission Test Cycles: largest deceleration and acceleration [m/s²] of chassis cycles for heavy trucks, given
-# there in mph/s (HHDDT transient −2.8 and 3.0, cruise −2.5 and 2.3, UDDS −4.6 and 4.4)
+# DieselNet, Emission Test Cycles: largest deceleration and acceleration [m/s²] of chassis cycles for heavy trucks,
+# given there in mph/s (HHDDT transient −2.8 and 3.0, cruise −2.5 and 2.3, UDDS −4.6 and 4.4)
 CYCLE_LIMITS = {"HHDDT transient": (-1.25, 1.34), "HHDDT cruise": (-1.12, 1.03), "UDDS (heavy)": (-2.06, 1.97)}
 # DieselNet: mean speeds with stops [km/h]; of the World Harmonized Vehicle Cycle its three parts
 CYCLE_SPEEDS_KMH = {
