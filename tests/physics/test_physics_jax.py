@@ -11,6 +11,7 @@ import numpy as np
 import physics_rows as made
 import pytest
 from jax.test_util import check_grads
+from map_reference import map_by_scipy
 from scipy.interpolate import PchipInterpolator
 
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
@@ -127,6 +128,9 @@ def test_map_is_the_monotone_cubic_along_its_lines_and_clamped_outside(surface: 
         np.testing.assert_allclose(jax.vmap(lambda t: surface(4.0, speed, t))(y), expected, rtol=1e-12)  # noqa: B023
     for speed, torque, corner in [(0.0, -1e6, (0, 0)), (1e6, -1e6, (3, 0)), (0.0, 1e6, (0, 4)), (1e6, 1e6, (3, 4))]:
         np.testing.assert_allclose(surface(1.0, speed, torque), z[0][corner], rtol=1e-15)
+    points = np.random.default_rng(3).uniform((40.0, -450.0), (320.0, 550.0), (60, 2))
+    expected = [map_by_scipy(axes[0], axes[1], z[1], w, t) for w, t in points]
+    np.testing.assert_allclose(jax.vmap(lambda x: surface(2.0, x[0], x[1]))(points), expected, rtol=1e-12)
     # one coordinate outside: the edge
     np.testing.assert_allclose(surface(1.0, 400.0, 45.0), surface(1.0, 300.0, 45.0), rtol=1e-14)
     rng = np.random.default_rng(0)
