@@ -153,8 +153,9 @@ class Surrogate(eqx.Module):
         reference = None
         if PLACE in self.trees.features:
             reference, _ = self.box.reference(jnp.asarray(segments.speed_mps))
-        p = absolute(p, self.trees.classes, reference, self.box.gears)
-        return p.astype(jnp.asarray(segments.duration_s).dtype)
+        # added up to 1 in the kernel's own precision
+        p = p.astype(jnp.asarray(segments.duration_s).dtype)
+        return absolute(p, self.trees.classes, reference, self.box.gears)
 
     def __call__(self, vehicle: Vehicle, segments: Segments, *, soft: bool = True) -> Segments:
         """The rows with their gears: how likely each is, or (`soft=False`) the likeliest. May be all within one jit."""
