@@ -11,7 +11,7 @@ from hdev_jax.learn.trees import IDLE, Branching, Oblivious, Reading
 
 __all__ = ["Leaf", "Node", "branching", "oblivious"]
 
-LEVELS = 12  # of trees that are merged: 4096 leaves of 12 classes in float32 are 192 KiB
+MERGED_BYTES = 32_768  # of the leaves of trees that are merged: the nearest cache of a core
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,9 @@ def _merged(column: np.ndarray, threshold: np.ndarray, leaves: np.ndarray) -> tu
     What a tree costs is the look-up of its leaf, not its questions; as long as the leaves fit into the cache.
     """
     trees, levels, classes = len(column), column.shape[1], leaves.shape[2]
-    together = max(1, LEVELS // levels)
+    together = 1
+    while (1 << levels * (together + 1)) * classes * leaves.itemsize <= MERGED_BYTES:
+        together += 1
     missing = -trees % together
     column = np.pad(column, ((0, missing), (0, 0)))
     threshold = np.pad(threshold, ((0, missing), (0, 0)), constant_values=IDLE)
