@@ -13,6 +13,7 @@ from hdev_jax.physics import EfficiencyMap
 
 __all__ = ["MAP_COLUMNS", "read_map"]
 
+_FAR = 1e9
 MAP_COLUMNS = ("gear", "motor_speed_radps", "motor_torque_nm", "efficiency")
 
 
@@ -91,9 +92,9 @@ def _grid(path: Path, points: dict[tuple[float, float, float], float]) -> Effici
             f"{len(speeds)} speeds and {len(torques)} torques is expected"
         )
     values = np.array([[[points[g, s, t] for t in torques] for s in speeds] for g in gears])
-    # interpolation needs a cell: an axis of one point is continued at the same value
+    # interpolation needs a cell: an axis of one point goes on at the same value, and nothing lies beyond it
     if len(speeds) == 1:
-        speeds, values = [speeds[0], speeds[0] + 1.0], np.repeat(values, 2, axis=1)
+        speeds, values = [speeds[0] - _FAR, speeds[0] + _FAR], np.repeat(values, 2, axis=1)
     if len(torques) == 1:
-        torques, values = [torques[0], torques[0] + 1.0], np.repeat(values, 2, axis=2)
+        torques, values = [torques[0] - _FAR, torques[0] + _FAR], np.repeat(values, 2, axis=2)
     return EfficiencyMap(*(jnp.asarray(x, dtype=float) for x in (gears, speeds, torques, values)))

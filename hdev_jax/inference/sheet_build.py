@@ -5,10 +5,21 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from hdev_jax.inference.map_range import read_against_map
 from hdev_jax.inference.parameters import Coefficient, ParameterTable
 from hdev_jax.inference.sheet import BATTERY_TARGETS, Built, Sheet
 from hdev_jax.inference.sheet_schema import KEYS, SECTIONS, Declared, Key, effect_key
-from hdev_jax.physics import Driveline, Effect, Grouped, Machine, Vehicle, at_null, most_group, unavailable
+from hdev_jax.physics import (
+    Driveline,
+    Effect,
+    EfficiencyMap,
+    Grouped,
+    Machine,
+    Vehicle,
+    at_null,
+    most_group,
+    unavailable,
+)
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.loads import Auxiliary
@@ -47,6 +58,8 @@ class Builder:
         effects += self._effects()
         self._unused()
         vehicle = Vehicle(tuple(effects), mass_kg=mass, driveline=driveline, machine=machine, entry=self.entry)
+        if self.entry == "road" and isinstance(driveline.efficiency, EfficiencyMap):
+            self.notes += read_against_map(self.sheet, vehicle, self.segments)
         return Built(vehicle, ParameterTable(tuple(self.rows)), self.notes)
 
     # --- one coefficient -----------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The kernel: effects at five stages, and the vehicle as their sum."""
 
-from hdev_jax.physics.driveline import Driveline, EfficiencyMap
+from hdev_jax.physics.driveline import GEAR_PROBABILITY, Driveline, EfficiencyMap
 from hdev_jax.physics.effect import Effect, Grouped, Parameter, Point
 from hdev_jax.physics.library import LIBRARY, at_null, derived, library, most_group, unavailable
 from hdev_jax.physics.machine import Machine
@@ -8,6 +8,7 @@ from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
 
 __all__ = [
     "AIR_DENSITY_KGPM3",
+    "GEAR_PROBABILITY",
     "GRAVITY_MPS2",
     "LIBRARY",
     "Driveline",

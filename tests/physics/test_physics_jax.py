@@ -11,6 +11,8 @@ import numpy as np
 import physics_rows as made
 import pytest
 from jax.test_util import check_grads
+from map_reference import map_by_scipy
+from scipy.interpolate import PchipInterpolator
 
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
 
@@ -115,19 +117,35 @@ def test_map_is_exact_at_its_nodes(surface: EfficiencyMap) -> None:
     np.testing.assert_allclose(found, surface.values.ravel(), rtol=1e-15)
 
 
-def test_map_is_bilinear_inside_and_clamped_outside(surface: EfficiencyMap) -> None:
-    z = np.asarray(surface.values)
-    a, b = (130.0 - 100.0) / 80.0, (60.0 - 0.0) / 90.0
-    inside = (1 - a) * ((1 - b) * z[1, 1, 2] + b * z[1, 1, 3]) + a * ((1 - b) * z[1, 2, 2] + b * z[1, 2, 3])
-    np.testing.assert_allclose(surface(2.0, 130.0, 60.0), inside, rtol=1e-14)
+def test_map_is_the_monotone_cubic_along_its_lines_and_clamped_outside(surface: EfficiencyMap) -> None:
+    z, axes = np.asarray(surface.values), (np.asarray(surface.speeds_radps), np.asarray(surface.torques_nm))
+    x, y = np.linspace(50, 300, 41), np.linspace(-400, 500, 41)
+    for k, torque in enumerate(axes[1]):
+        expected = PchipInterpolator(axes[0], z[1, :, k])(x)
+        np.testing.assert_allclose(jax.vmap(lambda s: surface(2.0, s, torque))(x), expected, rtol=1e-12)  # noqa: B023
+    for k, speed in enumerate(axes[0]):
+        expected = PchipInterpolator(axes[1], z[2, k])(y)
+        np.testing.assert_allclose(jax.vmap(lambda t: surface(4.0, speed, t))(y), expected, rtol=1e-12)  # noqa: B023
     for speed, torque, corner in [(0.0, -1e6, (0, 0)), (1e6, -1e6, (3, 0)), (0.0, 1e6, (0, 4)), (1e6, 1e6, (3, 4))]:
         np.testing.assert_allclose(surface(1.0, speed, torque), z[0][corner], rtol=1e-15)
-    # one coordinate outside: the edge, linear along it
-    np.testing.assert_allclose(surface(1.0, 400.0, 45.0), 0.5 * (z[0, 3, 2] + z[0, 3, 3]), rtol=1e-14)
+    points = np.random.default_rng(3).uniform((40.0, -450.0), (320.0, 550.0), (60, 2))
+    expected = [map_by_scipy(axes[0], axes[1], z[1], w, t) for w, t in points]
+    np.testing.assert_allclose(jax.vmap(lambda x: surface(2.0, x[0], x[1]))(points), expected, rtol=1e-12)
+    # one coordinate outside: the edge
+    np.testing.assert_allclose(surface(1.0, 400.0, 45.0), surface(1.0, 300.0, 45.0), rtol=1e-14)
     rng = np.random.default_rng(0)
     many = jax.vmap(surface)(rng.uniform(0, 6, 300), rng.uniform(-50, 500, 300), rng.uniform(-900, 900, 300))
-    assert np.min(z) <= np.min(many)
-    assert np.max(many) <= np.max(z)
+    span = np.max(z) - np.min(z)
+    assert np.min(z) - 0.05 * span <= np.min(many), "off the lines it may pass its nodes a little"
+    assert np.max(many) <= np.max(z) + 0.05 * span
+
+
+def test_map_of_a_plane_is_the_plane(surface: EfficiencyMap) -> None:
+    speeds, torques = jnp.linspace(0.0, 300.0, 5), jnp.linspace(-400.0, 400.0, 6)
+    plane = 0.9 - 2e-4 * speeds[:, None] + 1e-4 * torques[None, :]
+    flat = EfficiencyMap(jnp.array([1.0]), speeds, torques, plane[None])
+    s, t = np.random.default_rng(1).uniform(0, 300, 50), np.random.default_rng(2).uniform(-400, 400, 50)
+    np.testing.assert_allclose(jax.vmap(flat)(np.ones(50), s, t), 0.9 - 2e-4 * s + 1e-4 * t, rtol=1e-12)
 
 
 def test_map_takes_the_nearest_gear(surface: EfficiencyMap) -> None:
@@ -135,7 +153,7 @@ def test_map_takes_the_nearest_gear(surface: EfficiencyMap) -> None:
         assert surface(gear, 120.0, 30.0) == surface(nearest, 120.0, 30.0)
 
 
-def test_map_has_the_gradient_of_its_cell(surface: EfficiencyMap) -> None:
+def test_map_has_a_continuous_gradient(surface: EfficiencyMap) -> None:
     f = lambda x: surface(2.0, x[0], x[1])  # noqa: E731
     for point in ([130.0, 60.0], [60.0, -300.0], [299.0, 499.0]):
         check_grads(f, (jnp.array(point),), order=1, eps=1e-4, rtol=1e-6, atol=1e-9)
@@ -143,10 +161,13 @@ def test_map_has_the_gradient_of_its_cell(surface: EfficiencyMap) -> None:
     across, along = jax.grad(f)(jnp.array([400.0, 45.0]))
     assert across == 0.0
     assert along != 0.0
-    # at a node the slope is that of the cell above, and not the one below
-    left, at, right = (jax.grad(f)(jnp.array([x, 45.0]))[0] for x in (100.0 - 1e-6, 100.0, 100.0 + 1e-6))
-    np.testing.assert_allclose(at, right, rtol=1e-6)
-    assert abs(left - right) > 1e-6
+    # the slope is continuous over the lines of the grid, along both axes
+    for point in ([100.0, 45.0], [180.0, -200.0], [130.0, 90.0], [260.0, 0.0]):
+        for axis in (0, 1):
+            step = 1e-7 * np.eye(2)[axis]
+            left, at, right = (jax.grad(f)(jnp.asarray(point + k * step)) for k in (-1, 0, 1))
+            np.testing.assert_allclose(left, at, atol=1e-8)
+            np.testing.assert_allclose(right, at, atol=1e-8)
     # the map's own values take a gradient: it can be fitted
     grown = jax.grad(lambda m: m(2.0, 130.0, 60.0), allow_int=True)(surface)
     np.testing.assert_allclose(np.sum(grown.values), 1.0)

@@ -1,0 +1,118 @@
+"""Maps against logs: rows beyond the table, gears it lacks, and a map that is learned, beside the true one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hdev_jax.errors import InputError
+from hdev_jax.inference.map_fit import learn_map
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
+from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
+from hdev_jax.segments import Segments
+
+SHEET = """
+mass_kg = 20000.0
+[road]
+c_rr = 0.006
+cda_m2 = 5.5
+[driveline]
+map = "map.csv"
+gear_ratios = [5.0, 2.0]
+final_drive = 5.0
+wheel_radius_m = 0.5
+"""
+
+
+def log(count: int, seed: int = 0) -> Segments:
+    rng = np.random.default_rng(seed)
+    v0 = rng.uniform(2.0, 22.0, count)
+    v1 = np.maximum(v0 + rng.normal(0, 1.2, count), 0.5)
+    duration = rng.uniform(4.0, 9.0, count)
+    channels = {"gear": 1.0 + (v0 > 11), "grade_rad": rng.normal(0, 0.02, count), "mass_kg": np.full(count, 2e4)}
+    zero = np.zeros(count, int)
+    return Segments(zero, zero, np.cumsum(duration), duration, 0.5 * (v0 + v1) * duration, v0, v1, channels)
+
+
+def true_map() -> EfficiencyMap:
+    speeds = np.linspace(0.0, 1200.0, 7)
+    torques = np.concatenate([-np.geomspace(2600, 60, 6), np.geomspace(60, 2600, 6)])
+    w, t = np.meshgrid(speeds + 20, np.abs(torques), indexing="ij")
+    eta = t * w / (t * w + 3.0 * w + 0.004 * t**2 + 400.0)
+    return EfficiencyMap(
+        jnp.array([1.0, 2.0]), jnp.asarray(speeds), jnp.asarray(torques), jnp.asarray([eta * 0.97, eta])
+    )
+
+
+def car(efficiency: EfficiencyMap) -> Vehicle:
+    number = jnp.asarray
+    road = (Inertia(number(1.0)), Grade(), Rolling(number(0.006)), Aero(number(5.5)))
+    line = Driveline(efficiency, jnp.array([5.0, 2.0]), number(5.0), number(0.5))
+    return Vehicle(road, mass_kg=number(2e4), driveline=line, machine=Machine(number(1.0), number(1.0)))
+
+
+def write(folder, gears: tuple[int, ...], most_nm: float) -> None:
+    lines = ["gear,motor_speed_radps,motor_torque_nm,efficiency"]
+    lines += [f"{g},{s},{t},0.9" for g in gears for s in (0, 2000) for t in (-most_nm, most_nm)]
+    (folder / "map.csv").write_text("\n".join(lines))
+    (folder / "sheet.toml").write_text(SHEET)
+
+
+def test_rows_beyond_the_map_are_reported(tmp_path):
+    rows = log(400)
+    write(tmp_path, (1, 2), 1000.0)
+    built = read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh")
+    (note,) = (n for n in built.notes if "beyond its edge" in n)
+    ratio = np.where(rows.channels["gear"] == 1, 50.0, 20.0)
+    share = 100 * np.mean(np.abs(np.asarray(car(true_map()).force(rows)) / ratio) > 1000.0)
+    assert share > 0.2
+    assert f"{share:.2g} % of the moving rows" in note
+    write(tmp_path, (1, 2), 1e5)
+    assert not [n for n in read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh").notes if "edge" in n]
+
+
+def test_a_gear_that_the_map_lacks_is_refused(tmp_path):
+    rows = log(50)
+    write(tmp_path, (2, 3), 1e5)
+    with pytest.raises(InputError, match=r"map\.csv: the log's row \d+ drives in gear 1, .* it has gears 2, 3") as e:
+        read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh")
+    assert "\n" not in str(e.value)
+    with pytest.raises(InputError, match="gear 2, which the grid does not have"):
+        one = true_map()
+        learn_map(
+            car(one), rows, np.zeros(50), EfficiencyMap(one.gears[:1], one.speeds_radps, one.torques_nm, one.values[:1])
+        )
+    with pytest.raises(InputError, match="no column 'gear'"):
+        learn_map(car(true_map()), rows.without("gear"), np.zeros(50), true_map())
+
+
+def test_axes_must_increase():
+    m = true_map()
+    with pytest.raises(ValueError, match="torques_nm must increase"):
+        EfficiencyMap(m.gears, m.speeds_radps, m.torques_nm[::-1], m.values)
+
+
+def test_a_learned_map_is_the_true_one_where_the_log_has_been():
+    rows, truth = log(2500), true_map()
+    vehicle = car(truth)
+    rng = np.random.default_rng(1)
+    energy = np.asarray(vehicle.energy(rows)) + 0.5 * rng.normal(size=len(rows))
+    start = eqx.tree_at(lambda m: m.values, truth, jnp.full(truth.values.shape, 0.85))
+    found = learn_map(car(start), rows, energy, start, smooth=(30.0, 300.0, 3000.0))
+    assert 0.45 < found.noise_wh < 0.55
+    assert found.rows.sum() == len(rows)
+    ratio = np.where(rows.channels["gear"] == 1, 50.0, 20.0)
+    speed, torque = np.asarray(rows.speed_mps) * ratio, np.asarray(vehicle.force(rows)) / ratio
+    eta = [np.asarray(jax.vmap(m)(rows.channels["gear"], speed, torque)) for m in (found.map, truth)]
+    i = np.clip(np.searchsorted(truth.speeds_radps, speed) - 1, 0, 5)
+    j = np.clip(np.searchsorted(truth.torques_nm, torque) - 1, 0, 10)
+    cell = (rows.channels["gear"].astype(int) * 6 + i) * 11 + j
+    seen = [c for c in np.unique(cell) if np.sum(cell == c) >= 50 and c % 11 != 5]  # 5: torque changes sign, no power
+    errors = np.array([np.mean((eta[0] - eta[1])[cell == c]) for c in seen])
+    assert len(seen) > 8
+    assert np.max(np.abs(errors)) < 0.01
+    many, none = found.rows.max(), np.argwhere(found.rows == 0)[0]
+    busiest = np.argwhere(found.rows == many)[0]
+    assert found.sd[tuple(busiest)] < 0.5 * found.sd[tuple(none)], "it knows less where the log has not been"

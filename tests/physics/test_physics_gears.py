@@ -1,0 +1,74 @@
+"""Rows whose gear is known as probabilities: one-hot is the gear itself, the rest a mean, all with a gradient."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import physics_rows as made
+import pytest
+from jax.test_util import check_grads
+
+from hdev_jax.physics import GEAR_PROBABILITY, EfficiencyMap, Vehicle
+from hdev_jax.segments import Segments
+
+
+@pytest.fixture
+def car() -> Vehicle:
+    rng = np.random.default_rng(3)
+    return made.baseline(
+        efficiency=EfficiencyMap(
+            jnp.arange(1.0, 5.0),
+            jnp.linspace(0.0, 500.0, 6),
+            jnp.linspace(-3000.0, 3000.0, 8),
+            jnp.asarray(rng.uniform(0.75, 0.95, (4, 6, 8))),
+        )
+    )
+
+
+def with_shares(log: Segments, shares: np.ndarray) -> Segments:
+    return log.without("gear").with_channels(**{GEAR_PROBABILITY: jnp.asarray(shares)})
+
+
+def one_hot(log: Segments) -> np.ndarray:
+    return np.eye(4)[np.asarray(log.channels["gear"]).astype(int) - 1]
+
+
+def test_a_probability_of_one_is_the_gear_exactly(car: Vehicle) -> None:
+    log = made.drives(*made.LENGTHS)
+    for f in (lambda c, s: c.energy(s), lambda c, s: c.torque(s), lambda c, s: jnp.stack([*c.breakdown(s).values()])):
+        compiled = eqx.filter_jit(f)
+        np.testing.assert_array_equal(compiled(car, log), compiled(car, with_shares(log, one_hot(log))))
+
+
+def test_efficiency_is_the_mean_over_the_gears(car: Vehicle) -> None:
+    log = made.drives(*made.LENGTHS).without("motor_speed_radps")
+    shares = np.random.default_rng(0).dirichlet(np.ones(4), len(log))
+    force, speed, radius = np.asarray(car.force(log)), np.asarray(log.speed_mps), 0.5
+    eta = np.zeros(len(log))
+    for g, ratio in enumerate(np.asarray(car.driveline.gear_ratios) * 4.5 / radius):
+        of = jax.vmap(lambda s, t, g=g: car.driveline.efficiency(g + 1.0, s, t))
+        eta += shares[:, g] * np.asarray(of(speed * ratio, force / ratio))
+    power = np.where(force > 0, force / eta, force * eta) * speed
+    np.testing.assert_allclose(car.power(with_shares(log, shares)), power, rtol=1e-10, atol=1e-7)
+
+
+def test_gradients_by_vehicle_and_by_probability(car: Vehicle) -> None:
+    log = made.drives(*made.LENGTHS).without("motor_speed_radps")
+    shares = jnp.asarray(np.random.default_rng(1).dirichlet(np.ones(4), len(log)))
+
+    def energy(c_rr, values, ratios, shares):
+        where = lambda c: (c.effect("rolling").c_rr, c.driveline.efficiency.values, c.driveline.gear_ratios)  # noqa: E731
+        changed = eqx.tree_at(where, car, (c_rr, values, ratios))
+        return jnp.sum(changed.energy(with_shares(log, shares))) / len(log)
+
+    given = (car.effect("rolling").c_rr, car.driveline.efficiency.values, car.driveline.gear_ratios, shares)
+    check_grads(energy, tuple(map(jnp.asarray, given)), order=1, modes=("fwd", "rev"), eps=1e-6, rtol=2e-4, atol=1e-4)
+    by_share = jax.grad(energy, 3)(*given)
+    assert np.all(np.isfinite(by_share))
+    assert np.any(np.asarray(by_share) != 0)
+
+
+def test_as_many_probabilities_as_ratios(car: Vehicle) -> None:
+    log = made.drives(*made.LENGTHS)
+    with pytest.raises(ValueError, match=r"shape \(3,\) for 4 gear ratios"):
+        car.energy(with_shares(log, np.full((len(log), 3), 1 / 3)))
