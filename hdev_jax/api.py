@@ -1,10 +1,12 @@
 """The verbs: what `hdev VERB` does, as functions of the same names and arguments."""
 
 import json
+import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from hdev_jax import progress

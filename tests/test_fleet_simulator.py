@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.interpolate import RegularGridInterpolator
+from map_reference import map_by_scipy
 
 from hdev_jax import cli
 from hdev_jax.errors import InputError
@@ -159,11 +159,9 @@ def test_energy_is_that_of_a_plain_reference(perfect):
         gear = s.channels["gear"].astype(int)
         ratio = np.array(car.gear_ratios)[gear - 1] * car.final_drive / car.wheel_radius_m
         _, speeds, torques, values = efficiency_map(car)
-        omega = np.clip(s.distance_m / s.duration_s * ratio, speeds[0], speeds[-1])
-        torque = np.clip(force / ratio, torques[0], torques[-1])
+        omega, torque = s.distance_m / s.duration_s * ratio, force / ratio
         eta = np.array([
-            RegularGridInterpolator((speeds, torques), values[g - 1])([[w, m]])[0]
-            for g, w, m in zip(gear, omega, torque, strict=True)
+            map_by_scipy(speeds, torques, values[g - 1], w, m) for g, w, m in zip(gear, omega, torque, strict=True)
         ])  # fmt: skip
         wheel = force * s.distance_m
         energy = (np.where(wheel > 0, wheel / eta, wheel * eta) + car.auxiliary_w * s.duration_s) / 3600
