@@ -209,14 +209,17 @@ def find_expression(
     the rows to predict with `predict(vehicle, segments)`; `first`, a monomial that is tried before all others.
     """
     start = replace(state, refused=(), taken_out=())
-    if first and (found := _chosen(start, problem, [first], everything, predict, tell)) is not None:
+    if first and (found := _chosen(start, problem, *_best(start, problem, [first]), everything, predict, tell)):
         return found
     made = monomials(problem.rows.segments, problem.rows.rows)
-    best, _ = _best(start, problem, made)
-    if best is not None and len(factors := best[0]) == 1 and factors[0].above is not None:
+    best, view = _best(start, problem, made)
+    if best is None or view is None or view.q[Described.id] > problem.fdr:
+        return None
+    if len(factors := best[0]) == 1 and factors[0].above is not None:
         # a threshold that is off leaves some of the cause to whatever is near
         made += finer(factors[0], problem.rows.segments, problem.rows.rows)
-    return _chosen(start, problem, made, everything, predict, tell)
+        best, view = _best(start, problem, made)
+    return _chosen(start, problem, best, view, everything, predict, tell)
 
 
 def _best(start: Search, problem: Loop, made: Sequence[tuple[Factor, ...]]) -> tuple[Any, View | None]:
@@ -230,11 +233,10 @@ def _best(start: Search, problem: Loop, made: Sequence[tuple[Factor, ...]]) -> t
 
 
 def _chosen(
-    start: Search, problem: Loop, made: Sequence[tuple[Factor, ...]], everything: Segments,
+    start: Search, problem: Loop, best: Any, view: View | None, everything: Segments,
     predict: Callable[..., np.ndarray], tell: Callable[[str], None],
 ) -> Expression | None:  # fmt: skip
-    """The best monomial of those made, if it clears every bar."""
-    best, view = _best(start, problem, made)
+    """The best monomial of a look, if it clears every bar."""
     if best is None or view is None:
         return None
     factors, scale = best
