@@ -16,7 +16,7 @@ from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_co
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
-__all__ = ["grow", "is_size", "joined", "refit", "sharpened"]
+__all__ = ["grow", "is_size", "joined", "refit", "sharpened", "without"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
 AGREES = 0.9878  # of Student's distribution between what plain rows say of a size and what whitened ones do: 2.25 sd
@@ -88,6 +88,14 @@ def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
     if (not fit.converged and fit.steps < 5) or not _in_range(fit, c) or not _present(fit, c):
         return None
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
+
+
+def without(problem: Loop, state: Search, effect_id: str) -> Search:
+    """The state with one effect taken out again and the rest refitted."""
+    table, vehicle = state.table.minus(effect_id), state.fit.vehicle.minus(effect_id)
+    fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
+    found = [f for f in state.found if f.id != effect_id]
+    return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found)
 
 
 def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | None:

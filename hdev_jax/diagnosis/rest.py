@@ -15,11 +15,12 @@ import numpy as np
 from hdev_jax.diagnosis.expression import Factor, find_expression
 from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.refit import without
 from hdev_jax.diagnosis.select import prune
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.standins import beside, stand_ins
 from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder
-from hdev_jax.inference import Calibration, Fit, calibrate, cluster_rows
+from hdev_jax.inference import Calibration, calibrate, cluster_rows
 from hdev_jax.physics.across import distance_since_start
 
 __all__ = ["told_apart"]
@@ -39,8 +40,12 @@ def told_apart(
     each effect in turn; their predictions on all rows; and what is left.
     """
     train, first = problem.rows(split.train), []
+
+    def fresh() -> Loop:  # what is kept of an earlier round draws nothing: every stage has its own numbers
+        return replace(loop, rng=np.random.default_rng([seed, 999]))
+
     for round_ in range(MOST_SHADOWS + 1):
-        steps = _path(problem, state, loop.rows)
+        steps = _path(problem, state, loop)
         predicted = [problem.predict(fit.vehicle) for fit in steps]
         plain = checkpoint(
             f"remainder-{round_}",
@@ -49,18 +54,18 @@ def told_apart(
         left = Remainder(**plain)
         told = checkpoint(
             f"formula-{round_}",
-            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, s, loop, p, f, r, tell),
+            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, s, fresh(), p, f, r, tell),
         )
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told["factors"]
         elif np.any(left.cycle_w):
-            told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, loop, c, tell))
+            told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, fresh(), c, tell))
         gone = told["superfluous"] if told else []
         shadow = gone[0] if gone else _shadow(problem, state, predicted, train, left)
         if shadow is None or round_ == MOST_SHADOWS:
             break
         tell(f"taking {shadow} out: what is left is larger than what it explains")
-        state = _without(problem, state, shadow, loop.rows)
+        state = _gone(loop, state, shadow)
     return state, steps, predicted, left
 
 
@@ -127,22 +132,17 @@ def _shadow(
     return None
 
 
-def _without(problem: Problem, state: Search, effect_id: str, rows: Fit) -> Search:
-    """The state with one effect taken out again and the rest refitted."""
-    table, vehicle = state.table.minus(effect_id), state.fit.vehicle.minus(effect_id)
-    clusters = cluster_rows(rows.segments.take(np.arange(rows.rows)))
-    fit = calibrate(vehicle, table, rows, problem.target, clusters)
+def _gone(loop: Loop, state: Search, effect_id: str) -> Search:
+    """The state without a stand-in, with the verdict on it."""
     gone = next(f for f in state.found if f.id == effect_id)
     why = "the mean of something larger that is left unexplained, not a cause of its own"
     verdicts = [Verdict(effect_id, gone.score.gain, gone.q_value, why), *state.verdicts]
-    found = [f for f in state.found if f.id != effect_id]
-    return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found, verdicts=verdicts)
+    return replace(without(loop, state, effect_id), verdicts=verdicts)
 
 
-def _path(problem: Problem, state: Search, rows: Fit) -> list[Calibration]:
+def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:
     """The declared model, then with each effect in the order found, each fitted to all training rows."""
-    real = rows.segments.take(np.arange(rows.rows))
-    clusters = cluster_rows(real)
+    rows, clusters = loop.rows, loop.clusters
     fits = [calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)]
     for k in range(1, len(state.found)):
         later = [f.id for f in state.found[k:]]

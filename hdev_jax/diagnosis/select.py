@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import CLOSE, LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
 from hdev_jax.diagnosis.modes import add_mode
-from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened
+from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened, without
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle, most_group
@@ -245,11 +245,5 @@ def prune(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search:
             break
         drop = worst[1].id
         tell(f"taking {drop} out again")
-        table = state.table.minus(drop)
-        vehicle = state.fit.vehicle.minus(drop)
-        fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
-        kept = [f for f in state.found if f.id != drop]
-        state = replace(
-            state, vehicle=fit.vehicle, table=table, fit=fit, found=kept, taken_out=(*state.taken_out, drop)
-        )
+        state = replace(without(problem, state, drop), taken_out=(*state.taken_out, drop))
     return state

@@ -15,7 +15,7 @@ from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.expression import TERM, Described
 from hdev_jax.diagnosis.look import Found, Loop, Search, look
 from hdev_jax.diagnosis.modes import add_mode
-from hdev_jax.diagnosis.refit import sharpened
+from hdev_jax.diagnosis.refit import sharpened, without
 from hdev_jax.diagnosis.select import choose
 from hdev_jax.inference import calibrate, effect_coefficients
 
@@ -54,10 +54,9 @@ def stand_ins(problem: Loop, state: Search, channels: Sequence[str], tell: Tell)
 
 def _again(problem: Loop, state: Search, f: Found, tell: Tell) -> bool:
     """Whether the effect clears every bar from where the vehicle stands without it."""
-    table = state.table.minus(f.id)
-    fit = calibrate(state.fit.vehicle.minus(f.id), table, problem.rows, problem.target, problem.clusters)
-    rest = [g for g in state.found if g.id not in (f.id, Described.id)]
-    start = replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=rest, refused=(), taken_out=())
+    start = without(problem, state, f.id)
+    named = [g for g in start.found if g.id != Described.id]
+    start = replace(start, found=named, refused=(), taken_out=())
     if (by := f.score.candidate.effect.searched) in BY_TRIP:
         return BY_TRIP[by](problem, start)[0] is not None
     view = sharpened(problem, look(problem, start))
