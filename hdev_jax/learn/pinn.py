@@ -1,0 +1,251 @@
+"""The physics-informed network of paper 1 (section 3.3): two heads, a physics term that calls the kernel, and ours.
+
+What the paper leaves open is a choice of the `Recipe`, its readings named. Ours differs by deltas: coefficients that
+cannot saturate, by vehicle and by what a coefficient may depend on; a likelihood whose noise grows with energy in the
+place of squares weighed by hand; a term for the sum over a stretch of a trip; effects of the library as physics.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from hdev_jax.learn.heads import Heads, Network
+from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, energy, wheel_energy, with_coefficients
+from hdev_jax.physics import Effect, Grouped
+
+__all__ = ["Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict"]
+
+C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
+_LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
+_BY_ROW = 0.5  # how far the network's head moves a free coefficient, in logarithms, for an output of 1
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What is built and what is minimised.
+
+    - `features`, names of columns; `units`, `normalised`, `dropout`: the network.
+    - `predicted`, what E_pred of equation 7 is: `residual`, the physics with predicted coefficients plus what the
+      energy head says; `alone`, what that head says; `table`, the physics at the tables plus what the head says.
+    - `physics`: `battery` (equation 5) or `wheel` (equation 4 as equation 7 cites it).
+    - `coefficients`: `bounded`, c_rr by a scaled sigmoid in (0, 0.02], C_d·A clamped `clamp` around its table;
+      `free`, the table times an exponential; `table`, not predicted at all.
+    - `coefficient_inputs`: `all` features, or those that a coefficient can depend on (`physical`).
+    - `coefficient_loss`: squares of the distance from the table, `relative` to it or `absolute`.
+    - `by_vehicle`: coefficients and effects have a part of each vehicle's own, shrunk to the fleet's.
+    - `loss`: `squares` (equation 7), or the normal `likelihood` of measured and of physical energy, whose variances
+      are learned, which is what weighs the terms against each other (Kendall, Gal and Cipolla, CVPR 2018).
+    - `energy_head`: with the head, or without; `stretch`, rows of a stretch of a trip whose sum counts too (1: none).
+    """
+
+    features: tuple[str, ...]
+    units: tuple[int, ...] = (256, 128)
+    normalised: bool = True
+    dropout: float = 0.1
+    predicted: Literal["residual", "alone", "table"] = "residual"
+    physics: Literal["battery", "wheel"] = "battery"
+    coefficients: Literal["bounded", "free", "table"] = "bounded"
+    clamp: float = 0.5
+    coefficient_inputs: Literal["all", "physical"] = "all"
+    coefficient_loss: Literal["relative", "absolute"] = "relative"
+    by_vehicle: bool = False
+    loss: Literal["squares", "likelihood"] = "squares"
+    energy_head: bool = True
+    stretch: int = 1
+
+
+class Sized(NamedTuple):
+    """An effect whose sizes are trained: `sizes` by name with the number of values (0: one number, not by group); its
+    other parameters stay as in `fixed`."""
+
+    kind: type[Effect]
+    sizes: tuple[tuple[str, int], ...]
+    fixed: tuple[tuple[str, float], ...] = ()
+
+
+class Prediction(eqx.Module):
+    """By row: energy [Wh], what the physics alone says [Wh], the energy head's part [Wh], c_rr, C_d·A [m²], and the
+    standard deviation of the energy [Wh] (NaN without a likelihood)."""
+
+    energy_wh: Float[Array, " row"]
+    physics_wh: Float[Array, " row"]
+    residual_wh: Float[Array, " row"]
+    c_rr: Float[Array, " row"]
+    cda_m2: Float[Array, " row"]
+    sd_wh: Float[Array, " row"]
+
+
+class Pinn(eqx.Module):
+    """Weights of a recipe. `common` [2] and `own` [vehicle, 2] are logarithms of coefficients over their tables;
+    `sizes` and `own_sizes` are the effects' sizes in units of their usual scale.
+
+    `scale_wh` is the unit of the energy head.
+    """
+
+    network: Network
+    coefficient_network: Network | None
+    common: Float[Array, " 2"]
+    own: Float[Array, "vehicle 2"]
+    sizes: dict[str, Array]
+    own_sizes: dict[str, Array]
+    noise: Float[Array, " 4"]  # logarithms: floor [scale] and share of energy, of the prediction and of the physics
+    drift: Float[Array, ""]  # logarithm of the share by which a whole trip's energy is off
+    effects: tuple[Sized, ...] = eqx.field(static=True)
+    scale_wh: float = eqx.field(static=True)
+    recipe: Recipe = eqx.field(static=True)
+
+    def __init__(
+        self, recipe: Recipe, vehicles: int, *, scale_wh: float, effects: tuple[Sized, ...] = (), key: PRNGKeyArray
+    ):
+        first, second = jax.random.split(key)
+        make = lambda n, units, k: Network(  # noqa: E731
+            n, units, normalised=recipe.normalised, dropout=recipe.dropout, key=k
+        )
+        self.network = make(len(recipe.features), recipe.units, first)
+        physical = [n for n in recipe.features if n in PHYSICAL]
+        apart = recipe.coefficient_inputs == "physical" and recipe.coefficients == "free"
+        self.coefficient_network = make(len(physical), (32, 32), second) if apart else None
+        self.common = jnp.zeros(2, jnp.float32)
+        self.own = jnp.zeros((vehicles, 2), jnp.float32)
+        sizes = [(f"{e.kind.id}.{name}", (n,) if n else ()) for e in effects for name, n in e.sizes]
+        self.sizes = {name: jnp.zeros(shape, jnp.float32) for name, shape in sizes}
+        self.own_sizes = {name: jnp.zeros((vehicles, *shape), jnp.float32) for name, shape in sizes}
+        self.noise = jnp.log(jnp.array([0.1, 0.05, 0.2, 0.1], jnp.float32))
+        self.drift = jnp.log(jnp.array(0.03, jnp.float32))
+        self.effects = effects
+        self.scale_wh = scale_wh
+        self.recipe = recipe
+
+    # --- what holds in a row -----------------------------------------------------------------------------------------
+
+    def coefficients(self, heads: Heads, rows: Rows) -> tuple[Array, Array]:
+        """c_rr and C_d·A [m²] of each row."""
+        r, said = self.recipe, heads.coefficients
+        if r.coefficients == "table":
+            return rows.c_rr, rows.cda_m2
+        if r.coefficients == "bounded":
+            # begins at the table, as the drag area does
+            start = jnp.log(rows.c_rr / (C_RR_LIMIT - rows.c_rr))
+            c_rr = C_RR_LIMIT * jax.nn.sigmoid(said[:, 0] + start)
+            return c_rr, rows.cda_m2 * jnp.clip(1.0 + said[:, 1], 1.0 - r.clamp, 1.0 + r.clamp)
+        log = self.common + _BY_ROW * said
+        if r.by_vehicle:
+            log = log + _of(self.own, rows.vehicle)
+        return rows.c_rr * jnp.exp(log[:, 0]), rows.cda_m2 * jnp.exp(log[:, 1])
+
+    def effects_of(self, rows: Rows) -> tuple[Effect, ...]:
+        """The effects with the sizes that hold in each row."""
+        made, n = [], rows.vehicle.shape[0]
+        for e in self.effects:
+            values: dict[str, Any] = {k: jnp.full(n, x, jnp.float32) for k, x in e.fixed}
+            for p in e.kind.parameters:
+                if (name := f"{e.kind.id}.{p.name}") in self.sizes:
+                    size = jnp.broadcast_to(self.sizes[name], (n, *self.sizes[name].shape))
+                    if self.recipe.by_vehicle:
+                        size = size + _of(self.own_sizes[name], rows.vehicle)
+                    value = (p.null + p.scale * size).astype(jnp.float32)
+                    values[p.name] = Grouped(value, p.by) if p.by else value
+            made.append(e.kind(**values))
+        return tuple(made)
+
+    def __call__(
+        self, rows: Rows, memory: eqx.nn.State, *, key: PRNGKeyArray | None = None
+    ) -> tuple[Prediction, Heads, eqx.nn.State]:
+        """What it says of each row; with a `key` as in training."""
+        r = self.recipe
+        heads, memory = self.network(rows.features, memory, key=key)
+        if self.coefficient_network is not None:
+            at = jnp.array([i for i, n in enumerate(r.features) if n in PHYSICAL])
+            other = None if key is None else jax.random.fold_in(key, 17)
+            said, memory = self.coefficient_network(rows.features[:, at], memory, key=other)
+            heads = Heads(heads.energy, said.coefficients)
+        c_rr, cda = self.coefficients(heads, rows)
+        law = energy if r.physics == "battery" else wheel_energy
+        physics = law(with_coefficients(rows.car, c_rr, cda, *self.effects_of(rows)), rows.segments)
+        residual = self.scale_wh * heads.energy if r.energy_head else jnp.zeros_like(physics)
+        base = {
+            "residual": physics, "alone": jnp.zeros_like(physics), "table": energy(rows.car, rows.segments)
+        }[r.predicted]  # fmt: skip
+        floor, share = jnp.exp(self.noise[0]) * self.scale_wh, jnp.exp(self.noise[1])
+        sd = jnp.sqrt(floor**2 + (share * physics) ** 2)
+        if r.loss == "squares":
+            sd = jnp.full_like(sd, jnp.nan)
+        return Prediction(base + residual, physics, residual, c_rr, cda, sd), heads, memory
+
+
+def _of(table: Array, vehicle: Array) -> Array:
+    """The vehicle's entry; zero for one that was not trained on."""
+    zero = jnp.zeros((1, *table.shape[1:]), table.dtype)
+    return jnp.concatenate([table, zero])[jnp.minimum(vehicle, table.shape[0])]
+
+
+@eqx.filter_jit
+def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
+    """The model as it is used: no dropout, running means."""
+    return model(rows, memory)[0]
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Equation 7, or the likelihood. Batches are `Rows` [stretch, row of it, …]; `settings` are λ₁, λ₂ and λ₃ (of the
+    likelihood: what the measured term, the physics term and the priors are weighed by); `rows` is how many there are.
+    """
+
+    static: Any  # the model without its weights
+    rows: int
+
+    def loss(self, weights: Any, memory: Any, batch: Rows, key: PRNGKeyArray, settings: Any) -> tuple[Array, Any]:
+        """Of one batch."""
+        model: Pinn = eqx.combine(weights, self.static)
+        flat, memory = _flat(batch), memory
+        p, heads, memory = model(flat, memory, key=key)
+        terms = self._squares if model.recipe.loss == "squares" else self._likelihood
+        return sum(w * t for w, t in zip(settings, terms(model, p, heads, flat, batch), strict=True)), memory
+
+    def score(self, weights: Any, memory: Any, data: Rows, settings: Any) -> Array:
+        """The first term alone, of rows that were held out."""
+        model: Pinn = eqx.combine(weights, self.static)
+        flat = _flat(data)
+        p, heads, _ = model(flat, memory)
+        terms = self._squares if model.recipe.loss == "squares" else self._likelihood
+        return terms(model, p, heads, flat, data)[0]
+
+    def _squares(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:
+        def mean(x: Array) -> Array:
+            return jnp.sum(rows.weight * x) / jnp.sum(rows.weight)
+
+        unit = (rows.c_rr, rows.cda_m2) if model.recipe.coefficient_loss == "relative" else (1.0, 1.0)
+        pairs = zip((p.c_rr, p.cda_m2), (rows.c_rr, rows.cda_m2), unit, strict=True)
+        away = sum(mean(((x - table) / u) ** 2) for x, table, u in pairs)
+        return mean((rows.energy_wh - p.energy_wh) ** 2), mean((rows.energy_wh - p.physics_wh) ** 2), away
+
+    def _likelihood(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:
+        w, count = rows.weight, jnp.sum(rows.weight)
+        floor, share = jnp.exp(model.noise[2]) * model.scale_wh, jnp.exp(model.noise[3])
+        loose = jnp.sqrt(floor**2 + (share * p.physics_wh) ** 2)
+        error, off = rows.energy_wh - p.energy_wh, rows.energy_wh - p.physics_wh
+        data = jnp.sum(w * _normal(error, p.sd_wh)) / count
+        physics = jnp.sum(w * _normal(off, loose)) / count
+        shape = batch.weight.shape
+        if model.recipe.stretch > 1:
+            whole = lambda x: jnp.sum((w * x).reshape(shape), axis=1)  # noqa: E731
+            sd = jnp.sqrt(whole(p.sd_wh**2) + (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + 1e-6)
+            data = data + jnp.sum(_normal(whole(error), sd) * (whole(w) > 0)) / count
+        own = sum(jnp.sum(x**2) for x in model.own_sizes.values()) + sum(jnp.sum(x**2) for x in model.sizes.values())
+        prior = 0.5 * (jnp.sum(model.own**2) + jnp.sum(model.common**2)) / _LOG_SD**2 + 0.5 * own
+        by_row = jnp.sum(w[:, None] * heads.coefficients**2) / count
+        return data, physics, prior / self.rows + 0.01 * by_row
+
+
+def _normal(error: Array, sd: Array) -> Array:
+    """Minus the logarithm of the normal density, but for a constant."""
+    return 0.5 * (error / sd) ** 2 + jnp.log(sd)
+
+
+def _flat(batch: Rows) -> Rows:
+    """Stretches one after the other."""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)

@@ -1,0 +1,141 @@
+"""Fitting a physics-informed network: rows in stretches of a trip, members side by side, an ensemble's prediction."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from hdev_jax.learn.pinn import Objective, Pinn, Prediction, Recipe, Sized, predict
+from hdev_jax.learn.pinn_rows import Rows
+from hdev_jax.learn.sequences import Scale
+from hdev_jax.learn.train import Plan, Trained, train
+
+__all__ = ["Ensemble", "Member", "fit", "stretches"]
+
+PAPER_WEIGHTS = (1.0, 0.1, 0.01)  # λ₁, λ₂, λ₃ of section 3.3.2
+_AT_ONCE = 2**16  # rows of a prediction
+
+
+@dataclass(frozen=True)
+class Member:
+    """One network: its seed, and what the terms of its loss are weighed by."""
+
+    seed: int
+    weights: tuple[float, float, float] = PAPER_WEIGHTS
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Members with one recipe: weights and memory with a leading axis of members, and the features' scale."""
+
+    model: Pinn
+    memory: eqx.nn.State
+    scale: Scale
+    members: tuple[Member, ...]
+    trained: Trained
+
+    def predict(self, rows: Rows) -> list[Prediction]:
+        """What each member says of each row, as NumPy."""
+        scaled = _scaled(rows, self.scale)
+        out = []
+        for k in range(len(self.members)):
+            arrays, static = eqx.partition(self.model, eqx.is_array)
+            one = eqx.combine(jax.tree.map(lambda x, k=k: x[k], arrays), static)
+            parts = []
+            for first in range(0, len(rows), _AT_ONCE):
+                # the last part is filled up, so that one program serves all
+                at = np.minimum(np.arange(first, first + min(_AT_ONCE, _filled(len(rows)))), len(rows) - 1)
+                part = jax.tree.map(np.asarray, predict(one, jax.tree.map(lambda x, k=k: x[k], self.memory), scaled.take(at)))
+                parts.append(jax.tree.map(lambda x, first=first: x[: len(rows) - first], part))
+            out.append(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+        return out
+
+    def mean(self, rows: Rows) -> Prediction:
+        """Mean of the members; `sd_wh` holds the noise and how far the members are apart."""
+        every = self.predict(rows)
+        means = jax.tree.map(lambda *x: np.mean(x, axis=0), *every)
+        noise = np.mean([p.sd_wh**2 for p in every], axis=0)
+        apart = np.var([p.energy_wh for p in every], axis=0)
+        return eqx.tree_at(lambda p: p.sd_wh, means, np.sqrt(noise + apart))
+
+
+def _filled(n: int) -> int:
+    return 2 ** int(np.ceil(np.log2(max(n, 256))))
+
+
+def _scaled(rows: Rows, scale: Scale) -> Rows:
+    return eqx.tree_at(lambda r: r.features, rows, np.asarray(scale.apply(rows.features), np.float32))
+
+
+def stretches(rows: Rows, length: int) -> Rows:
+    """Rows in stretches of a trip [stretch, `length`]; what fills the last of a trip has weight 0.
+
+    Rows of a trip must follow one another.
+    """
+    if length == 1:
+        return jax.tree.map(lambda x: np.asarray(x)[:, None], rows)
+    trip, vehicle = np.asarray(rows.segments.trip), np.asarray(rows.vehicle)
+    starts = np.flatnonzero(np.r_[True, (trip[1:] != trip[:-1]) | (vehicle[1:] != vehicle[:-1])])
+    ends = np.r_[starts[1:], len(trip)]
+    firsts = np.concatenate([np.arange(a, b, length) for a, b in zip(starts, ends, strict=True)])
+    last = np.repeat(ends, [-(-(b - a) // length) for a, b in zip(starts, ends, strict=True)])
+    at = firsts[:, None] + np.arange(length)[None, :]
+    inside = at < last[:, None]
+    out = rows.take(np.minimum(at, last[:, None] - 1))
+    return eqx.tree_at(lambda r: r.weight, out, np.where(inside, out.weight, np.float32(0)))
+
+
+def fit(
+    recipe: Recipe,
+    rows: Rows,
+    held: Rows,
+    *,
+    vehicles: int,
+    members: Sequence[Member],
+    plan: Plan,
+    rate: float = 0.005,
+    decay: float = 0.0,
+    effects: tuple[Sized, ...] = (),
+    checkpoint: Path | None = None,
+    tell: Callable[[int, float, float], None] | None = None,
+) -> Ensemble:
+    """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
+
+    **Arguments:** `vehicles`, how many there are in `rows`; `decay`, of the weights (AdamW). All members train in one
+    program. **Raises:** `NotFiniteError` where a single member's loss is not finite.
+    """
+    scale = Scale.of(np.asarray(rows.features, float))
+    data = stretches(_scaled(rows, scale), recipe.stretch)
+    check = stretches(_scaled(held, scale), recipe.stretch)
+    plan = Plan(**{**plan.__dict__, "batch": max(1, plan.batch // recipe.stretch)})
+    unit = float(np.std(rows.energy_wh))
+    made = [
+        eqx.nn.make_with_state(Pinn)(
+            recipe, vehicles, scale_wh=unit, effects=effects, key=jax.random.fold_in(jax.random.key(m.seed), 0)
+        )
+        for m in members
+    ]
+    arrays = [eqx.partition(model, eqx.is_inexact_array) for model, _ in made]
+    static = arrays[0][1]
+    weights = jax.tree.map(lambda *x: jnp.stack(x), *(w for w, _ in arrays))
+    memory = jax.tree.map(lambda *x: jnp.stack(x), *(s for _, s in made))
+    keys = jnp.stack([jax.random.fold_in(jax.random.key(m.seed), 1) for m in members])
+    settings = jnp.asarray([m.weights for m in members], jnp.float32)
+    optimiser = optax.adamw(rate, weight_decay=decay) if decay else optax.adam(rate)
+    single = len(members) == 1
+    if single:
+        weights, memory = jax.tree.map(lambda x: x[0], (weights, memory))
+        keys, settings = keys[0], settings[0]
+    trained = train(
+        Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optimiser, plan, key=keys,
+        held=jax.tree.map(jnp.asarray, check), settings=settings, members=not single, checkpoint=checkpoint, tell=tell,
+    )  # fmt: skip
+    weights, memory = trained.weights, trained.memory
+    if single:
+        weights, memory = jax.tree.map(lambda x: x[None], (weights, memory))
+    return Ensemble(eqx.combine(weights, static), memory, scale, tuple(members), trained)
