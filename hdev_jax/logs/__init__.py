@@ -6,6 +6,7 @@ from hdev_jax.logs.ledger import Entry, Ledger
 from hdev_jax.logs.log import MEASURED, TARGETS, Log
 from hdev_jax.logs.read import read_log
 from hdev_jax.logs.skeleton import write_adapter_skeleton
+from hdev_jax.logs.stretches import by_distance
 
 __all__ = [
     "MEASURED",
@@ -17,6 +18,7 @@ __all__ = [
     "Ledger",
     "Log",
     "Rule",
+    "by_distance",
     "read_log",
     "write_adapter_skeleton",
 ]
