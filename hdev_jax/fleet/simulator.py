@@ -21,6 +21,7 @@ from hdev_jax.fleet.rows import TRUTH_ONLY, log_rows, measured, padded
 from hdev_jax.fleet.shifting import Program, engaged, load_share, shift_lines
 from hdev_jax.fleet.variants import AXLE_LOAD_SHARE, Variant
 from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Machine, Vehicle
+from hdev_jax.physics.library import WITH_AIR, WITH_WEIGHT
 from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Segments
 
@@ -238,13 +239,9 @@ def _coefficients(vehicle: Vehicle, segments: Segments, parts: dict[str, Any]) -
         return sum(parts[k] for k in ids if k in parts) * (3600.0 / metres)
 
     moves = segments.distance_m > 0
-    c_rr = (force(_ROLLING) - spray) / weight
-    cda = (force(_AIR) + spray) / (0.5 * AIR_DENSITY_KGPM3 * jnp.where(square > 0, square, 1.0))
+    c_rr = (force(WITH_WEIGHT) - spray) / weight
+    cda = (force(WITH_AIR) + spray) / (0.5 * AIR_DENSITY_KGPM3 * jnp.where(square > 0, square, 1.0))
     return {
         "c_rr": jnp.where(moves, c_rr, vehicle.effect("rolling").c_rr),
         "cda_m2": jnp.where(moves & (square > 0), cda, vehicle.effect("aero").cda_m2),
     }
-
-
-_ROLLING = ("rolling", "rolling_temperature", "rolling_speed", "tyre_warmup", "road_surface", "wet_road", "cornering")
-_AIR = ("aero", "headwind", "crosswind", "air_density")

@@ -29,9 +29,7 @@ class Network(eqx.Module):
     head: eqx.nn.Linear
     dropout: float = eqx.field(static=True)
 
-    def __init__(
-        self, inputs: int, units: tuple[int, ...], *, normalised: bool, dropout: float, key: PRNGKeyArray
-    ):
+    def __init__(self, inputs: int, units: tuple[int, ...], *, normalised: bool, dropout: float, key: PRNGKeyArray):
         sizes = (inputs, *units)
         keys = jax.random.split(key, len(units))
         self.layers = tuple(

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hdev_jax.learn.heads import Heads, Network
-from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, energy, wheel_energy, with_coefficients
+from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, coefficients_that_hold, energy, wheel_energy, with_coefficients
 from hdev_jax.physics import Effect, Grouped
 
 __all__ = ["Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict"]
@@ -185,8 +185,13 @@ def _of(table: Array, vehicle: Array) -> Array:
 
 @eqx.filter_jit
 def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
-    """The model as it is used: no dropout, running means."""
-    return model(rows, memory)[0]
+    """The model as it is used: no dropout, running means. Its coefficients are those that hold in the row, with all its
+    effects."""
+    p = model(rows, memory)[0]
+    if not model.effects:
+        return p
+    car = with_coefficients(rows.car, p.c_rr, p.cda_m2, *model.effects_of(rows))
+    return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, coefficients_that_hold(car, rows.segments))
 
 
 @dataclass(frozen=True)
@@ -201,10 +206,10 @@ class Objective:
     def loss(self, weights: Any, memory: Any, batch: Rows, key: PRNGKeyArray, settings: Any) -> tuple[Array, Any]:
         """Of one batch."""
         model: Pinn = eqx.combine(weights, self.static)
-        flat, memory = _flat(batch), memory
+        flat = _flat(batch)
         p, heads, memory = model(flat, memory, key=key)
         terms = self._squares if model.recipe.loss == "squares" else self._likelihood
-        return sum(w * t for w, t in zip(settings, terms(model, p, heads, flat, batch), strict=True)), memory
+        return jnp.sum(settings * jnp.stack(terms(model, p, heads, flat, batch))), memory
 
     def score(self, weights: Any, memory: Any, data: Rows, settings: Any) -> Array:
         """The first term alone, of rows that were held out."""
@@ -220,7 +225,7 @@ class Objective:
 
         unit = (rows.c_rr, rows.cda_m2) if model.recipe.coefficient_loss == "relative" else (1.0, 1.0)
         pairs = zip((p.c_rr, p.cda_m2), (rows.c_rr, rows.cda_m2), unit, strict=True)
-        away = sum(mean(((x - table) / u) ** 2) for x, table, u in pairs)
+        away = sum((mean(((x - table) / u) ** 2) for x, table, u in pairs), jnp.zeros(()))
         return mean((rows.energy_wh - p.energy_wh) ** 2), mean((rows.energy_wh - p.physics_wh) ** 2), away
 
     def _likelihood(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:

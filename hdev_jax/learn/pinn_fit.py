@@ -50,7 +50,9 @@ class Ensemble:
             for first in range(0, len(rows), _AT_ONCE):
                 # the last part is filled up, so that one program serves all
                 at = np.minimum(np.arange(first, first + min(_AT_ONCE, _filled(len(rows)))), len(rows) - 1)
-                part = jax.tree.map(np.asarray, predict(one, jax.tree.map(lambda x, k=k: x[k], self.memory), scaled.take(at)))
+                part = jax.tree.map(
+                    np.asarray, predict(one, jax.tree.map(lambda x, k=k: x[k], self.memory), scaled.take(at))
+                )
                 parts.append(jax.tree.map(lambda x, first=first: x[: len(rows) - first], part))
             out.append(jax.tree.map(lambda *x: np.concatenate(x), *parts))
         return out

@@ -12,16 +12,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Effect, Vehicle
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
-from hdev_jax.physics.road import mean_square_speed
-from hdev_jax.segments import Segments
+from hdev_jax.physics.effect import resolve
+from hdev_jax.physics.library import WITH_AIR, WITH_WEIGHT
+from hdev_jax.physics.road import mean_square_speed, weight_on_road
+from hdev_jax.segments import Column, Ids, Segments
 
-__all__ = ["FEATURES", "PHYSICAL", "Rows", "concatenated", "energy", "row_wise", "rows_of", "wheel_energy", "with_coefficients"]
+__all__ = [
+    "FEATURES",
+    "PHYSICAL",
+    "Rows",
+    "coefficients_that_hold",
+    "concatenated",
+    "energy",
+    "row_wise",
+    "rows_of",
+    "wheel_energy",
+    "with_coefficients",
+]
 
 _REFERENCE_M = 100.0  # the length of the paper's segments; √(g·100 m) is the unit of speed
 _PADDED = 4096
@@ -30,8 +43,8 @@ _PADDED = 4096
 _PRINTED = ("speed_mps", "mass_kg", "grade_rad")
 _CHANNELS = (*_PRINTED, "accel_mps2", "c_rr_table", "cda_table")
 _UNITLESS = (
-    "acceleration", "slope", "froude", "c_rr_table", "drag_over_weight", "specific_energy", "duration",
-    "load_of_rated", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3", "warmth",
+    "acceleration", "slope", "froude", "kinetic", "c_rr_table", "drag_over_weight", "specific_energy", "duration",
+    "mass_of_sheet", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3", "warmth",
     "cornering", "efficiency", "halt",
 )  # fmt: skip
 FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS}
@@ -47,12 +60,12 @@ class Rows(eqx.Module):
     `weight` is 0 for a row that only fills an array.
     """
 
-    features: Float[Array, "row feature"]
+    features: Float[Array, "*row feature"] | Float[np.ndarray, "*row feature"]
     segments: Segments
     car: Vehicle
-    energy_wh: Float[Array, " row"]
-    vehicle: Int[Array, " row"]
-    weight: Float[Array, " row"]
+    energy_wh: Column
+    vehicle: Ids
+    weight: Column
 
     def __len__(self) -> int:
         return self.energy_wh.shape[0]
@@ -87,6 +100,21 @@ def wheel_energy(car: Vehicle, segments: Segments) -> Float[Array, " row"]:
     """Energy at the wheels of each row by the kernel [Wh] (paper 1, equation 4)."""
     force = jax.vmap(lambda c, s: c.force(jax.tree.map(lambda x: x[None], s))[0])(car, segments)
     return force * segments.distance_m / 3600.0
+
+
+@eqx.filter_jit
+def coefficients_that_hold(car: Vehicle, segments: Segments) -> tuple[Float[Array, " row"], Float[Array, " row"]]:
+    """c_rr and C_d·A [m²] of each row with all effects that go with the weight, and with the air (at least 0.1 m/s of
+    it). `car` has a value of each coefficient for each row. Of `wet_road`, spray counts as rolling."""
+
+    def one(c: Vehicle, s: Segments) -> tuple[Any, Any]:
+        c = resolve(c, s)
+        force = {e.id: e.force(s, c) for e in c.effects if e.id in WITH_WEIGHT + WITH_AIR}
+        air = 0.5 * AIR_DENSITY_KGPM3 * jnp.maximum(mean_square_speed(s), 1e-2)
+        rolling = sum(f for k, f in force.items() if k in WITH_WEIGHT)
+        return rolling / weight_on_road(s, c), sum(f for k, f in force.items() if k in WITH_AIR) / air
+
+    return jax.vmap(one)(car, segments)
 
 
 def row_wise(effect: Effect | type[Effect]) -> bool:
@@ -142,16 +170,12 @@ def rows_of(
 def concatenated(parts: Sequence[Rows]) -> Rows:
     """Rows one after the other; all must have the same channels."""
     shared = set.intersection(*(set(p.segments.channels) for p in parts))
-    kept = [
-        eqx.tree_at(lambda r: r.segments, p, p.segments.without(*set(p.segments.channels) - shared)) for p in parts
-    ]
+    kept = [eqx.tree_at(lambda r: r.segments, p, p.segments.without(*set(p.segments.channels) - shared)) for p in parts]
     return jax.tree.map(lambda *x: np.concatenate(x), *kept)
 
 
 @eqx.filter_jit
-def _sheet(
-    vehicle: Vehicle, segments: Segments, effects: tuple[Effect, ...]
-) -> tuple[Segments, dict[str, Array]]:
+def _sheet(vehicle: Vehicle, segments: Segments, effects: tuple[Effect, ...]) -> tuple[Segments, dict[str, Array]]:
     """The rows with what is worked out by trip, and what the sheet alone says of each: energy, ratio and efficiency of
     the driveline."""
     if not segments.has(DISTANCE_SINCE_START):
@@ -205,13 +229,15 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
             return np.sin(channel("grade_rad"))
         case _ if name == "froude":
             return square / unit
+        case _ if name == "kinetic":
+            return (np.asarray(s.speed_end_mps) ** 2 - np.asarray(s.speed_start_mps) ** 2) / (2.0 * unit)
         case _ if name == "drag_over_weight":
             return 0.5 * AIR_DENSITY_KGPM3 * cda * square / weight
         case _ if name == "specific_energy":
             return sheet["energy"] * 3600.0 / (weight * _REFERENCE_M)
         case _ if name == "duration":
             return np.asarray(s.duration_s) * np.sqrt(GRAVITY_MPS2 / _REFERENCE_M) / 10.0
-        case _ if name == "load_of_rated":
+        case _ if name == "mass_of_sheet":
             return mass / float(vehicle.mass_kg)
         case _ if name == "temperature":
             return (channel("ambient_temp_c") - 20.0) / 293.15
@@ -230,4 +256,6 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
             return sheet["efficiency"]
         case _ if name == "halt":
             return (np.asarray(s.distance_m) == 0) * one
-    raise InputError(f"no feature {name!r}; they are {', '.join(dict.fromkeys(n for f in FEATURES.values() for n in f))}")
+    raise InputError(
+        f"no feature {name!r}; they are {', '.join(dict.fromkeys(n for f in FEATURES.values() for n in f))}"
+    )

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hdev_jax.errors import InputError
 from hdev_jax.learn.sequences import Scale, Trip
 from hdev_jax.learn.sources import Channels, Source
+from hdev_jax.learn.train import Plan, train
 
 __all__ = ["Recurrent", "RecurrentModel", "train_recurrent"]
 
@@ -99,7 +100,8 @@ def train_recurrent(
     decay: float = 0.03,
     huber: float = np.inf,
 ) -> RecurrentModel:
-    """Adam with a cosine schedule from `rate` to 0 over `steps` batches of windows from random places of the trip.
+    """Adam with a cosine schedule from `rate` to 0 over `steps` batches (or as many more as fill the last pass over the
+    trip) of windows from all places of the trip.
 
     **Arguments:** `length` rows of a window count, after `burn_in` that only fill the memory; `decay` of the
     weights (Loshchilov and Hutter 2019), of the cell, not of the read-out, times the rate; `huber`, corner of the
@@ -122,22 +124,35 @@ def train_recurrent(
     cell_only = eqx.tree_at(
         lambda n: n.cell, jax.tree.map(lambda _: False, weights), jax.tree.map(lambda _: True, weights.cell)
     )
-    schedule = optax.cosine_decay_schedule(rate, steps)
+    places = jnp.arange(x.shape[0] - window + 1)
+    each = max(len(places) // batch, 1)
+    epochs = -(-steps // each)
+    schedule = optax.cosine_decay_schedule(rate, epochs * each)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=decay, mask=cell_only))
+    objective = _Windows(static, x, y, burn_in, window, corner)
+    trained = train(objective, weights, None, places, optimiser, Plan(epochs, batch), key=draw)
+    return RecurrentModel(eqx.combine(trained.weights, static), source, *scales)
 
-    def loss(weights: Any, xs: Array, ys: Array) -> Array:
-        error = jax.vmap(eqx.combine(weights, static))(xs)[:, burn_in:] - ys[:, burn_in:]
-        return jnp.mean(optax.huber_loss(error, delta=corner)) / corner
 
-    @jax.jit
-    def learn(weights: Any, state: Any, keys: Array) -> Any:
-        def one(carry: Any, key: Array) -> tuple[Any, None]:
-            weights, state = carry
-            at = jax.random.randint(key, (batch, 1), 0, x.shape[0] - window + 1) + jnp.arange(window)[None, :]
-            update, state = optimiser.update(jax.grad(loss)(weights, x[at], y[at]), state, weights)
-            return (optax.apply_updates(weights, update), state), None
+@dataclass(frozen=True)
+class _Windows:
+    """Huber's loss over windows of a trip; a batch is where they begin."""
 
-        return jax.lax.scan(one, (weights, state), keys)[0]
+    static: Any
+    x: Array
+    y: Array
+    burn_in: int
+    window: int
+    corner: float
 
-    weights, _ = learn(weights, optimiser.init(weights), jax.random.split(draw, steps))
-    return RecurrentModel(eqx.combine(weights, static), source, *scales)
+    def loss(self, weights: Any, memory: Any, batch: Array, key: Array, settings: Any) -> tuple[Array, Any]:
+        import optax
+
+        at = batch[:, None] + jnp.arange(self.window)[None, :]
+        error = (
+            jax.vmap(eqx.combine(weights, self.static))(self.x[at])[:, self.burn_in :] - self.y[at][:, self.burn_in :]
+        )
+        return jnp.mean(optax.huber_loss(error, delta=self.corner)) / self.corner, memory
+
+    def score(self, weights: Any, memory: Any, data: Any, settings: Any) -> Array:
+        raise NotImplementedError("nothing is held out of the one training trip")

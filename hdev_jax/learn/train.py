@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -36,6 +36,7 @@ class NotFiniteError(InputError):
         )
 
 
+@runtime_checkable
 class Objective(Protocol):
     """What is minimised, and what a validation set is scored by.
 
@@ -124,8 +125,8 @@ def train(
     """
     entries = jax.tree.leaves(data)[0].shape[0]
     batch = min(plan.batch, entries)
-    epoch = functools.partial(_epoch, objective, optimiser, plan, batch)
-    start = functools.partial(_start, optimiser, plan)
+    epoch: Callable[..., Any] = functools.partial(_epoch, objective, optimiser, plan, batch)
+    start: Callable[..., Any] = functools.partial(_start, optimiser, plan)
     if members:
         epoch = jax.vmap(epoch, in_axes=(0, 0, 0, None, None))
         start = jax.vmap(start)

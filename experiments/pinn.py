@@ -1,0 +1,244 @@
+"""Paper 1, table 2 and figures 6 and 7, and the studies around them: networks with physics against what they must beat.
+
+One task is one model on one fold of the data; of the vehicle-by-vehicle ones (tables, regression, the kernel with
+diagnosed effects) one vehicle. Networks that differ in seed and loss weights alone train side by side in one program.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from experiments import pinn_pages
+from experiments.config import Strict
+from experiments.data import MissingDataError, fingerprint
+from experiments.pinn_buses import bus_files
+from experiments.pinn_data import Data, load
+from experiments.pinn_models import bayesian, boosted, diagnosed, names_of, networks, said, sized
+from experiments.pinn_scores import scores
+from hdev_jax.learn.pinn import Recipe
+from hdev_jax.learn.pinn_rows import energy
+from hdev_jax.learn.train import Plan
+from hdev_jax.rundir import Run
+
+__all__ = ["SOURCES", "Config", "Model", "collect", "run", "run_together", "tasks", "together"]
+
+SOURCES = ("pinn.py", "pinn_data.py", "pinn_models.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py")
+PAPER = (1.0, 0.1, 0.01)
+
+
+class Model(Strict):
+    """A row of the table. `kind`: what by vehicle needs no network (`vehicles`), LightGBM, or a network, whose recipe
+    is that of `hdev_jax.learn.pinn.Recipe`."""
+
+    kind: Literal["vehicles", "lightgbm", "network"] = "network"
+    title: str = ""
+    features: Literal["printed", "channels", "unitless"] = "channels"
+    units: list[int] = Field(default_factory=lambda: [256, 128])
+    normalised: bool = True
+    dropout: float = 0.1
+    predicted: Literal["residual", "alone", "table"] = "residual"
+    physics: Literal["battery", "wheel"] = "battery"
+    coefficients: Literal["bounded", "free", "table"] = "bounded"
+    clamp: float = 0.5
+    coefficient_inputs: Literal["all", "physical"] = "all"
+    coefficient_loss: Literal["relative", "absolute"] = "relative"
+    by_vehicle: bool = False
+    loss: Literal["squares", "likelihood"] = "squares"
+    energy_head: bool = True
+    stretch: int = 1
+    effects: bool = False  # those of the config
+    weights: list[float] = Field(default_factory=lambda: list(PAPER))
+    members: int = 1  # of an ensemble
+    rate: float = 0.005
+    decay: float = 0.0
+    batch: int = 1024
+
+
+class Config(Strict):
+    """Data, split, what is compared, and grids over seeds, loss weights and the amount of data."""
+
+    experiment: Literal["pinn"]
+    artefact: str
+    caption: str
+    data: Literal["fleet", "ztbus"] = "fleet"
+    routes: int = 5000  # ztbus: missions of each bus, 0 for all
+    variants: list[str] = Field(default_factory=lambda: ["all"])
+    held_variants: list[str] = Field(default_factory=list)
+    warmer_than_c: float | None = None
+    folds: list[int] = Field(default_factory=lambda: [0])
+    shares: list[float] = Field(default_factory=lambda: [1.0])
+    models: dict[str, Model]
+    grid: list[list[float]] = Field(default_factory=list)  # loss weights in the place of each model's own
+    seeds: list[int] = Field(default_factory=lambda: [0])
+    effects: dict[str, dict[str, float]] = Field(default_factory=dict)
+    diagnosed_routes: int = 0  # that the diagnosis sees of each vehicle; 0: none is made
+    epochs: int = 100
+    patience: int = 5
+    stop_after: int = 15
+    page: Literal["table", "shares", "grid"] = "table"
+    paper: dict[str, dict[str, float]] = Field(default_factory=dict)
+    wanted: dict[str, float] = Field(default_factory=dict)
+    seed: int = 1
+
+
+def tasks(config: Config) -> Iterator[dict[str, Any]]:
+    """By fold and share of the data: vehicles one by one, then models by seed and weights."""
+    for fold in config.folds:
+        for share in config.shares:
+            data = {
+                "kind": config.data, "seed": config.seed, "routes": config.routes, "held": config.held_variants,
+                "share": share, "warmer_than": config.warmer_than_c, "fold": fold, "variants": config.variants,
+            }  # fmt: skip
+            if config.data == "ztbus":
+                try:
+                    data["files"] = fingerprint(bus_files(config.routes))
+                except MissingDataError:
+                    return
+            for name, model in config.models.items():
+                yield from _of_model(config, data, name, model)
+
+
+def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> Iterator[dict[str, Any]]:
+    task: dict[str, Any] = {"data": data, "name": name, "model": model.model_dump(exclude={"title"})}
+    if model.kind == "vehicles":
+        for vehicle in _vehicles(config):
+            yield {**task, "vehicle": vehicle, "diagnosed_routes": config.diagnosed_routes}
+        return
+    plan = {"epochs": config.epochs, "patience": config.patience, "stop_after": config.stop_after}
+    task |= {**plan, "effects": config.effects if model.effects else {}}
+    for seed in config.seeds:
+        for weights in (config.grid or [model.weights]) if model.kind == "network" else [[]]:
+            yield {**task, "seed": seed, "weights": list(weights)}
+
+
+def _vehicles(config: Config) -> list[int]:
+    if config.data == "ztbus":
+        return [0, 1]
+    from hdev_jax.fleet import VARIANTS
+
+    return list(range(len(VARIANTS) if config.variants == ["all"] else len(config.variants)))
+
+
+def together(task: dict[str, Any]) -> str | None:
+    """Networks that differ in seed and weights alone, ensembles apart."""
+    if task["model"]["kind"] != "network" or task["model"]["members"] > 1:
+        return None
+    return json.dumps({k: v for k, v in task.items() if k not in ("seed", "weights")}, sort_keys=True)
+
+
+def run(task: dict[str, Any]) -> dict[str, Any]:
+    """Scores on rows that nothing was chosen on."""
+    return run_together([task])[0]
+
+
+def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The same for several that may train side by side."""
+    task, d = tasks[0], tasks[0]["data"]
+    data = load(d["kind"], d["seed"], d["routes"], tuple(d["held"]), d["share"], d["warmer_than"], d["fold"],
+                tuple(d["variants"]))  # fmt: skip
+    if task["model"]["kind"] == "vehicles":
+        return [_by_vehicle(data, task)]
+    rows, use = data.rows(names_of(task["model"]["features"], data), tuple(task["effects"]))
+    if task["model"]["kind"] == "lightgbm":
+        return [{"lightgbm": scores(data, use, boosted(rows, use, t["seed"])), "counts": data.counts()} for t in tasks]
+    return _networks(data, rows, use, tasks)
+
+
+def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
+    """The table, the paper's regression, and the kernel with what the diagnosis found on the training routes."""
+    k = task["vehicle"]
+    if k >= len(data.vehicles):
+        return {}
+    m = data.vehicles[k]
+    one = np.ones(len(m.energy_wh))
+
+    def scored(car: Any) -> dict[str, Any]:
+        c = (car.effect("rolling").c_rr, car.effect("aero").cda_m2)
+        return scores(data, m.use, said(car, m), only=k, c_rr=float(c[0]) * one, cda_m2=float(c[1]) * one)
+
+    out: dict[str, Any] = {"vehicle": m.id, "tabular": scored(m.vehicle)}
+    if not np.any(m.use == 0):
+        return out
+    out["bayesian"] = scored(bayesian(m)[0])
+    if task["diagnosed_routes"]:
+        car, out["found"], out["coefficients"] = diagnosed(m, task["diagnosed_routes"], seed=0)
+        out["diagnosed"] = scores(data, m.use, said(car, m), only=k)
+    return out
+
+
+def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    spec = Model(**tasks[0]["model"])
+    recipe = Recipe(
+        features=names_of(spec.features, data), units=tuple(spec.units),
+        **{k: getattr(spec, k) for k in Recipe.__dataclass_fields__ if k not in ("features", "units")},
+    )  # fmt: skip
+    plan = Plan(tasks[0]["epochs"], spec.batch, 0.5, tasks[0]["patience"], stop_after=tasks[0]["stop_after"])
+    members = [(t["seed"] * 1000 + k, t["weights"]) for t in tasks for k in range(spec.members)]
+    ensemble = networks(
+        rows,
+        use,
+        recipe,
+        data,
+        members,
+        plan=plan,
+        rate=spec.rate,
+        decay=spec.decay,
+        effects=sized(tasks[0]["effects"]),
+    )
+    shown = np.isin(use, (2, 3))
+    picked, uses = rows.take(shown), use[shown]
+    every = ensemble.predict(picked)
+    out = []
+    for i, _ in enumerate(tasks):
+        own = every[i * spec.members : (i + 1) * spec.members]
+        out.append(_scored(data, use, shown, picked, uses, own, recipe))
+        ends = ensemble.trained.scores.reshape(len(members), -1)[i * spec.members]
+        out[-1] |= {"counts": data.counts(), "epochs": int(np.isfinite(ends).sum())}
+    return out
+
+
+def _scored(
+    data: Data, use: np.ndarray, shown: np.ndarray, picked: Any, uses: np.ndarray, own: Sequence[Any], recipe: Recipe
+) -> dict[str, Any]:
+    """Of an ensemble: its prediction, its physics alone; how near the bounds its coefficients are."""
+
+    def whole(x: np.ndarray) -> np.ndarray:
+        full = np.full(len(use), np.nan)
+        full[shown] = x
+        return full
+
+    mean = {k: np.mean([np.asarray(getattr(p, k), float) for p in own], axis=0)
+            for k in ("energy_wh", "physics_wh", "c_rr", "cda_m2")}  # fmt: skip
+    noise = np.mean([np.asarray(p.sd_wh, float) ** 2 for p in own], axis=0)
+    sd = np.sqrt(noise + np.var([p.energy_wh for p in own], axis=0))
+    out: dict[str, Any] = {}
+    both = {"c_rr": whole(mean["c_rr"]), "cda_m2": whole(mean["cda_m2"])}
+    out["network"] = scores(data, use, whole(mean["energy_wh"]), sd_wh=whole(sd), **both)
+    if recipe.coefficients != "table" or recipe.predicted != "alone":
+        base = energy(picked.car, picked.segments) if recipe.physics == "wheel" else None
+        physics = mean["physics_wh"] if base is None else _at_battery(picked, mean)
+        out["physics"] = scores(data, use, whole(physics), **both)
+    if recipe.coefficients == "bounded":
+        table = np.asarray(picked.cda_m2)
+        near = {"c_rr": mean["c_rr"] >= 0.99 * 0.02,
+                "cda_m2": np.abs(np.abs(mean["cda_m2"] / table - 1) - recipe.clamp) <= 0.01 * recipe.clamp}  # fmt: skip
+        out["at_bound"] = {k: float(np.mean(x[uses == 2])) for k, x in near.items()}
+    return out
+
+
+def _at_battery(rows: Any, mean: dict[str, np.ndarray]) -> np.ndarray:
+    """Battery energy with coefficients that were learned against the energy at the wheels."""
+    from hdev_jax.learn.pinn_rows import with_coefficients
+
+    car = with_coefficients(rows.car, np.asarray(mean["c_rr"], np.float32), np.asarray(mean["cda_m2"], np.float32))
+    return np.asarray(energy(car, rows.segments), float)
+
+
+def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:
+    """Tables and figures of the page that the config asks for."""
+    return {"table": pinn_pages.table, "shares": pinn_pages.shares, "grid": pinn_pages.grid}[config.page](
+        config, results, run
+    )

@@ -1,0 +1,125 @@
+"""What is compared on the same rows: tables, the paper's regression, trees, networks, the kernel with found effects."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.paper1_halves import fitted
+from experiments.pinn_data import Data, Member
+from hdev_jax.inference import padded, predict
+from hdev_jax.learn.pinn import Recipe, Sized
+from hdev_jax.learn.pinn_fit import Ensemble, fit
+from hdev_jax.learn.pinn_fit import Member as Seed
+from hdev_jax.learn.pinn_rows import FEATURES, Rows
+from hdev_jax.learn.train import Plan
+from hdev_jax.physics import LIBRARY, Vehicle
+
+__all__ = ["bayesian", "boosted", "diagnosed", "names_of", "networks", "said", "sized"]
+
+
+def names_of(features: str, data: Data) -> tuple[str, ...]:
+    """A set of `FEATURES`, without those whose channels this data lacks."""
+    have = data.vehicles[0].segments
+    needs = {
+        "wind_along": ("wind_speed_mps",), "wind_across": ("wind_speed_mps",), "wet": ("wet_road",),
+        "surface_1": ("road_surface",), "surface_2": ("road_surface",), "surface_3": ("road_surface",),
+        "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",),
+    }  # fmt: skip
+    return tuple(n for n in FEATURES[features] if have.has(*needs.get(n, ())))
+
+
+def sized(effects: Mapping[str, Mapping[str, float]]) -> tuple[Sized, ...]:
+    """Effects by id, with the shapes that they keep; every size is trained."""
+    out = []
+    for id, shapes in effects.items():
+        kind = LIBRARY[id]
+        groups = {"": 0, "road_surface": 4, "gear": 13}
+        sizes = tuple((p.name, groups[p.by]) for p in kind.parameters if p.kind == "size" and p.name not in shapes)
+        fixed = tuple((p.name, float(shapes.get(p.name, p.null))) for p in kind.parameters
+                      if p.name not in dict(sizes))  # fmt: skip
+        out.append(Sized(kind, sizes, fixed))
+    return tuple(out)
+
+
+def said(vehicle: Vehicle, m: Member) -> np.ndarray:
+    """Energy of every row of a vehicle by the kernel [Wh]."""
+    rows = padded(m.segments, m.energy_wh)
+    return np.asarray(predict(vehicle, rows.segments, "energy_wh"))[: rows.rows]
+
+
+def bayesian(m: Member) -> tuple[Vehicle, list[float]]:
+    """The paper's regression on the training rows: the vehicle and its coefficients."""
+    train = m.where(0)
+    one = fitted(m.vehicle, m.table, m.segments.take(train), m.energy_wh[train], "energy_wh", paper=True)
+    return m.table.insert(m.vehicle, one.values), [float(x) for x in one.values]
+
+
+def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
+    """The vehicle with the effects that the diagnosis finds on its first training routes, what these are, and what the
+    declared coefficients became. The whole loop, as `hdev diagnose` runs it."""
+    from hdev_jax.diagnosis.diagnose import diagnose
+    from hdev_jax.diagnosis.problem import prepare
+    from hdev_jax.diagnosis.split import split_trips
+    from hdev_jax.fleet import FleetConfig
+    from hdev_jax.fleet.sheets import write_sheet
+    from hdev_jax.inference.sheet import read_sheet
+    from hdev_jax.logs import read_log
+
+    known = np.unique(m.routes[m.where(0)])[: routes + 1]
+    at = np.flatnonzero(np.isin(m.routes, known))
+    with tempfile.TemporaryDirectory() as folder:
+        _write_log(m, at, Path(folder) / "log.parquet")
+        write_sheet(m.variant, FleetConfig(), Path(folder))
+        problem = prepare(read_log(Path(folder) / "log.parquet"), read_sheet(Path(folder) / f"{m.id}.toml"))
+        # one route more than is learnt from: the loop wants a test trip, and what it says of that is not used
+        split = split_trips(problem.log, None, [problem.log.trip_names[-1]])
+        done = diagnose(problem, split, LIBRARY, seed=seed)
+    found = {e["id"]: {k: p["value"] for k, p in e["parameters"].items()} for e in done.summary["effects"]}
+    values = {c.name: float(x) for c, x in zip(done.fit.table.free, done.fit.values, strict=True)}
+    return done.after, found, values
+
+
+def _write_log(m: Member, at: np.ndarray, path: Path) -> None:
+    import pandas as pd
+
+    s = m.segments.take(at)
+    columns: dict[str, Any] = {"trip_id": m.routes[at].astype(str), "vehicle_id": m.id}
+    for k in ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps"):
+        columns[k] = np.asarray(getattr(s, k))
+    columns |= {k: np.asarray(x) for k, x in s.channels.items()}
+    columns["energy_wh"] = m.energy_wh[at]
+    pd.DataFrame(columns).to_parquet(path)
+
+
+def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
+    """LightGBM on the same features, stopped by the validation rows: energy of every row [Wh]."""
+    import lightgbm as lgb
+
+    x, y = np.asarray(rows.features), np.asarray(rows.energy_wh, float)
+    train, held = lgb.Dataset(x[use == 0], y[use == 0]), lgb.Dataset(x[use == 1], y[use == 1])
+    settings = {"objective": "regression", "learning_rate": 0.05, "num_leaves": 63, "min_data_in_leaf": 20,
+                "verbosity": -1, "seed": seed, "deterministic": True, "force_row_wise": True}  # fmt: skip
+    stop = [lgb.early_stopping(50, verbose=False)]
+    model = lgb.train(settings, train, 2000, valid_sets=[held], callbacks=stop)
+    return np.asarray(model.predict(x))
+
+
+def networks(
+    rows: Rows, use: np.ndarray, recipe: Recipe, data: Data, members: Sequence[tuple[int, Sequence[float]]], *,
+    plan: Plan, rate: float, decay: float, effects: tuple[Sized, ...], checkpoint: Path | None = None,
+) -> Ensemble:  # fmt: skip
+    """Members by seed and weights, trained side by side on the training rows, kept at their best on the validation."""
+    from hdev_jax import progress
+
+    def tell(epoch: int, loss: float, score: float) -> None:
+        if epoch % 10 == 9:
+            progress.step(f"epoch {epoch + 1}: loss {loss:.4g}, validation {score:.4g}")
+
+    return fit(
+        recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate, decay=decay,
+        members=[Seed(s, tuple(float(x) for x in w)) for s, w in members], effects=effects, checkpoint=checkpoint,
+        tell=tell,
+    )  # fmt: skip
