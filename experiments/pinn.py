@@ -215,7 +215,7 @@ def _scored(
     noise = np.mean([np.asarray(p.sd_wh, float) ** 2 for p in own], axis=0)
     sd = np.sqrt(noise + np.var([p.energy_wh for p in own], axis=0))
     out: dict[str, Any] = {}
-    both = {"c_rr": whole(mean["c_rr"]), "cda_m2": whole(mean["cda_m2"])}
+    both: dict[str, Any] = {"c_rr": whole(mean["c_rr"]), "cda_m2": whole(mean["cda_m2"])}
     out["network"] = scores(data, use, whole(mean["energy_wh"]), sd_wh=whole(sd), **both)
     if recipe.coefficients != "table" or recipe.predicted != "alone":
         base = energy(picked.car, picked.segments) if recipe.physics == "wheel" else None

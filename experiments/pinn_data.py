@@ -96,7 +96,7 @@ def _fleet(
     for v in sorted(fleet.vehicles, key=lambda v: v.id in held):
         route = np.asarray(v.segments.trip) + first
         count = len(v.trip_names)
-        order = np.random.default_rng([seed, 7, v.segments.vehicle[0]]).permutation(count)
+        order = np.random.default_rng([seed, 7, int(v.segments.vehicle[0])]).permutation(count)
         place = np.empty(count)
         place[order] = (np.arange(count) + 0.5) / count
         by_route = np.where(place < SPLIT[0], 0, np.where(place < sum(SPLIT), 1, 2))

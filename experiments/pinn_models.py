@@ -114,12 +114,14 @@ def networks(
     """Members by seed and weights, trained side by side on the training rows, kept at their best on the validation."""
     from hdev_jax import progress
 
+    seeds = [Seed(s, (float(w[0]), float(w[1]), float(w[2]))) for s, w in members]
+
     def tell(epoch: int, loss: float, score: float) -> None:
         if epoch % 10 == 9:
             progress.step(f"epoch {epoch + 1}: loss {loss:.4g}, validation {score:.4g}")
 
     return fit(
         recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate, decay=decay,
-        members=[Seed(s, tuple(float(x) for x in w)) for s, w in members], effects=effects, checkpoint=checkpoint,
+        members=seeds, effects=effects, checkpoint=checkpoint,
         tell=tell,
     )  # fmt: skip

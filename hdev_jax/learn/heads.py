@@ -48,13 +48,13 @@ class Network(eqx.Module):
     ) -> tuple[Heads, eqx.nn.State]:
         """The heads of each row, and the running means after it; with a `key` as in training, without as in use."""
         for k, layer in enumerate(self.layers):
-            x = jax.nn.relu(x @ layer.weight.T + layer.bias)
+            x = jax.nn.relu(jax.vmap(layer)(x))
             if self.norms:
                 x, state = self._normalised(self.norms[k], x, state, training=key is not None)
             if key is not None and self.dropout > 0:
                 kept = jax.random.bernoulli(jax.random.fold_in(key, k), 1.0 - self.dropout, x.shape)
                 x = jnp.where(kept, x / (1.0 - self.dropout), 0.0)
-        out = x @ self.head.weight.T + self.head.bias
+        out = jax.vmap(self.head)(x)
         return Heads(out[:, 0], out[:, 1:]), state
 
     def _normalised(self, norm: eqx.nn.BatchNorm, x: Array, state: Any, *, training: bool) -> tuple[Array, Any]:

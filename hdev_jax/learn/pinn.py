@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hdev_jax.learn.heads import Heads, Network
 from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, coefficients_that_hold, energy, wheel_energy, with_coefficients
 from hdev_jax.physics import Effect, Grouped
+from hdev_jax.segments import Column, Ids
 
 __all__ = ["Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict"]
 
@@ -157,11 +158,12 @@ class Pinn(eqx.Module):
     ) -> tuple[Prediction, Heads, eqx.nn.State]:
         """What it says of each row; with a `key` as in training."""
         r = self.recipe
-        heads, memory = self.network(rows.features, memory, key=key)
+        features = jnp.asarray(rows.features)
+        heads, memory = self.network(features, memory, key=key)
         if self.coefficient_network is not None:
             at = jnp.array([i for i, n in enumerate(r.features) if n in PHYSICAL])
             other = None if key is None else jax.random.fold_in(key, 17)
-            said, memory = self.coefficient_network(rows.features[:, at], memory, key=other)
+            said, memory = self.coefficient_network(features[:, at], memory, key=other)
             heads = Heads(heads.energy, said.coefficients)
         c_rr, cda = self.coefficients(heads, rows)
         law = energy if r.physics == "battery" else wheel_energy
@@ -177,7 +179,7 @@ class Pinn(eqx.Module):
         return Prediction(base + residual, physics, residual, c_rr, cda, sd), heads, memory
 
 
-def _of(table: Array, vehicle: Array) -> Array:
+def _of(table: Array, vehicle: Ids) -> Array:
     """The vehicle's entry; zero for one that was not trained on."""
     zero = jnp.zeros((1, *table.shape[1:]), table.dtype)
     return jnp.concatenate([table, zero])[jnp.minimum(vehicle, table.shape[0])]
@@ -220,7 +222,7 @@ class Objective:
         return terms(model, p, heads, flat, data)[0]
 
     def _squares(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:
-        def mean(x: Array) -> Array:
+        def mean(x: Column) -> Array:
             return jnp.sum(rows.weight * x) / jnp.sum(rows.weight)
 
         unit = (rows.c_rr, rows.cda_m2) if model.recipe.coefficient_loss == "relative" else (1.0, 1.0)
@@ -246,9 +248,9 @@ class Objective:
         return data, physics, prior / self.rows + 0.01 * by_row
 
 
-def _normal(error: Array, sd: Array) -> Array:
+def _normal(error: Column, sd: Column) -> Array:
     """Minus the logarithm of the normal density, but for a constant."""
-    return 0.5 * (error / sd) ** 2 + jnp.log(sd)
+    return 0.5 * jnp.square(error / sd) + jnp.log(sd)
 
 
 def _flat(batch: Rows) -> Rows:
