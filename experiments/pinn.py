@@ -16,7 +16,7 @@ from experiments.config import Strict
 from experiments.data import MissingDataError, fingerprint
 from experiments.pinn_buses import bus_files
 from experiments.pinn_data import Data, load
-from experiments.pinn_models import bayesian, boosted, diagnosed, names_of, networks, said, sized
+from experiments.pinn_models import bayesian, boosted, diagnosed, kernel, names_of, networks, said, sized
 from experiments.pinn_scores import scores
 from hdev_jax.learn.pinn import Recipe
 from hdev_jax.learn.pinn_rows import energy
@@ -74,7 +74,8 @@ class Config(Strict):
     grid: list[list[float]] = Field(default_factory=list)  # loss weights in the place of each model's own
     seeds: list[int] = Field(default_factory=lambda: [0])
     effects: dict[str, dict[str, float]] = Field(default_factory=dict)
-    diagnosed_routes: int = 0  # that the diagnosis sees of each vehicle; 0: none is made
+    diagnosed: list[str] = Field(default_factory=list)  # vehicles that the whole diagnosis is made of, or "all"
+    diagnosed_routes: int = 12  # training routes that it sees of each
     epochs: int = 100
     patience: int = 5
     stop_after: int = 15
@@ -105,13 +106,23 @@ def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> 
     task: dict[str, Any] = {"data": data, "name": name, "model": model.model_dump(exclude={"title"})}
     if model.kind == "vehicles":
         for vehicle in _vehicles(config):
-            yield {**task, "vehicle": vehicle, "diagnosed_routes": config.diagnosed_routes}
+            known = config.diagnosed == ["all"] or (config.data == "fleet" and _id(config, vehicle) in config.diagnosed)
+            yield {**task, "vehicle": vehicle, "effects": config.effects if model.effects else {},
+                   "diagnosed_routes": config.diagnosed_routes if known else 0}  # fmt: skip
         return
     plan = {"epochs": config.epochs, "patience": config.patience, "stop_after": config.stop_after}
     task |= {**plan, "effects": config.effects if model.effects else {}}
     for seed in config.seeds:
         for weights in (config.grid or [model.weights]) if model.kind == "network" else [[]]:
             yield {**task, "seed": seed, "weights": list(weights)}
+
+
+def _id(config: Config, vehicle: int) -> str:
+    """The id of a vehicle by its place, those that are held out last."""
+    from hdev_jax.fleet import VARIANTS
+
+    ids = [v.id for v in VARIANTS if config.variants == ["all"] or v.id in config.variants]
+    return sorted(ids, key=lambda i: i in config.held_variants)[vehicle]
 
 
 def _vehicles(config: Config) -> list[int]:
@@ -163,6 +174,8 @@ def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
     if not np.any(m.use == 0):
         return out
     out["bayesian"] = scored(bayesian(m)[0])
+    if task["effects"]:
+        out["kernel"] = scores(data, m.use, said(kernel(m, task["effects"]), m), only=k)
     if task["diagnosed_routes"]:
         car, out["found"], out["coefficients"] = diagnosed(m, task["diagnosed_routes"], seed=0)
         out["diagnosed"] = scores(data, m.use, said(car, m), only=k)

@@ -3,13 +3,15 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper1_halves import coefficient, paper_table
+from experiments.paper1_halves import AUXILIARY_SD_W, coefficient, fitted, paper_table
 from experiments.pinn_buses import BUSES, buses
 from hdev_jax.fleet import simulate
 from hdev_jax.inference import ParameterTable
@@ -55,14 +57,34 @@ class Data:
     synthetic: bool
 
     def rows(self, features: Sequence[str], effects: Sequence[str] = ()) -> tuple[Rows, np.ndarray]:
-        """Rows of all vehicles as networks read them, and the use of each."""
+        """Rows of all vehicles as networks read them, and the use of each.
+
+        Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`).
+        """
         made = [at_null(LIBRARY[e]) for e in effects]
         parts = []
-        for k, m in enumerate(self.vehicles):
+        for k, (m, car) in enumerate(zip(self.vehicles, self._calibrated, strict=True)):
             number = min(k, self.trained)
             s = dataclasses.replace(m.segments, trip=m.routes)
-            parts.append(rows_of(m.vehicle, s, m.energy_wh, number=number, features=features, effects=made))
+            one = rows_of(m.vehicle, s, m.energy_wh, number=number, features=features, effects=made, calibrated=car)
+            parts.append(one)
         return concatenated(parts), self.column("use")
+
+    @cached_property
+    def _calibrated(self) -> list[Vehicle]:
+        """Each vehicle with c_rr, C_d·A and auxiliary load by closed form from its training rows; one without any has
+        the median ratios of the others to their tables."""
+        fits = [calibrated(m) if np.any(m.use == 0) else None for m in self.vehicles]
+        ratio = np.median([f for f in fits if f is not None], axis=0)
+        out = []
+        for m, f in zip(self.vehicles, fits, strict=True):
+            c_rr, cda, load = ratio if f is None else f
+            table = (m.vehicle.effect("rolling").c_rr, m.vehicle.effect("aero").cda_m2)
+            out.append(eqx.tree_at(
+                lambda c: (c.effect("rolling").c_rr, c.effect("aero").cda_m2, c.effect("auxiliary").auxiliary_w),
+                m.vehicle, (table[0] * c_rr, table[1] * cda, jnp.asarray(float(load))),
+            ))  # fmt: skip
+        return out
 
     def column(self, name: str) -> np.ndarray:
         """A column of all vehicles, one after the other."""
@@ -73,6 +95,19 @@ class Data:
         use = self.column("use")
         names = ("training", "validation", "test", "unseen", "unused")
         return {n: int(np.sum(use == k)) for k, n in enumerate(names)}
+
+
+def calibrated(m: Member) -> np.ndarray:
+    """c_rr and C_d·A over their tables, and the auxiliary load [W], by the closed form on the training rows."""
+    train = m.where(0)
+    load = float(m.vehicle.effect("auxiliary").auxiliary_w)
+    table = m.table if "battery.auxiliary_w" in [c.path for c in m.table.free] else m.table.plus(
+        coefficient("battery.auxiliary_w", "W", load, AUXILIARY_SD_W, positive=False)
+    )  # fmt: skip
+    one = fitted(m.vehicle, table, m.segments.take(train), m.energy_wh[train], "energy_wh", paper=True)
+    values = dict(zip([c.path for c in table.free], np.asarray(one.values), strict=True))
+    c_rr, cda = float(m.vehicle.effect("rolling").c_rr), float(m.vehicle.effect("aero").cda_m2)
+    return np.array([values["road.c_rr"] / c_rr, values["road.cda_m2"] / cda, values["battery.auxiliary_w"]])
 
 
 @cache

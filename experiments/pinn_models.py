@@ -5,19 +5,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 
 from experiments.paper1_halves import fitted
 from experiments.pinn_data import Data, Member
-from hdev_jax.inference import padded, predict
+from hdev_jax.inference import effect_coefficients, padded, predict
 from hdev_jax.learn.pinn import Recipe, Sized
 from hdev_jax.learn.pinn_fit import Ensemble, fit
 from hdev_jax.learn.pinn_fit import Member as Seed
 from hdev_jax.learn.pinn_rows import FEATURES, Rows
 from hdev_jax.learn.train import Plan
-from hdev_jax.physics import LIBRARY, Vehicle
+from hdev_jax.physics import LIBRARY, Vehicle, at_null
 
-__all__ = ["bayesian", "boosted", "diagnosed", "names_of", "networks", "said", "sized"]
+__all__ = ["bayesian", "boosted", "diagnosed", "kernel", "names_of", "networks", "said", "sized"]
 
 
 def names_of(features: str, data: Data) -> tuple[str, ...]:
@@ -57,9 +58,24 @@ def bayesian(m: Member) -> tuple[Vehicle, list[float]]:
     return m.table.insert(m.vehicle, one.values), [float(x) for x in one.values]
 
 
+def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Vehicle:
+    """The whole kernel, efficiency map included, with these effects, by the closed form on the training rows."""
+    car, table = m.vehicle, m.table
+    for s in sized(effects):
+        e = at_null(s.kind, gears=3 if any(n for _, n in s.sizes) else 1)
+        for name, value in s.fixed:
+            e = eqx.tree_at(lambda e, name=name: getattr(e, name), e, np.asarray(value))
+        car = car.plus(e)
+        table = table.plus(*effect_coefficients(e, [n for n, _ in s.sizes], shapes=False, groups=("1", "2", "3")))
+    train = m.where(0)
+    one = fitted(car, table, m.segments.take(train), m.energy_wh[train], "energy_wh", paper=True)
+    return table.insert(car, one.values)
+
+
 def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
     """The vehicle with the effects that the diagnosis finds on its first training routes, what these are, and what the
     declared coefficients became. The whole loop, as `hdev diagnose` runs it."""
+    from hdev_jax import progress
     from hdev_jax.diagnosis.diagnose import diagnose
     from hdev_jax.diagnosis.problem import prepare
     from hdev_jax.diagnosis.split import split_trips
@@ -76,7 +92,7 @@ def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dic
         problem = prepare(read_log(Path(folder) / "log.parquet"), read_sheet(Path(folder) / f"{m.id}.toml"))
         # one route more than is learnt from: the loop wants a test trip, and what it says of that is not used
         split = split_trips(problem.log, None, [problem.log.trip_names[-1]])
-        done = diagnose(problem, split, LIBRARY, seed=seed)
+        done = diagnose(problem, split, LIBRARY, seed=seed, tell=progress.step)
     found = {e["id"]: {k: p["value"] for k, p in e["parameters"].items()} for e in done.summary["effects"]}
     values = {c.name: float(x) for c, x in zip(done.fit.table.free, done.fit.values, strict=True)}
     return done.after, found, values

@@ -16,7 +16,7 @@ __all__ = ["grid", "shares", "table"]
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 MODELS = ("A", "B", "C", "D")
 WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
-        "diagnosed": "physics, diagnosed effects"}  # fmt: skip
+        "kernel": "physics, effects by closed form", "diagnosed": "physics, as diagnosed"}  # fmt: skip
 PAPER_MODEL = "paper"  # the network as printed, and ours, among the models of a config
 OURS = "ours"
 

@@ -1,8 +1,8 @@
 """Rows as a physics-informed network reads them: features, and for each row the declared vehicle that it is of.
 
 Rows of different vehicles stand in one array: every coefficient of the declared vehicle is a column, and so are the
-ratio and the efficiency of its driveline. The efficiency is the sheet's, at the row's gear and at the motor's speed and
-torque by the sheet's own force (paper 1: from calibration maps by gear and torque).
+ratio and the efficiency of its driveline. The efficiency is that of the sheet's map, at the row's gear and at the
+motor's speed and torque by the vehicle's force (paper 1: from calibration maps by gear and torque).
 """
 
 from collections.abc import Mapping, Sequence
@@ -131,11 +131,13 @@ def rows_of(
     number: int,
     features: Sequence[str] = _UNITLESS,
     effects: Sequence[Effect] = (),
+    calibrated: Vehicle | None = None,
 ) -> Rows:
     """The rows of one declared vehicle.
 
     **Arguments:** `vehicle`, as its sheet declares it, entered at the road; `number`, its place among the vehicles;
-    `features`, names of `FEATURES`; `effects`, those whose channels are to be worked out by trip.
+    `features`, names of `FEATURES`; `effects`, those whose channels are to be worked out by trip; `calibrated`, the
+    vehicle at whose force the efficiency is read and whose energy is a feature, in the place of the declared one.
 
     **Raises:** `InputError` for a vehicle that is not entered at the road or lacks rolling or aero, for an unknown
     feature and for a channel that a feature needs and the log lacks.
@@ -144,7 +146,9 @@ def rows_of(
         raise InputError("the network's physics: a vehicle with rolling and aero, entered at the road, is expected")
     n = len(segments)
     padding = np.minimum(np.arange(-(-n // _PADDED) * _PADDED), n - 1)  # logs of about one length share a program
-    s, sheet = jax.tree.map(lambda x: np.asarray(x)[:n], _sheet(vehicle, segments.take(padding), tuple(effects)))
+    s, sheet = jax.tree.map(
+        lambda x: np.asarray(x)[:n], _sheet(calibrated or vehicle, segments.take(padding), tuple(effects))
+    )
     columns = [_feature(name, s, vehicle, sheet) for name in features]
     # a gear ratio of 1, so that ratio and efficiency are the row's own
     line = Driveline(
@@ -176,8 +180,8 @@ def concatenated(parts: Sequence[Rows]) -> Rows:
 
 @eqx.filter_jit
 def _sheet(vehicle: Vehicle, segments: Segments, effects: tuple[Effect, ...]) -> tuple[Segments, dict[str, Array]]:
-    """The rows with what is worked out by trip, and what the sheet alone says of each: energy, ratio and efficiency of
-    the driveline."""
+    """The rows with what is worked out by trip, and what the vehicle says of each: energy, ratio and efficiency of the
+    driveline."""
     if not segments.has(DISTANCE_SINCE_START):
         segments = segments.with_channels(**{DISTANCE_SINCE_START: distance_since_start(segments)})
     for e in effects:

@@ -130,7 +130,7 @@ def train(
     if members:
         epoch = jax.vmap(epoch, in_axes=(0, 0, 0, None, None))
         start = jax.vmap(start)
-    step: Callable[..., Any] = eqx.filter_jit(epoch)
+    step: Any = eqx.filter_jit(epoch)
     state = start(weights, memory)
     if checkpoint is not None and checkpoint.exists():
         state = eqx.tree_deserialise_leaves(checkpoint, state)
