@@ -43,9 +43,9 @@ _PADDED = 4096
 _PRINTED = ("speed_mps", "mass_kg", "grade_rad")
 _CHANNELS = (*_PRINTED, "accel_mps2", "c_rr_table", "cda_table")
 _UNITLESS = (
-    "acceleration", "slope", "froude", "kinetic", "c_rr_table", "drag_over_weight", "specific_energy", "duration",
-    "mass_of_sheet", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3", "warmth",
-    "cornering", "efficiency", "halt",
+    "acceleration", "slope", "froude", "pace", "kinetic", "c_rr_table", "drag_over_weight", "specific_energy",
+    "duration", "length", "elapsed", "mass_of_sheet", "temperature", "wind_along", "wind_across", "wet", "surface_1",
+    "surface_2", "surface_3", "warmth", "cornering", "efficiency", "halt",
 )  # fmt: skip
 FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS}
 # Those that a coefficient may depend on: not the power that is asked for, nor how steep it is.
@@ -233,6 +233,12 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
             return np.sin(channel("grade_rad"))
         case _ if name == "froude":
             return square / unit
+        case _ if name == "pace":
+            return np.square(np.asarray(s.speed_mps)) / unit
+        case _ if name == "length":
+            return np.asarray(s.distance_m) / _REFERENCE_M
+        case _ if name == "elapsed":
+            return np.asarray(s.time_s) * np.sqrt(GRAVITY_MPS2 / _REFERENCE_M) / 1e3
         case _ if name == "kinetic":
             return (np.asarray(s.speed_end_mps) ** 2 - np.asarray(s.speed_start_mps) ** 2) / (2.0 * unit)
         case _ if name == "drag_over_weight":
