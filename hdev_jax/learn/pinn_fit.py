@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from hdev_jax.learn.pinn import Objective, Pinn, Prediction, Recipe, Sized, predict
+from hdev_jax.errors import InputError
+from hdev_jax.learn.pinn import C_RR_LIMIT, Objective, Pinn, Prediction, Recipe, Sized, predict
 from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
@@ -109,8 +110,17 @@ def fit(
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
     **Arguments:** `vehicles`, how many there are in `rows`; `decay`, of the weights (AdamW). All members train in one
-    program. **Raises:** `NotFiniteError` where a single member's loss is not finite.
+    program. **Raises:** `NotFiniteError` where a single member's loss is not finite; `InputError` where there are no
+    rows, or where a table's c_rr is not within the bounds that the recipe keeps it in.
     """
+    if not len(rows) or not len(held):
+        raise InputError(f"{len(rows)} rows to train on and {len(held)} held out; some of both are needed")
+    tables = np.concatenate([np.asarray(r.c_rr) for r in (rows, held)])
+    if recipe.coefficients == "bounded" and not np.all((tables > 0) & (tables < C_RR_LIMIT)):
+        raise InputError(
+            f"bounded coefficients: a table's c_rr is {tables[np.argmax(np.abs(tables - C_RR_LIMIT / 2))]:.4g}, and has "
+            f"to be between 0 and {C_RR_LIMIT}; take free ones"
+        )
     scale = Scale.of(np.asarray(rows.features, float))
     data = stretches(_scaled(rows, scale), recipe.stretch)
     check = stretches(_scaled(held, scale), recipe.stretch)

@@ -25,14 +25,14 @@ __all__ = ["NotFiniteError", "Objective", "Plan", "Trained", "train"]
 
 
 class NotFiniteError(InputError):
-    """A loss or a slope that is NaN or infinite, with the batch that it came from: `epoch`, `step`, `rows` of the data."""
+    """A loss or its slope is NaN or infinite; the batch that it came from: `epoch`, `step` and `rows` of the data."""
 
     def __init__(self, epoch: int, step: int, rows: np.ndarray):
         self.epoch, self.step, self.rows = epoch, step, rows
         few = ", ".join(map(str, rows[:8])) + (", …" if len(rows) > 8 else "")
         super().__init__(
-            f"training: the loss or its slope is not finite in epoch {epoch}, batch {step} (entries {few} of the data); "
-            "look for a bad row there, or lower the rate"
+            f"training: the loss or its slope is not finite in epoch {epoch}, batch {step} (entries {few} of the "
+            "data); look for a bad row there, or lower the rate"
         )
 
 
