@@ -64,7 +64,7 @@ def marched(plan: Plan, best: float | None = None, held: Any = 0, **kwargs: Any)
     return train(March(best), jnp.zeros(()), None, data, optax.sgd(1.0), plan, key=KEY, held=held, **kwargs)
 
 
-class Killed(Exception):
+class KilledError(Exception):
     pass
 
 
@@ -78,10 +78,10 @@ def test_a_run_that_is_resumed_gives_the_same_numbers_to_the_last_bit(tmp_path):
     def kill(epoch, loss, score):
         told.append(epoch)
         if epoch == 7:
-            raise Killed
+            raise KilledError
 
     whole = make()
-    with pytest.raises(Killed):
+    with pytest.raises(KilledError):
         make(checkpoint=tmp_path / "run.eqx", every=3, tell=kill)
     again = make(checkpoint=tmp_path / "run.eqx", every=3, tell=lambda epoch, *_: told.append(epoch))
     assert told == [*range(8), *range(6, 12)]  # it did go on, from the sixth epoch
@@ -102,10 +102,12 @@ def test_a_loss_that_is_not_finite_names_epoch_batch_and_rows():
     with pytest.raises(NotFiniteError) as e:
         train(Line(bad=bad, after=after), *start(), rows(), optax.sgd(0.01), Plan(epochs=5, batch=8), key=KEY)
     found = e.value
-    assert bad in found.rows and len(found.rows) == 8
+    assert bad in found.rows
+    assert len(found.rows) == 8
     seen = found.epoch * 5 + found.step  # five batches an epoch, each with every entry once
     assert after <= seen < after + 10
-    assert f"epoch {found.epoch}, batch {found.step}" in str(found) and "\n" not in str(found)
+    assert f"epoch {found.epoch}, batch {found.step}" in str(found)
+    assert "\n" not in str(found)
 
 
 def test_a_slope_that_is_not_finite_names_the_batch_that_it_came_from():
@@ -119,7 +121,8 @@ def test_a_slope_that_is_not_finite_names_the_batch_that_it_came_from():
     data["x"] = data["x"].at[21].set(0.0)
     with pytest.raises(NotFiniteError) as e:
         train(Root(), jnp.ones(3, jnp.float32), None, data, optax.sgd(1e-3), Plan(epochs=2, batch=8), key=KEY)
-    assert e.value.epoch == 0 and 21 in e.value.rows
+    assert e.value.epoch == 0
+    assert 21 in e.value.rows
 
 
 def test_scores_that_are_never_finite_are_an_error_not_an_untrained_model():
@@ -152,10 +155,13 @@ def test_training_stops_and_the_best_epoch_is_kept():
     one = marched(plan, best=6.0, tell=lambda *x: told.append(x))
     assert one.epochs == 6 + 4 == len(told)  # best after the sixth
     assert float(one.weights) == 6.0
-    assert np.isfinite(one.losses[:10]).all() and np.isnan(one.losses[10:]).all() and np.isnan(one.scores[10:]).all()
+    assert np.isfinite(one.losses[:10]).all()
+    assert np.isnan(one.losses[10:]).all()
+    assert np.isnan(one.scores[10:]).all()
     assert told[5] == (5, -5.0, 0.0)
     last = marched(plan, held=None, tell=lambda *x: told.append(x))  # no score to tell of
-    assert last.epochs == 20 and float(last.weights) == 20.0
+    assert last.epochs == 20
+    assert float(last.weights) == 20.0
     assert np.isnan(told[-1][2])
 
 
@@ -202,8 +208,10 @@ def test_an_entry_is_seen_at_most_once_an_epoch_and_who_waits_changes():
 
     memory = (jnp.zeros((), jnp.int32), jnp.zeros((12, 40), jnp.int32))
     seen = np.asarray(train(Seen(), start()[0], memory, rows(), optax.sgd(0.1), Plan(12, 9), key=KEY).memory[1])
-    assert seen.max() == 1 and np.all(seen.sum(axis=1) == 36)  # four wait in every epoch
-    assert np.all(seen.sum(axis=0) >= 8) and len({tuple(row) for row in seen}) == 12
+    assert seen.max() == 1
+    assert np.all(seen.sum(axis=1) == 36)
+    assert np.all(seen.sum(axis=0) >= 8)
+    assert len({tuple(row) for row in seen}) == 12
 
 
 def test_least_squares_end_at_the_normal_equations():
