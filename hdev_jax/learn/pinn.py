@@ -138,7 +138,7 @@ class Pinn(eqx.Module):
             start = jnp.log(rows.c_rr / (C_RR_LIMIT - rows.c_rr))
             c_rr = C_RR_LIMIT * jax.nn.sigmoid(said[:, 0] + start)
             return c_rr, rows.cda_m2 * jnp.clip(1.0 + said[:, 1], 1.0 - r.clamp, 1.0 + r.clamp)
-        log = self.common + _BY_ROW * said
+        log = self.common[None] + _BY_ROW * said
         if r.by_vehicle:
             log = log + _of(self.own, rows.vehicle)
         return rows.c_rr * jnp.exp(log[:, 0]), rows.cda_m2 * jnp.exp(log[:, 1])
