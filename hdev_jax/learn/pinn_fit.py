@@ -116,10 +116,11 @@ def fit(
     if not len(rows) or not len(held):
         raise InputError(f"{len(rows)} rows to train on and {len(held)} held out; some of both are needed")
     tables = np.concatenate([np.asarray(r.c_rr) for r in (rows, held)])
-    if recipe.coefficients == "bounded" and not np.all((tables > 0) & (tables < C_RR_LIMIT)):
+    outside = tables[~((tables > 0) & (tables < C_RR_LIMIT))]
+    if recipe.coefficients == "bounded" and len(outside):
         raise InputError(
-            f"bounded coefficients: a table's c_rr is {tables[np.argmax(np.abs(tables - C_RR_LIMIT / 2))]:.4g}, and has "
-            f"to be between 0 and {C_RR_LIMIT}; take free ones"
+            f"bounded coefficients: a table's c_rr is {outside[0]:.4g}, between 0 and {C_RR_LIMIT} is expected; "
+            "take free ones"
         )
     scale = Scale.of(np.asarray(rows.features, float))
     data = stretches(_scaled(rows, scale), recipe.stretch)

@@ -1,4 +1,4 @@
-"""Rows of a physics-informed network: the sheet's physics row by row, features without units, coefficients that hold."""
+"""Rows of a physics-informed network: the sheet's physics by row, features without units, coefficients that hold."""
 
 import dataclasses
 
