@@ -128,7 +128,7 @@ class Pinn(eqx.Module):
 
     # --- what holds in a row -----------------------------------------------------------------------------------------
 
-    def coefficients(self, heads: Heads, rows: Rows) -> tuple[Array, Array]:
+    def coefficients(self, heads: Heads, rows: Rows) -> tuple[Column, Column]:
         """c_rr and C_d·A [m²] of each row."""
         r, said = self.recipe, heads.coefficients
         if r.coefficients == "table":

@@ -155,7 +155,7 @@ def train(
     return Trained(*kept, np.asarray(state.losses), np.asarray(state.scores), done)
 
 
-def _resumed(checkpoint: Path, state: _State) -> _State:
+def _resumed(checkpoint: Path, state: Any) -> Any:
     try:
         return eqx.tree_deserialise_leaves(checkpoint, state)
     except (RuntimeError, ValueError, EOFError, OSError) as e:

@@ -81,7 +81,7 @@ def test_concatenated_keeps_the_order_and_the_channels_that_all_have(fleet, of_f
 
 
 def test_coefficients_that_hold_are_those_of_the_truth(fleet):
-    """Of the vehicle that was driven, with all its effects; on wet road the fleet counts spray as air, this as rolling."""
+    """Of the vehicle that was driven, with all its effects; on wet road the fleet counts spray as air."""
     v = fleet.vehicles[0]
     assert all(row_wise(e) for e in v.true.effects)
     rows = rows_of(v.true, v.segments, v.energy_wh, number=0, effects=v.true.effects)
@@ -94,13 +94,10 @@ def test_coefficients_that_hold_are_those_of_the_truth(fleet):
     np.testing.assert_allclose(np.asarray(c_rr)[dry], v.truth["c_rr"][dry], rtol=1e-4)
     np.testing.assert_allclose(np.asarray(cda)[dry], v.truth["cda_m2"][dry], rtol=1e-4)
     # what they do together is the same everywhere
-    force = lambda r, a: (
-        r * np.asarray(s.channels["mass_kg"]) * 9.80665 * np.cos(s.channels["grade_rad"])
-        + (  # noqa: E731
-            0.5 * 1.225 * a * square
-        )
-    )
-    np.testing.assert_allclose(force(c_rr, cda)[moving], force(v.truth["c_rr"], v.truth["cda_m2"])[moving], rtol=1e-4)
+    weight = np.asarray(s.channels["mass_kg"]) * 9.80665 * np.cos(s.channels["grade_rad"])
+    together = np.asarray(c_rr) * weight + 0.5 * 1.225 * np.asarray(cda) * square
+    expected = v.truth["c_rr"] * weight + 0.5 * 1.225 * v.truth["cda_m2"] * square
+    np.testing.assert_allclose(together[moving], expected[moving], rtol=1e-4)
     close(energy(rows.car, rows.segments), v.truth["energy_true_wh"], 2e-5)
 
 
