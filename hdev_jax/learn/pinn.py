@@ -128,20 +128,21 @@ class Pinn(eqx.Module):
 
     # --- what holds in a row -----------------------------------------------------------------------------------------
 
-    def coefficients(self, heads: Heads, rows: Rows) -> tuple[Column, Column]:
+    def coefficients(self, heads: Heads, rows: Rows) -> tuple[Array, Array]:
         """c_rr and C_d·A [m²] of each row."""
         r, said = self.recipe, heads.coefficients
+        table_c_rr, table_cda = jnp.asarray(rows.c_rr), jnp.asarray(rows.cda_m2)
         if r.coefficients == "table":
-            return rows.c_rr, rows.cda_m2
+            return table_c_rr, table_cda
         if r.coefficients == "bounded":
             # begins at the table, as the drag area does
-            start = jnp.log(rows.c_rr / (C_RR_LIMIT - rows.c_rr))
+            start = jnp.log(table_c_rr / (C_RR_LIMIT - table_c_rr))
             c_rr = C_RR_LIMIT * jax.nn.sigmoid(said[:, 0] + start)
-            return c_rr, rows.cda_m2 * jnp.clip(1.0 + said[:, 1], 1.0 - r.clamp, 1.0 + r.clamp)
+            return c_rr, table_cda * jnp.clip(1.0 + said[:, 1], 1.0 - r.clamp, 1.0 + r.clamp)
         log = self.common[None] + _BY_ROW * said
         if r.by_vehicle:
             log = log + _of(self.own, rows.vehicle)
-        return rows.c_rr * jnp.exp(log[:, 0]), rows.cda_m2 * jnp.exp(log[:, 1])
+        return table_c_rr * jnp.exp(log[:, 0]), table_cda * jnp.exp(log[:, 1])
 
     def effects_of(self, rows: Rows) -> tuple[Effect, ...]:
         """The effects with the sizes that hold in each row."""

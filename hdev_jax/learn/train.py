@@ -151,8 +151,8 @@ def train(
                 eqx.tree_serialise_leaves(file, state)
     if held is not None and not np.isfinite(np.asarray(state.score)).any():
         raise InputError("training: no epoch has a finite score; look for a bad row in what is held out")
-    kept = state.best if held is not None else (state.weights, state.memory)
-    return Trained(*kept, np.asarray(state.losses), np.asarray(state.scores), done)
+    kept, remembered = state.best if held is not None else (state.weights, state.memory)
+    return Trained(kept, remembered, np.asarray(state.losses), np.asarray(state.scores), done)
 
 
 def _resumed(checkpoint: Path, state: Any) -> Any:
