@@ -240,6 +240,7 @@ def test_planted_coefficients_of_each_vehicle_are_found():
     assert np.std(error / p.sd_wh) == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.slow
 def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
     one = recipe(units=(8,), normalised=True, dropout=0.3)
     held = rows.take(np.arange(0, 80, 4))
