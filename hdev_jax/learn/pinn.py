@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads, Network
 from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, coefficients_that_hold, energy, wheel_energy, with_coefficients
 from hdev_jax.physics import Effect, Grouped
 from hdev_jax.segments import Column, Ids
 
-__all__ = ["Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict"]
+__all__ = ["C_RR_LIMIT", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict"]
 
 C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
 _LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
@@ -85,6 +86,8 @@ class Pinn(eqx.Module):
     `sizes` and `own_sizes` are the effects' sizes in units of their usual scale.
 
     `scale_wh` is the unit of the energy head.
+
+    **Raises:** `InputError` where coefficients shall depend on `physical` features and there is none.
     """
 
     network: Network
@@ -109,6 +112,8 @@ class Pinn(eqx.Module):
         self.network = make(len(recipe.features), recipe.units, first)
         physical = [n for n in recipe.features if n in PHYSICAL]
         apart = recipe.coefficient_inputs == "physical" and recipe.coefficients == "free"
+        if apart and not physical:
+            raise InputError(f"coefficient_inputs physical: none of the features is one of {', '.join(PHYSICAL)}")
         self.coefficient_network = make(len(physical), (32, 32), second) if apart else None
         self.common = jnp.zeros(2, jnp.float32)
         self.own = jnp.zeros((vehicles, 2), jnp.float32)
@@ -126,17 +131,18 @@ class Pinn(eqx.Module):
     def coefficients(self, heads: Heads, rows: Rows) -> tuple[Array, Array]:
         """c_rr and C_d·A [m²] of each row."""
         r, said = self.recipe, heads.coefficients
+        table_c_rr, table_cda = jnp.asarray(rows.c_rr), jnp.asarray(rows.cda_m2)
         if r.coefficients == "table":
-            return rows.c_rr, rows.cda_m2
+            return table_c_rr, table_cda
         if r.coefficients == "bounded":
             # begins at the table, as the drag area does
-            start = jnp.log(rows.c_rr / (C_RR_LIMIT - rows.c_rr))
+            start = jnp.log(table_c_rr / (C_RR_LIMIT - table_c_rr))
             c_rr = C_RR_LIMIT * jax.nn.sigmoid(said[:, 0] + start)
-            return c_rr, rows.cda_m2 * jnp.clip(1.0 + said[:, 1], 1.0 - r.clamp, 1.0 + r.clamp)
-        log = self.common + _BY_ROW * said
+            return c_rr, table_cda * jnp.clip(1.0 + said[:, 1], 1.0 - r.clamp, 1.0 + r.clamp)
+        log = self.common[None] + _BY_ROW * said
         if r.by_vehicle:
             log = log + _of(self.own, rows.vehicle)
-        return rows.c_rr * jnp.exp(log[:, 0]), rows.cda_m2 * jnp.exp(log[:, 1])
+        return table_c_rr * jnp.exp(log[:, 0]), table_cda * jnp.exp(log[:, 1])
 
     def effects_of(self, rows: Rows) -> tuple[Effect, ...]:
         """The effects with the sizes that hold in each row."""

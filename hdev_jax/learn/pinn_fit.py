@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from hdev_jax.learn.pinn import Objective, Pinn, Prediction, Recipe, Sized, predict
+from hdev_jax.errors import InputError
+from hdev_jax.learn.pinn import C_RR_LIMIT, Objective, Pinn, Prediction, Recipe, Sized, predict
 from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
@@ -109,8 +110,18 @@ def fit(
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
     **Arguments:** `vehicles`, how many there are in `rows`; `decay`, of the weights (AdamW). All members train in one
-    program. **Raises:** `NotFiniteError` where a single member's loss is not finite.
+    program. **Raises:** `NotFiniteError` where a single member's loss is not finite; `InputError` where there are no
+    rows, or where a table's c_rr is not within the bounds that the recipe keeps it in.
     """
+    if not len(rows) or not len(held):
+        raise InputError(f"{len(rows)} rows to train on and {len(held)} held out; some of both are needed")
+    tables = np.concatenate([np.asarray(r.c_rr) for r in (rows, held)])
+    outside = tables[~((tables > 0) & (tables < C_RR_LIMIT))]
+    if recipe.coefficients == "bounded" and len(outside):
+        raise InputError(
+            f"bounded coefficients: a table's c_rr is {outside[0]:.4g}, between 0 and {C_RR_LIMIT} is expected; "
+            "take free ones"
+        )
     scale = Scale.of(np.asarray(rows.features, float))
     data = stretches(_scaled(rows, scale), recipe.stretch)
     check = stretches(_scaled(held, scale), recipe.stretch)

@@ -75,12 +75,12 @@ class Rows(eqx.Module):
         return jax.tree.map(lambda x: x[at], self)
 
     @property
-    def c_rr(self) -> Float[Array, " row"]:
+    def c_rr(self) -> Column:
         """The table's rolling resistance coefficient."""
         return self.car.effect("rolling").c_rr
 
     @property
-    def cda_m2(self) -> Float[Array, " row"]:
+    def cda_m2(self) -> Column:
         """The table's drag area [m²]."""
         return self.car.effect("aero").cda_m2
 
@@ -139,11 +139,13 @@ def rows_of(
     `features`, names of `FEATURES`; `effects`, those whose channels are to be worked out by trip; `calibrated`, the
     vehicle at whose force the efficiency is read and whose energy is a feature, in the place of the declared one.
 
-    **Raises:** `InputError` for a vehicle that is not entered at the road or lacks rolling or aero, for an unknown
-    feature and for a channel that a feature needs and the log lacks.
+    **Raises:** `InputError` for a vehicle that is not entered at the road or lacks rolling or aero, for an effect that
+    acts across rows, for an unknown feature and for a channel that a feature needs and the log lacks.
     """
     if vehicle.entry != "road" or not (vehicle.has("rolling") and vehicle.has("aero")):
         raise InputError("the network's physics: a vehicle with rolling and aero, entered at the road, is expected")
+    if whole := [e.id for e in (*vehicle.effects, *effects) if not row_wise(e)]:
+        raise InputError(f"the network's physics: {whole[0]} acts across rows, which are shuffled; leave it out")
     n = len(segments)
     padding = np.minimum(np.arange(-(-n // _PADDED) * _PADDED), n - 1)  # logs of about one length share a program
     s, sheet = jax.tree.map(
@@ -154,7 +156,7 @@ def rows_of(
     line = Driveline(
         sheet["efficiency"], None, sheet["ratio"] * WHEEL_RADIUS_M, np.full(n, WHEEL_RADIUS_M), covers_machine=True
     )
-    wide = lambda x: np.full(n, float(x)) if np.ndim(x) == 0 else np.asarray(x)  # noqa: E731
+    wide = lambda x: np.broadcast_to(np.asarray(x, float), (n, *np.shape(x)))  # noqa: E731
     plain = Vehicle(
         vehicle.effects, mass_kg=vehicle.mass_kg, driveline=Driveline(1.0), machine=vehicle.machine, entry="road"
     )
@@ -199,8 +201,10 @@ def _sheet(vehicle: Vehicle, segments: Segments, effects: tuple[Effect, ...]) ->
 
 def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.ndarray]) -> np.ndarray:
     """A column of `FEATURES`. Every one of `_UNITLESS` is a ratio of two quantities of the same kind."""
+    if name not in (known := tuple(dict.fromkeys(n for f in FEATURES.values() for n in f))):
+        raise InputError(f"no feature {name!r}; they are {', '.join(known)}")
     one = np.ones(len(s))
-    mass = np.asarray(s.get("mass_kg", vehicle.mass_kg)) * one
+    mass = np.asarray(s.get("mass_kg", float(vehicle.mass_kg))) * one
     square = np.asarray(mean_square_speed(s))
     weight = mass * GRAVITY_MPS2
     unit = GRAVITY_MPS2 * _REFERENCE_M
@@ -266,6 +270,4 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
             return sheet["efficiency"]
         case _ if name == "halt":
             return (np.asarray(s.distance_m) == 0) * one
-    raise InputError(
-        f"no feature {name!r}; they are {', '.join(dict.fromkeys(n for f in FEATURES.values() for n in f))}"
-    )
+    raise AssertionError(name)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import atomic_file
@@ -25,14 +25,14 @@ __all__ = ["NotFiniteError", "Objective", "Plan", "Trained", "train"]
 
 
 class NotFiniteError(InputError):
-    """A loss that is NaN or infinite, with the batch that it came from: `epoch`, `step` and `rows` of the data."""
+    """A loss or its slope is NaN or infinite; the batch that it came from: `epoch`, `step` and `rows` of the data."""
 
     def __init__(self, epoch: int, step: int, rows: np.ndarray):
         self.epoch, self.step, self.rows = epoch, step, rows
         few = ", ".join(map(str, rows[:8])) + (", …" if len(rows) > 8 else "")
         super().__init__(
-            f"training: the loss is not finite in epoch {epoch}, batch {step} (entries {few} of the data); "
-            "look for a bad row there, or lower the rate"
+            f"training: the loss or its slope is not finite in epoch {epoch}, batch {step} (entries {few} of the "
+            "data); look for a bad row there, or lower the rate"
         )
 
 
@@ -105,7 +105,7 @@ def train(
     optimiser: optax.GradientTransformation,
     plan: Plan,
     *,
-    key: PRNGKeyArray,
+    key: PRNGKeyArray | Key[Array, " member"],
     held: Any = None,
     settings: Any = None,
     members: bool = False,
@@ -121,7 +121,7 @@ def train(
     on from it, to the same numbers. `tell(epoch, loss, score)` after each epoch.
 
     **Raises:** `NotFiniteError` with the batch; of several members, one whose loss is not finite stops, and keeps
-    what it had.
+    what it had. `InputError` where `held` never had a finite score, and for a checkpoint of another training.
     """
     entries = jax.tree.leaves(data)[0].shape[0]
     batch = min(plan.batch, entries)
@@ -133,7 +133,7 @@ def train(
     step: Any = eqx.filter_jit(epoch)
     state = start(weights, memory)
     if checkpoint is not None and checkpoint.exists():
-        state = eqx.tree_deserialise_leaves(checkpoint, state)
+        state = _resumed(checkpoint, state)
     done = int(np.max(np.asarray(state.epoch)))
     while done < plan.epochs and not bool(np.all(np.asarray(state.stopped))):
         state, losses = step(state, key, settings, data, held)
@@ -143,13 +143,32 @@ def train(
             rows = np.asarray(_shuffled(key, done, entries, batch))[at]
             raise NotFiniteError(done, at, rows)
         if tell is not None:
-            tell(done, float(np.nanmean(losses)), float(np.nanmin(np.asarray(state.scores)[..., done])))
+            scores = np.asarray(state.scores)[..., done]
+            tell(done, _finite(np.mean, losses), _finite(np.min, scores))
         done += 1
         if checkpoint is not None and (done % every == 0 or done == plan.epochs):
             with atomic_file(checkpoint) as file:
                 eqx.tree_serialise_leaves(file, state)
-    kept = state.best if held is not None else (state.weights, state.memory)
-    return Trained(*kept, np.asarray(state.losses), np.asarray(state.scores), done)
+    if held is not None and not np.isfinite(np.asarray(state.score)).any():
+        raise InputError("training: no epoch has a finite score; look for a bad row in what is held out")
+    kept, remembered = state.best if held is not None else (state.weights, state.memory)
+    return Trained(kept, remembered, np.asarray(state.losses), np.asarray(state.scores), done)
+
+
+def _resumed(checkpoint: Path, state: Any) -> Any:
+    try:
+        return eqx.tree_deserialise_leaves(checkpoint, state)
+    except (RuntimeError, ValueError, EOFError, OSError) as e:
+        why = str(e).strip().partition("\n")[0]
+        raise InputError(
+            f"{checkpoint}: not a checkpoint of this training ({why}); delete it, or train as it was begun"
+        ) from e
+
+
+def _finite(of: Callable[[np.ndarray], Any], x: np.ndarray) -> float:
+    """Mean or least of what is finite, of members that go on; NaN where nothing is."""
+    x = x[np.isfinite(x)]
+    return float(of(x)) if x.size else float("nan")
 
 
 def _start(optimiser: optax.GradientTransformation, plan: Plan, weights: Any, memory: Any) -> _State:
@@ -189,6 +208,9 @@ def _epoch(
         rows, draw = now
         part = jax.tree.map(lambda x: x[rows], data)
         (loss, memory), slope = jax.value_and_grad(objective.loss, has_aux=True)(weights, memory, part, draw, settings)
+        # a slope can be NaN where the loss is not (√ at 0); the next batch would be blamed, or the last one nobody
+        sound = jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(slope)])
+        loss = jnp.where(jnp.all(sound), loss, jnp.nan)
         update, inner = optimiser.update(slope, inner, weights)
         update = jax.tree.map(lambda u: u * state.factor.astype(u.dtype), update)
         return (optax.apply_updates(weights, update), memory, inner), loss

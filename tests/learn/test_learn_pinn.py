@@ -1,0 +1,283 @@
+"""The physics-informed network: equation 7 and the likelihood by hand, bounds, vehicles, what is planted is found."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.flatten_util import ravel_pytree
+from learn_trucks import FEATURES, TABLE, energy_by_hand, road, truck_rows
+from scipy.special import expit, logit
+from scipy.stats import norm
+
+from hdev_jax.errors import InputError
+from hdev_jax.learn.heads import Heads
+from hdev_jax.learn.pinn import Objective, Pinn, Recipe, Sized, predict
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, fit, stretches
+from hdev_jax.learn.pinn_rows import concatenated
+from hdev_jax.learn.train import Plan
+from hdev_jax.physics import LIBRARY
+
+PLAIN = Recipe(FEATURES, units=(6,), normalised=False, dropout=0.0)
+AUXILIARY = Sized(LIBRARY["auxiliary_power"], (("power_w", 0),))
+KEY = jax.random.key(0)
+
+
+def recipe(**changes: Any) -> Recipe:
+    return dataclasses.replace(PLAIN, **changes)
+
+
+def made(recipe: Recipe, vehicles: int = 2, seed: int | None = 5, effects: tuple[Sized, ...] = ()) -> tuple[Any, Any]:
+    """A model and its memory; with a seed, with random weights in its heads and in what vehicles have of their own."""
+    model, memory = eqx.nn.make_with_state(Pinn)(recipe, vehicles, scale_wh=50.0, effects=effects, key=KEY)
+    if seed is None:
+        return model, memory
+    rng = np.random.default_rng(seed)
+    where = lambda m: (m.network.head, m.common, m.own, m.sizes, m.own_sizes)  # noqa: E731
+    random = lambda x: jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32)  # noqa: E731
+    return eqx.tree_at(where, model, jax.tree.map(random, where(model))), memory
+
+
+def two_trucks(rows: int = 40) -> Any:
+    """Rows of two trucks with tables of their own, and energies that are not quite the table's."""
+    parts = []
+    for k, c_rr in enumerate((0.006, 0.009)):
+        s = road(rows, 2, seed=k)
+        s = dataclasses.replace(s, trip=np.asarray(s.trip) + 2 * k)
+        table = {**TABLE, "c_rr": 1.2 * c_rr, "auxiliary_w": 3000.0}
+        parts.append(truck_rows(s, energy_by_hand(s, table), number=k, c_rr=c_rr))
+    return concatenated(parts)
+
+
+ROWS = None
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return two_trucks()
+
+
+def said(model: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The plain network's two heads in NumPy."""
+    n = model.network
+    w, b, v, c = (np.asarray(x, float) for x in (n.layers[0].weight, n.layers[0].bias, n.head.weight, n.head.bias))
+    out = np.maximum(np.asarray(rows.features, float) @ w.T + b, 0) @ v.T + c
+    return out[:, 0], out[:, 1:]
+
+
+def by_hand(rows: Any, c_rr: Any, cda: Any, *, wheel: bool = False) -> np.ndarray:
+    return energy_by_hand(jax.tree.map(np.asarray, rows.segments), {**TABLE, "c_rr": c_rr, "cda_m2": cda}, wheel=wheel)
+
+
+@pytest.mark.parametrize("coefficients", ["bounded", "free"])
+def test_an_untrained_model_says_what_the_sheet_says(rows, coefficients):
+    model, memory = made(recipe(coefficients=coefficients, normalised=True, dropout=0.1), seed=None)
+    p = predict(model, memory, rows)
+    expected = by_hand(rows, rows.c_rr, rows.cda_m2)
+    np.testing.assert_allclose(p.energy_wh, expected, rtol=1e-5, atol=2e-3)
+    np.testing.assert_array_equal(p.energy_wh, p.physics_wh)
+    np.testing.assert_allclose(p.c_rr, rows.c_rr, rtol=1e-5)
+    np.testing.assert_allclose(p.cda_m2, rows.cda_m2, rtol=1e-6)
+    np.testing.assert_array_equal(p.residual_wh, 0)
+
+
+@settings(max_examples=100)
+@given(
+    st.floats(allow_nan=False, allow_infinity=False, width=32),
+    st.floats(allow_nan=False, allow_infinity=False, width=32),
+    st.floats(0.05, 0.9),
+)
+def test_the_bounds_are_never_left(first, second, clamp):
+    rows = _two_rows()
+    model, _ = made(recipe(clamp=clamp), seed=None)
+    heads = Heads(jnp.zeros(2, jnp.float32), jnp.array([[first, second], [second, first]], jnp.float32))
+    c_rr, cda = (np.asarray(x, float) for x in model.coefficients(heads, rows))
+    assert np.all((c_rr >= 0) & (c_rr <= 0.02 * (1 + 1e-6)))
+    assert np.all(np.abs(cda / rows.cda_m2 - 1) <= clamp * (1 + 1e-5))
+
+
+def _two_rows() -> Any:
+    global ROWS
+    ROWS = two_trucks().take(np.array([0, 60])) if ROWS is None else ROWS
+    return ROWS
+
+
+@pytest.mark.parametrize(
+    ("predicted", "physics", "coefficient_loss"),
+    [("residual", "battery", "relative"), ("alone", "wheel", "absolute"), ("table", "wheel", "relative")],
+)
+def test_equation_7_by_hand(rows, predicted, physics, coefficient_loss):
+    model, memory = made(recipe(predicted=predicted, physics=physics, coefficient_loss=coefficient_loss))
+    weight = np.where(np.arange(len(rows)) % 5 == 0, 0, 1).astype(np.float32)
+    rows = eqx.tree_at(lambda r: r.weight, rows, weight)
+    static = eqx.partition(model, eqx.is_inexact_array)
+    objective = Objective(static[1], len(rows))
+    loss = lambda *w: objective.loss(  # noqa: E731
+        static[0], memory, stretches(rows, 1), KEY, jnp.asarray(w, jnp.float32)
+    )[0]
+    energy, coefficients = said(model, rows)
+    c_rr = 0.02 * expit(logit(np.asarray(rows.c_rr, float) / 0.02) + coefficients[:, 0])
+    cda = rows.cda_m2 * np.clip(1 + coefficients[:, 1], 0.5, 1.5)
+    law = by_hand(rows, c_rr, cda, wheel=physics == "wheel")
+    base = {"residual": law, "alone": 0 * law, "table": by_hand(rows, rows.c_rr, rows.cda_m2)}[predicted]
+    kept = weight > 0
+    unit = (rows.c_rr, rows.cda_m2) if coefficient_loss == "relative" else (1.0, 1.0)
+    mean = lambda x: np.mean(np.square(x)[kept])  # noqa: E731
+    terms = (
+        mean(rows.energy_wh - base - 50.0 * energy), mean(rows.energy_wh - law),
+        mean((c_rr - rows.c_rr) / unit[0]) + mean((cda - rows.cda_m2) / unit[1]),
+    )  # fmt: skip
+    assert min(terms) > 1e-9
+    for weights in ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), PAPER_WEIGHTS):
+        np.testing.assert_allclose(loss(*weights), np.dot(weights, terms), rtol=2e-4)
+    np.testing.assert_allclose(objective.score(static[0], memory, stretches(rows, 1), None), terms[0], rtol=1e-4)
+
+
+def test_the_likelihood_and_its_stretches_by_hand(rows):
+    """Rows, sums of stretches of one trip each, priors; what only fills a stretch moves neither value nor slope."""
+    model, memory = made(
+        recipe(coefficients="free", by_vehicle=True, loss="likelihood", stretch=7), effects=(AUXILIARY,)
+    )
+    weights, static = eqx.partition(model, eqx.is_inexact_array)
+    objective = Objective(static, 1000)
+    batch = stretches(rows, 7)
+    for trip in batch.segments.trip:
+        assert len(set(trip)) == 1
+    assert batch.weight.shape == (12, 7)  # three of seven rows in each of four trips of twenty
+    assert batch.weight.sum() == len(rows)
+    lam = (1.0, 0.3, 0.5)
+    value = eqx.filter_jit(
+        jax.value_and_grad(lambda w, b: objective.loss(w, memory, b, KEY, jnp.asarray(lam, jnp.float32))[0])
+    )
+    found, slope = value(weights, batch)
+
+    energy, coefficients = said(model, rows)
+    log = np.asarray(model.common) + np.asarray(model.own)[rows.vehicle] + 0.5 * coefficients
+    watts = 1000.0 * np.asarray(model.sizes["auxiliary_power.power_w"] + model.own_sizes["auxiliary_power.power_w"])
+    law = by_hand(rows, rows.c_rr * np.exp(log[:, 0]), rows.cda_m2 * np.exp(log[:, 1]))
+    law = law + watts[rows.vehicle] * rows.segments.duration_s / 3600
+    floor, share = np.exp(np.asarray(model.noise[::2], float)) * 50.0, np.exp(np.asarray(model.noise[1::2], float))
+    sd, loose = (np.sqrt(a**2 + (b * law) ** 2) for a, b in zip(floor, share, strict=True))
+    error, off = rows.energy_wh - law - 50.0 * energy, rows.energy_wh - law
+    minus = lambda x, s: -norm.logpdf(x, scale=s) - 0.5 * np.log(2 * np.pi)  # noqa: E731
+    data = minus(error, sd).sum()
+    for trip in range(4):
+        at = np.flatnonzero(np.asarray(rows.segments.trip) == trip)
+        for first in range(0, len(at), 7):
+            part = at[first : first + 7]
+            off_by = np.exp(float(model.drift)) * law[part].sum()
+            data += minus(error[part].sum(), np.sqrt((sd[part] ** 2).sum() + off_by**2))
+    square = lambda x: float(np.sum(np.square(x)))  # noqa: E731
+    sizes = square(model.sizes["auxiliary_power.power_w"]) + square(model.own_sizes["auxiliary_power.power_w"])
+    prior = 0.5 * (square(model.own) + square(model.common)) / 0.3**2 + 0.5 * sizes
+    terms = (data / 80, minus(off, loose).sum() / 80, prior / 1000 + 0.01 * square(coefficients) / 80)
+    np.testing.assert_allclose(found, np.dot(lam, terms), rtol=1e-4)
+
+    fills = batch.weight == 0
+    spoilt = eqx.tree_at(
+        lambda r: (r.energy_wh, r.features), batch,
+        (np.where(fills, np.float32(1e4), batch.energy_wh), np.where(fills[..., None], np.float32(9), batch.features)),
+    )  # fmt: skip
+    again, other = value(weights, spoilt)
+    np.testing.assert_allclose(again, found, rtol=1e-6)
+    np.testing.assert_allclose(ravel_pytree(other)[0], ravel_pytree(slope)[0], rtol=1e-4, atol=1e-6)
+
+
+def test_a_vehicle_that_was_not_trained_on_has_what_the_fleet_has_in_common(rows):
+    model, memory = made(
+        recipe(coefficients="free", coefficient_inputs="physical", by_vehicle=True), effects=(AUXILIARY,)
+    )
+    for number in (0, 1, 2):
+        some = eqx.tree_at(lambda r: r.vehicle, rows, np.full(len(rows), number, np.int32))
+        own = np.zeros(2) if number == 2 else np.asarray(model.own[number])
+        heads = Heads(jnp.zeros(len(rows), jnp.float32), jnp.zeros((len(rows), 2), jnp.float32))
+        c_rr, cda = model.coefficients(heads, some)
+        factor = np.exp(np.asarray(model.common) + own)
+        np.testing.assert_allclose(c_rr, rows.c_rr * factor[0], rtol=1e-5)
+        np.testing.assert_allclose(cda, rows.cda_m2 * factor[1], rtol=1e-5)
+        size = model.sizes["auxiliary_power.power_w"]
+        size = size if number == 2 else size + model.own_sizes["auxiliary_power.power_w"][number]
+        np.testing.assert_allclose(model.effects_of(some)[0].power_w, 1000.0 * float(size) * np.ones(80), rtol=1e-5)
+    # and its coefficients do not depend on the power that is asked for
+    steeper = np.array(rows.features)
+    steeper[:, FEATURES.index("slope")] += 1.0
+    model = eqx.tree_at(lambda m: m.coefficient_network.head.weight, model, jnp.ones((3, 32), jnp.float32))
+    one, other = (model(eqx.tree_at(lambda r: r.features, rows, x), memory)[0] for x in (rows.features, steeper))
+    np.testing.assert_array_equal(one.c_rr, other.c_rr)
+    assert np.ptp(one.c_rr / rows.c_rr) > 1e-3
+    assert np.abs(one.residual_wh - other.residual_wh).max() > 0.1
+
+
+def test_planted_coefficients_of_each_vehicle_are_found():
+    planted = ((0.0072, 5.2, 1500.0), (0.0050, 7.1, 3000.0))
+    rng, parts = np.random.default_rng(1), []
+    for k, (c_rr, cda, watts) in enumerate(planted):
+        s = road(480, 12, seed=10 + k)
+        s = dataclasses.replace(s, trip=np.asarray(s.trip) + 12 * k)
+        y = energy_by_hand(s, {**TABLE, "c_rr": c_rr, "cda_m2": cda, "auxiliary_w": 2000.0 + watts})
+        parts.append(truck_rows(s, y + rng.normal(0, 1.0 + 0.01 * np.abs(y)), number=k))
+    rows = concatenated(parts)
+    held = np.asarray(rows.segments.trip) % 6 == 5
+    made = fit(
+        recipe(coefficients="free", by_vehicle=True, loss="likelihood", energy_head=False, stretch=4),
+        rows.take(~held), rows.take(held), vehicles=2, members=[Member(0, (1.0, 0.1, 1.0))],
+        plan=Plan(epochs=60, batch=160, patience=5), rate=0.03, effects=(AUXILIARY,),
+    )  # fmt: skip
+    (p,) = made.predict(rows)
+    sizes = made.model.sizes["auxiliary_power.power_w"] + made.model.own_sizes["auxiliary_power.power_w"][0]
+    for k, (c_rr, cda, watts) in enumerate(planted):
+        of = (np.asarray(rows.vehicle) == k) & (np.asarray(rows.segments.distance_m) > 0)
+        assert np.median(p.c_rr[of]) == pytest.approx(c_rr, rel=0.03)
+        assert np.median(p.cda_m2[of]) == pytest.approx(cda, rel=0.03)
+        assert 1000.0 * float(sizes[k]) == pytest.approx(watts, rel=0.1)
+    # and the noise that was added
+    error = rows.energy_wh - p.energy_wh
+    assert np.std(error / p.sd_wh) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.slow
+def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
+    one = recipe(units=(8,), normalised=True, dropout=0.3)
+    held = rows.take(np.arange(0, 80, 4))
+    made = fit(
+        one, rows, held, vehicles=2, members=[Member(0), Member(1, (1.0, 0.0, 0.0))], plan=Plan(epochs=3, batch=16)
+    )
+    first, second = made.predict(rows)
+    assert np.abs(first.residual_wh - second.residual_wh).max() > 1e-2
+    # the network in NumPy, with the means that ran
+    model = jax.tree.map(lambda x: x[1] if eqx.is_array(x) else x, made.model)
+    memory = jax.tree.map(lambda x: x[1], made.memory)
+    x = made.scale.apply(rows.features)
+    for layer, normal in zip(model.network.layers, model.network.norms, strict=True):
+        mean, var, scale, shift, w, b = (
+            np.asarray(z, float)
+            for z in (*memory.get(normal.ema_state_index), normal.weight, normal.bias, layer.weight, layer.bias)
+        )
+        x = (np.maximum(x @ w.T + b, 0) - mean) / np.sqrt(var + normal.eps) * scale + shift
+    out = x @ np.asarray(model.network.head.weight, float).T + np.asarray(model.network.head.bias, float)
+    np.testing.assert_allclose(second.residual_wh, model.scale_wh * out[:, 0], rtol=1e-3, atol=1e-3)
+    # whatever stands beside it
+    some = np.array([70, 3, 3])
+    for all_of, few in zip((first, second), made.predict(rows.take(some)), strict=True):
+        np.testing.assert_allclose(few.energy_wh, all_of.energy_wh[some], rtol=1e-6)
+        np.testing.assert_allclose(few.c_rr, all_of.c_rr[some], rtol=1e-6)
+    np.testing.assert_allclose(made.mean(rows).energy_wh, (first.energy_wh + second.energy_wh) / 2, rtol=1e-5)
+
+
+def test_what_cannot_be_built_is_said_in_one_line(rows):
+    start = {"vehicles": 2, "members": [Member(0, PAPER_WEIGHTS)], "plan": Plan(epochs=1)}
+    much = eqx.tree_at(lambda r: r.car.effect("rolling").c_rr, rows, np.full(len(rows), 0.021, np.float32))
+    cases = (
+        (PLAIN, much, "c_rr is 0.021"),
+        (PLAIN, rows.take(np.arange(0)), "0 rows"),
+        (recipe(features=("slope",), coefficients="free", coefficient_inputs="physical"), rows, "physical"),
+    )
+    for wrong, data, words in cases:
+        with pytest.raises(InputError, match=words) as e:
+            fit(wrong, data, rows, **start)
+        assert "\n" not in str(e.value)
