@@ -143,7 +143,8 @@ def train(
             rows = np.asarray(_shuffled(key, done, entries, batch))[at]
             raise NotFiniteError(done, at, rows)
         if tell is not None:
-            tell(done, float(np.nanmean(losses)), float(np.nanmin(np.asarray(state.scores)[..., done])))
+            scores = np.asarray(state.scores)[..., done]
+            tell(done, float(np.nanmean(losses)), float(np.fmin.reduce(scores, axis=None)))  # NaN where all are
         done += 1
         if checkpoint is not None and (done % every == 0 or done == plan.epochs):
             with atomic_file(checkpoint) as file:
