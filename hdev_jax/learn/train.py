@@ -134,7 +134,8 @@ def train(
     step: Callable[..., Any] = eqx.filter_jit(epoch)
     state = start(weights, memory)
     if checkpoint is not None and checkpoint.exists():
-        state = eqx.tree_deserialise_leaves(checkpoint, state)
+        with checkpoint.open("rb") as file:  # of a path Equinox would add an ending to a name that has none
+            state = eqx.tree_deserialise_leaves(file, state)
     done = int(np.max(np.asarray(state.epoch)))
     while done < plan.epochs and not bool(np.all(np.asarray(state.stopped))):
         state, losses = step(state, key, settings, data, held)
