@@ -12,7 +12,7 @@ normalisation is its own, by the batch; ours normalises by running means, for ab
 a jitted step that Python calls for every batch. An epoch of each side by turns, so that what else the machine does
 falls on all; printed are medians, best times and ratios of medians. `cpu` is by seconds of the processor, which other
 work moves little: on one core (`taskset -c 0`) it is the fairest of them. Compiling is timed apart.
-*Inference*: one row, called from Python, and 550,000. *Members*: seeds in one program on 20,000 rows, against one alone.
+*Inference*: one row, called from Python, and 550,000. *Members*: seeds in one program on 20,000 rows, against one.
 
 Rows are of the synthetic fleet, repeated up to the number wanted.
 """

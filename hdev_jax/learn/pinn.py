@@ -198,7 +198,7 @@ def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
 
 
 def ready(model: Pinn, memory: eqx.nn.State) -> Callable[[Rows], Prediction]:
-    """`predict` with the model's numbers compiled in: for a row at a time, where handing these over takes the longest."""
+    """`predict` with the model's numbers compiled in: for a row at a time, where handing these over takes longest."""
     return jax.jit(lambda rows: predict(model, memory, rows))
 
 

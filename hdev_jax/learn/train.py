@@ -118,8 +118,9 @@ def train(
     **Arguments:** `data` and `held`, pytrees of arrays with one leading axis; `settings`, numbers for the objective
     (loss weights); with `members`, `weights`, `memory`, `key` and `settings` have a leading axis of members, the data
     are the same for all. They take turns by epochs, `jax.lax.map`: on a CPU that is faster than `jax.vmap`, whose
-    batched products of small matrices are slow and fill the caches (16 of 256-128 units: 1.2 times). `checkpoint`, a file that is written every so many epochs; where it is there, training goes
-    on from it, to the same numbers. `tell(epoch, loss, score)` after each epoch.
+    batched products of small matrices are slow and fill the caches (16 of 256-128 units: 1.2 times). `checkpoint`, a
+    file that is written every so many epochs; where it is there, training goes on from it, to the same numbers.
+    `tell(epoch, loss, score)` after each epoch.
 
     **Raises:** `NotFiniteError` with the batch; of several members, one whose loss is not finite stops, and keeps
     what it had.
@@ -167,7 +168,7 @@ def _start(optimiser: optax.GradientTransformation, plan: Plan, weights: Any, me
 def _shuffled(key: PRNGKeyArray, epoch: Any, entries: int, batch: int) -> Array:
     """Entries of each batch of an epoch [step, batch]."""
     steps = entries // batch
-    # one sort, where `jax.random.permutation` makes two: of n words only n²/2³³ pairs are alike, and these stay in order
+    # one sort, where `jax.random.permutation` makes two: of n words only n²/2³³ pairs are alike, and stay in order
     words = jax.random.bits(jax.random.fold_in(jax.random.fold_in(key, epoch), 0), (entries,), jnp.uint32)
     _, order = jax.lax.sort((words, jax.lax.iota(jnp.int32, entries)), num_keys=1)
     return order[: steps * batch].reshape(steps, batch)
