@@ -150,7 +150,7 @@ def train(
             tell(done, float(np.nanmean(losses)), float(np.fmin.reduce(scores, axis=None)))  # NaN where all are
         done += 1
         if checkpoint is not None and (done % every == 0 or done == plan.epochs):
-            with atomic_file(checkpoint) as file:
+            with atomic_file(checkpoint) as path, path.open("wb") as file:
                 eqx.tree_serialise_leaves(file, state)
     kept = state.best if held is not None else (state.weights, state.memory)
     return Trained(*kept, np.asarray(state.losses), np.asarray(state.scores), done)
