@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 __all__ = ["Heads", "Network"]
 
@@ -52,7 +52,7 @@ class Network(eqx.Module):
             if self.norms:
                 x, state = self._normalised(self.norms[k], x, state, training=key is not None)
             if key is not None and self.dropout > 0:
-                kept = jax.random.bernoulli(jax.random.fold_in(key, k), 1.0 - self.dropout, x.shape)
+                kept = _kept(jax.random.fold_in(key, k), 1.0 - self.dropout, x.shape)
                 x = jnp.where(kept, x / (1.0 - self.dropout), 0.0)
         out = jax.vmap(self.head)(x)
         return Heads(out[:, 0], out[:, 1:]), state
@@ -60,3 +60,11 @@ class Network(eqx.Module):
     def _normalised(self, norm: eqx.nn.BatchNorm, x: Array, state: Any, *, training: bool) -> tuple[Array, Any]:
         one = lambda row, s: norm(row, s, inference=not training)  # noqa: E731
         return jax.vmap(one, in_axes=(0, None), out_axes=(0, None), axis_name="batch")(x, state)
+
+
+def _kept(key: PRNGKeyArray, share: float, shape: tuple[int, int]) -> Bool[Array, "row unit"]:
+    """Which units stay: so large a share, to 2⁻¹⁷. Of one random word 16 bits are for a unit and 16 for another, since
+    drawing uniform numbers takes as long as the network."""
+    words = jax.random.bits(key, (shape[0], -(-shape[1] // 2)), jnp.uint32)
+    halves = jnp.concatenate([words & 0xFFFF, words >> 16], axis=1)[:, : shape[1]]
+    return halves < round(share * 2**16)

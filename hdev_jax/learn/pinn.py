@@ -5,6 +5,7 @@ cannot saturate, by vehicle and by what a coefficient may depend on; a likelihoo
 place of squares weighed by hand; a term for the sum over a stretch of a trip; effects of the library as physics.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -19,7 +20,7 @@ from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, coefficients_that_hold, ene
 from hdev_jax.physics import Effect, Grouped
 from hdev_jax.segments import Column, Ids
 
-__all__ = ["C_RR_LIMIT", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict"]
+__all__ = ["C_RR_LIMIT", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
 
 C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
 _LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
@@ -200,6 +201,11 @@ def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
         return p
     car = with_coefficients(rows.car, p.c_rr, p.cda_m2, *model.effects_of(rows))
     return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, coefficients_that_hold(car, rows.segments))
+
+
+def ready(model: Pinn, memory: eqx.nn.State) -> Callable[[Rows], Prediction]:
+    """`predict` with the model's numbers compiled in: for a row at a time, where handing these over takes longest."""
+    return jax.jit(lambda rows: predict(model, memory, rows))
 
 
 @dataclass(frozen=True)
