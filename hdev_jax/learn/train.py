@@ -241,7 +241,7 @@ def _epoch(
 
 
 def _in_turn(
-    epoch: Callable[..., Any], state: _State, key: PRNGKeyArray, settings: Any, data: Any, held: Any
+    epoch: Callable[..., Any], state: _State, key: Any, settings: Any, data: Any, held: Any
 ) -> tuple[_State, Float[Array, "member step"]]:
     """An epoch of every member, one after the other."""
     return jax.lax.map(lambda own: epoch(*own, data, held), (state, key, settings))
