@@ -36,7 +36,7 @@ class Network(eqx.Module):
             eqx.nn.Linear(a, b, dtype=jnp.float32, key=k) for a, b, k in zip(sizes[:-1], units, keys, strict=True)
         )
         self.norms = tuple(
-            eqx.nn.BatchNorm(n, axis_name="batch", mode="ema", momentum=0.99, dtype=jnp.float32)
+            eqx.nn.BatchNorm(n, axis_name="batch", mode="batch", momentum=0.9, dtype=jnp.float32)
             for n in (units if normalised else ())
         )
         head = eqx.nn.Linear(sizes[-1], 3, dtype=jnp.float32, key=key)
