@@ -18,12 +18,14 @@ from experiments.pinn_buses import bus_files
 from experiments.pinn_data import Data, load
 from experiments.pinn_models import bayesian, boosted, diagnosed, kernel, names_of, networks, said, sized
 from experiments.pinn_scores import scores
+from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn import Recipe
 from hdev_jax.learn.pinn_rows import energy
 from hdev_jax.learn.train import Plan
+from hdev_jax.physics import LIBRARY
 from hdev_jax.rundir import Run
 
-__all__ = ["SOURCES", "Config", "Model", "collect", "run", "run_together", "tasks", "together"]
+__all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = ("pinn.py", "pinn_data.py", "pinn_models.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py")
 PAPER = (1.0, 0.1, 0.01)
@@ -34,7 +36,7 @@ class Model(Strict):
     is that of `hdev_jax.learn.pinn.Recipe`."""
 
     kind: Literal["vehicles", "lightgbm", "network"] = "network"
-    title: str = ""
+    like: str = ""  # another model of the config, of which this one is a delta
     features: Literal["printed", "channels", "unitless"] = "channels"
     units: list[int] = Field(default_factory=lambda: [256, 128])
     normalised: bool = True
@@ -71,7 +73,8 @@ class Config(Strict):
     folds: list[int] = Field(default_factory=lambda: [0])
     shares: list[float] = Field(default_factory=lambda: [1.0])
     models: dict[str, Model]
-    grid: list[list[float]] = Field(default_factory=list)  # loss weights in the place of each model's own
+    only: list[str] = Field(default_factory=list)  # of the models; none: all
+    grid_values: list[list[float]] = Field(default_factory=list)  # of λ₁, λ₂, λ₃: every pair, the third as printed
     seeds: list[int] = Field(default_factory=lambda: [0])
     effects: dict[str, dict[str, float]] = Field(default_factory=dict)
     diagnosed: list[str] = Field(default_factory=list)  # vehicles that the whole diagnosis is made of, or "all"
@@ -79,7 +82,8 @@ class Config(Strict):
     epochs: int = 100
     patience: int = 5
     stop_after: int = 15
-    page: Literal["table", "shares", "grid"] = "table"
+    page: Literal["table", "coefficients", "shares", "grid"] = "table"
+    coefficient: Literal["c_rr", "cda_m2"] = "c_rr"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     wanted: dict[str, float] = Field(default_factory=dict)
     seed: int = 1
@@ -98,12 +102,45 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
                     data["files"] = fingerprint(bus_files(config.routes))
                 except MissingDataError:
                     return
-            for name, model in config.models.items():
+            for name, model in chosen(config).items():
                 yield from _of_model(config, data, name, model)
 
 
+def chosen(config: Config) -> dict[str, Model]:
+    """The models of a config that are run, each with what it takes over from the one that it is like.
+
+    **Raises:** `InputError` for a name that is no model's.
+    """
+    for name in [*config.only, *(m.like for m in config.models.values() if m.like)]:
+        if name not in config.models:
+            raise InputError(f"config: no model {name!r}; it has {', '.join(config.models)}")
+
+    def whole(model: Model, seen: tuple[str, ...]) -> dict[str, Any]:
+        if model.like in seen:
+            raise InputError(f"config: model {model.like!r} is like itself")
+        base = whole(config.models[model.like], (*seen, model.like)) if model.like else {}
+        return base | {k: getattr(model, k) for k in model.model_fields_set if k != "like"}
+
+    names = config.only or list(config.models)
+    return {name: Model(**whole(config.models[name], (name,))) for name in names}
+
+
+def _weights(config: Config, model: Model) -> list[list[float]]:
+    """Loss weights that a model is trained with."""
+    if not config.grid_values:
+        return [model.weights]
+    found = []
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        for a in config.grid_values[i]:
+            for b in config.grid_values[j]:
+                w = list(PAPER)
+                w[i], w[j] = a, b
+                found.append(tuple(w))
+    return [list(w) for w in dict.fromkeys(found)]
+
+
 def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> Iterator[dict[str, Any]]:
-    task: dict[str, Any] = {"data": data, "name": name, "model": model.model_dump(exclude={"title"})}
+    task: dict[str, Any] = {"data": data, "name": name, "model": model.model_dump(exclude={"like"})}
     if model.kind == "vehicles":
         for vehicle in _vehicles(config):
             known = config.diagnosed == ["all"] or (config.data == "fleet" and _id(config, vehicle) in config.diagnosed)
@@ -113,7 +150,7 @@ def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> 
     plan = {"epochs": config.epochs, "patience": config.patience, "stop_after": config.stop_after}
     task |= {**plan, "effects": config.effects if model.effects else {}}
     for seed in config.seeds:
-        for weights in (config.grid or [model.weights]) if model.kind == "network" else [[]]:
+        for weights in _weights(config, model) if model.kind == "network" else [[]]:
             yield {**task, "seed": seed, "weights": list(weights)}
 
 
@@ -150,6 +187,11 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     task, d = tasks[0], tasks[0]["data"]
     data = load(d["kind"], d["seed"], d["routes"], tuple(d["held"]), d["share"], d["warmer_than"], d["fold"],
                 tuple(d["variants"]))  # fmt: skip
+    if odd := set(task.get("effects", {})) - set(LIBRARY):
+        raise InputError(f"config, key effects: {sorted(odd)[0]!r} is no effect of the library; see `hdev effects`")
+    effects = data.shown(task.get("effects", {}))
+    tasks = [{**t, "effects": effects} for t in tasks]
+    task = tasks[0]
     if task["model"]["kind"] == "vehicles":
         return [_by_vehicle(data, task)]
     rows, use = data.rows(names_of(task["model"]["features"], data), tuple(task["effects"]))
@@ -209,7 +251,11 @@ def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]
         own = every[i * spec.members : (i + 1) * spec.members]
         out.append(_scored(data, use, shown, picked, uses, own, recipe))
         ends = ensemble.trained.scores.reshape(len(members), -1)[i * spec.members]
-        out[-1] |= {"counts": data.counts(), "epochs": int(np.isfinite(ends).sum())}
+        out[-1] |= {
+            "counts": data.counts(),
+            "effects": list(tasks[0]["effects"]),
+            "epochs": int(np.isfinite(ends).sum()),
+        }
     return out
 
 
@@ -252,6 +298,6 @@ def _at_battery(rows: Any, mean: dict[str, np.ndarray]) -> np.ndarray:
 
 def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:
     """Tables and figures of the page that the config asks for."""
-    return {"table": pinn_pages.table, "shares": pinn_pages.shares, "grid": pinn_pages.grid}[config.page](
-        config, results, run
-    )
+    pages = {"table": pinn_pages.table, "coefficients": pinn_pages.coefficients, "shares": pinn_pages.shares,
+             "grid": pinn_pages.grid}  # fmt: skip
+    return pages[config.page](config, results, run)

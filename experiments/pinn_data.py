@@ -1,7 +1,7 @@
 """The rows that networks are compared on: the synthetic fleet, or buses by 100 m, split by route or mission."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from hdev_jax.fleet import simulate
 from hdev_jax.inference import ParameterTable
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.learn.pinn_rows import Rows, concatenated, rows_of
-from hdev_jax.physics import LIBRARY, Vehicle, at_null
+from hdev_jax.physics import LIBRARY, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
 
 __all__ = ["Data", "Member", "load"]
@@ -85,6 +85,11 @@ class Data:
                 m.vehicle, (table[0] * c_rr, table[1] * cda, jnp.asarray(float(load))),
             ))  # fmt: skip
         return out
+
+    def shown(self, effects: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of the effects whose channels this data has."""
+        s = self.vehicles[0].segments
+        return {k: v for k, v in effects.items() if unavailable(LIBRARY[k], s, "road") is None}
 
     def column(self, name: str) -> np.ndarray:
         """A column of all vehicles, one after the other."""
