@@ -248,7 +248,11 @@ def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]
     every = ensemble.predict(picked)
     out = []
     for i, _ in enumerate(tasks):
-        own = every[i * spec.members : (i + 1) * spec.members]
+        at = range(i * spec.members, (i + 1) * spec.members)
+        own = [every[j] for j in at if not ensemble.diverged[j]]
+        if not own:
+            out.append({"diverged": True})
+            continue
         out.append(_scored(data, use, shown, picked, uses, own, recipe))
         ends = ensemble.trained.scores.reshape(len(members), -1)[i * spec.members]
         out[-1] |= {

@@ -24,7 +24,7 @@ seed = [1, 2]
 """
 
 
-def until(condition, what, seconds=120):
+def until(condition, what, seconds=300):
     for _ in range(int(seconds * 20)):
         if found := condition():
             return found

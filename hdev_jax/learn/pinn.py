@@ -42,7 +42,8 @@ class Recipe:
     - `by_vehicle`: coefficients and effects have a part of each vehicle's own, shrunk to the fleet's.
     - `loss`: `squares` (equation 7), or the normal `likelihood` of measured and of physical energy, whose variances
       are learned, which is what weighs the terms against each other (Kendall, Gal and Cipolla, CVPR 2018).
-    - `energy_head`: with the head, or without; `stretch`, rows of a stretch of a trip whose sum counts too (1: none).
+    - `energy_head`: with the head, or without; `stretch`, rows of a stretch of a trip whose sum counts too (1: none):
+      a composite likelihood, rows and sums being the same data twice.
     """
 
     features: tuple[str, ...]

@@ -40,6 +40,12 @@ class Ensemble:
     members: tuple[Member, ...]
     trained: Trained
 
+    @property
+    def diverged(self) -> np.ndarray:
+        """Whether a member [member] never had a finite score: it is as it began, and says nothing."""
+        finite = np.isfinite(self.trained.scores.reshape(len(self.members), -1))
+        return np.logical_not(np.any(finite, axis=1))
+
     def predict(self, rows: Rows) -> list[Prediction]:
         """What each member says of each row, as NumPy."""
         scaled = _scaled(rows, self.scale)
@@ -59,8 +65,8 @@ class Ensemble:
         return out
 
     def mean(self, rows: Rows) -> Prediction:
-        """Mean of the members; `sd_wh` holds the noise and how far the members are apart."""
-        every = self.predict(rows)
+        """Mean of the members that did not diverge; `sd_wh` holds the noise and how far the members are apart."""
+        every = [p for p, lost in zip(self.predict(rows), self.diverged, strict=True) if not lost]
         means = jax.tree.map(lambda *x: np.mean(x, axis=0), *every)
         noise = np.mean([p.sd_wh**2 for p in every], axis=0)
         apart = np.var([p.energy_wh for p in every], axis=0)

@@ -1,0 +1,77 @@
+"""The networks' experiment: who is trained on what, deltas of models, scores that add up."""
+
+import numpy as np
+import pytest
+
+from experiments.config import CONFIGS, resolve, typed
+from experiments.pinn import PAPER, Config, chosen, tasks, together
+from experiments.pinn_data import load
+from experiments.pinn_scores import pooled, scores
+from hdev_jax.errors import InputError
+
+
+def config(name, *sets):
+    return typed(Config, resolve(CONFIGS / f"{name}.toml", sets), name)
+
+
+def test_a_model_takes_over_what_it_does_not_change():
+    models = chosen(config("studies/pinn_ablations"))
+    ours, delta = models["ours"], models["ours without effects"]
+    changed = {k for k in type(ours).model_fields if getattr(ours, k) != getattr(delta, k)}
+    assert changed == {"effects"}
+    with pytest.raises(InputError, match="no model 'none'"):
+        chosen(config("studies/pinn_ablations", 'only=["none"]'))
+    with pytest.raises(InputError, match="is like itself"):
+        chosen(config("studies/pinn_ablations", 'models.ours.like="ours without effects"'))
+
+
+def test_every_ablation_of_the_networks_changes_one_thing():
+    models = chosen(config("studies/pinn_ablations"))
+    for name, model in models.items():
+        base = models["ours" if name.startswith("ours") else "paper"]
+        changed = [k for k in type(base).model_fields if getattr(base, k) != getattr(model, k)]
+        assert len(changed) == (name not in ("ours", "paper")), name
+
+
+def test_loss_weights_come_by_pairs_and_train_together():
+    every = list(tasks(config("studies/pinn_weights")))
+    weights = {tuple(t["weights"]) for t in every}
+    assert len(every) == 3 * len(weights) == 3 * 61
+    assert all(sum(a != b for a, b in zip(w, PAPER, strict=True)) <= 2 for w in weights)
+    assert len({together(t) for t in every}) == 1
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_a_route_has_one_use_and_held_variants_none_but_unseen(share):
+    data = load("fleet", 3, 24, ("B",), share, None, 0, ("A", "B"))
+    uses = {}
+    for m in data.vehicles:
+        for route, use in zip(m.routes, m.use, strict=True):
+            assert uses.setdefault(route, use) == use
+        assert (m.id == "B") == bool(np.all(m.use == 3))
+    of = np.bincount([u for u in uses.values() if u != 3], minlength=5)
+    assert of.sum() == 12
+    assert of[2] == 2, "test routes are the same whatever is trained on"
+    assert of[0] == (8 if share == 1.0 else 2)
+    assert data.trained == 1
+    assert "requested_torque_nm" not in data.vehicles[0].segments.channels
+
+
+def test_scores_are_those_of_all_rows_and_add_up_over_vehicles():
+    data = load("fleet", 3, 24, (), 1.0, None, 0, ("A", "B"))
+    rng = np.random.default_rng(0)
+    y = data.column("energy_wh")
+    told = y + rng.standard_normal(len(y)) + 0.5
+    use, route = data.column("use"), data.column("routes")
+    parts, first = [], 0
+    for k, m in enumerate(data.vehicles):
+        mine = told[first : first + len(m.use)]
+        parts.append(scores(data, m.use, mine, only=k)["test"])
+        first += len(m.use)
+    whole, added = pooled([scores(data, use, told)["test"]]), pooled(parts)
+    at = use == 2
+    assert whole == pytest.approx(added, rel=1e-12)
+    assert whole["rmse_wh"] == pytest.approx(np.sqrt(np.mean((told - y)[at] ** 2)), rel=1e-12)
+    assert whole["pe_percent"] == pytest.approx(100 * (told[at].sum() / y[at].sum() - 1), rel=1e-9)
+    trips = [100 * (told[route == t].sum() / y[route == t].sum() - 1) for t in np.unique(route[at])]
+    assert whole["trip_pe_median"] == pytest.approx(np.median(np.abs(trips)), abs=1e-3)
