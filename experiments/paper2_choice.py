@@ -32,7 +32,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     """
     found = {(task["group"], task["name"]): (task, result) for task, result in results}
     rows, lines, missed = [], [], []
-    for key, group in config.groups.items():
+    for key, group in config.picked.items():
         model, own = config.models[group.model], {n: found[key, n] for n in group.tried if (key, n) in found}
         best = min(own, key=lambda n: own[n][1]["mean_mse"]) if own else ""
         for name, (task, result) in own.items():

@@ -15,6 +15,7 @@ from experiments.config import Strict
 from experiments.paper2_choice import chosen_keys, collect
 from experiments.paper2_data import kia_fingerprint, kia_trips
 from experiments.paper2_models import Settings, structure
+from hdev_jax.errors import InputError
 from hdev_jax.learn.selection import validated
 
 __all__ = ["SOURCES", "Config", "Group", "collect", "run", "tasks"]
@@ -43,6 +44,7 @@ class Config(Strict):
     order: list[str] = Field(default_factory=list)
     models: dict[str, Settings]
     groups: dict[str, Group]
+    only: list[str] = Field(default_factory=list)  # of the groups; none: all
     starts: int = 4
     blocks: int = 3
     steps: int = 80
@@ -50,10 +52,17 @@ class Config(Strict):
     train: str = "1"
     seed: int = 0
 
+    @property
+    def picked(self) -> dict[str, Group]:
+        """The groups that are asked for."""
+        if odd := [name for name in self.only if name not in self.groups]:
+            raise InputError(f"config, key only: no group {odd[0]!r}; there are {', '.join(self.groups)}")
+        return {name: g for name, g in self.groups.items() if not self.only or name in self.only}
+
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """One for each entry."""
-    for key, group in config.groups.items():
+    for key, group in config.picked.items():
         for name, keys in group.tried.items():
             settings = chosen_keys(config.models[group.model], keys)
             yield {
