@@ -40,7 +40,7 @@ class Model(Strict):
     features: Literal["printed", "channels", "unitless"] = "channels"
     units: list[int] = Field(default_factory=lambda: [256, 128])
     normalised: bool = True
-    dropout: float = 0.1
+    dropout: float = Field(0.1, ge=0, lt=1)
     predicted: Literal["residual", "alone", "table"] = "residual"
     physics: Literal["battery", "wheel"] = "battery"
     coefficients: Literal["bounded", "free", "table"] = "bounded"
@@ -50,13 +50,13 @@ class Model(Strict):
     by_vehicle: bool = False
     loss: Literal["squares", "likelihood"] = "squares"
     energy_head: bool = True
-    stretch: int = 1
+    stretch: int = Field(1, ge=1)
     effects: bool = False  # those of the config
-    weights: list[float] = Field(default_factory=lambda: list(PAPER))
-    members: int = 1  # of an ensemble
-    rate: float = 0.005
-    decay: float = 0.0
-    batch: int = 1024
+    weights: list[float] = Field(default_factory=lambda: list(PAPER), min_length=3, max_length=3)
+    members: int = Field(1, ge=1)  # of an ensemble
+    rate: float = Field(0.005, gt=0)
+    decay: float = Field(0.0, ge=0)
+    batch: int = Field(1024, ge=1)
 
 
 class Config(Strict):
@@ -90,7 +90,8 @@ class Config(Strict):
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
-    """By fold and share of the data: vehicles one by one, then models by seed and weights."""
+    """By fold and share of the data: vehicles one by one, then models by seed and weights. Raises `InputError`."""
+    _checked(config)
     for fold in config.folds:
         for share in config.shares:
             data = {
@@ -111,6 +112,10 @@ def chosen(config: Config) -> dict[str, Model]:
 
     **Raises:** `InputError` for a name that is no model's.
     """
+    if config.grid_values and len(config.grid_values) != 3:
+        raise InputError(
+            f"config, key grid_values: values of λ₁, λ₂ and λ₃ are expected, found {len(config.grid_values)}"
+        )
     for name in [*config.only, *(m.like for m in config.models.values() if m.like)]:
         if name not in config.models:
             raise InputError(f"config: no model {name!r}; it has {', '.join(config.models)}")
@@ -123,6 +128,33 @@ def chosen(config: Config) -> dict[str, Model]:
 
     names = config.only or list(config.models)
     return {name: Model(**whole(config.models[name], (name,))) for name in names}
+
+
+def _checked(config: Config) -> None:
+    """Raises `InputError` for what is not of the library, the fleet or the data."""
+    for id, shapes in config.effects.items():
+        if id not in LIBRARY:
+            raise InputError(f"config, key effects: {id!r} is no effect of the library; see `hdev effects`")
+        known = [p.name for p in LIBRARY[id].parameters]
+        if odd := set(shapes) - set(known):
+            raise InputError(f"config, key effects.{id}: {sorted(odd)[0]!r} is none of {', '.join(known)}")
+    if config.data == "ztbus":
+        if config.held_variants or config.warmer_than_c is not None or config.diagnosed:
+            raise InputError("config: held_variants, warmer_than_c and diagnosed are of the fleet, data is ztbus")
+        return
+    from hdev_jax.fleet import VARIANTS
+
+    known = [v.id for v in VARIANTS]
+    for key, names in (("variants", config.variants), ("held_variants", config.held_variants),
+                       ("diagnosed", config.diagnosed)):  # fmt: skip
+        if names != ["all"] and (
+            odd := [n for n in names if n not in known] or [n for n in names if names.count(n) > 1]
+        ):
+            raise InputError(
+                f"config, key {key}: {odd[0]!r} is no variant, or there twice; they are {', '.join(known)}"
+            )
+    if config.folds != [0]:
+        raise InputError("config, key folds: the fleet is split once, [0]; folds are of ztbus")
 
 
 def _weights(config: Config, model: Model) -> list[list[float]]:
@@ -187,8 +219,6 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     task, d = tasks[0], tasks[0]["data"]
     data = load(d["kind"], d["seed"], d["routes"], tuple(d["held"]), d["share"], d["warmer_than"], d["fold"],
                 tuple(d["variants"]))  # fmt: skip
-    if odd := set(task.get("effects", {})) - set(LIBRARY):
-        raise InputError(f"config, key effects: {sorted(odd)[0]!r} is no effect of the library; see `hdev effects`")
     effects = data.shown(task.get("effects", {}))
     tasks = [{**t, "effects": effects} for t in tasks]
     task = tasks[0]
@@ -279,10 +309,11 @@ def _scored(
     sd = np.sqrt(noise + np.var([p.energy_wh for p in own], axis=0))
     out: dict[str, Any] = {}
     both: dict[str, Any] = {"c_rr": whole(mean["c_rr"]), "cda_m2": whole(mean["cda_m2"])}
+    if recipe.coefficients == "table":
+        both = {}
     out["network"] = scores(data, use, whole(mean["energy_wh"]), sd_wh=whole(sd), **both)
     if recipe.coefficients != "table" or recipe.predicted != "alone":
-        base = energy(picked.car, picked.segments) if recipe.physics == "wheel" else None
-        physics = mean["physics_wh"] if base is None else _at_battery(picked, mean)
+        physics = mean["physics_wh"] if recipe.physics == "battery" else _at_battery(picked, mean)
         out["physics"] = scores(data, use, whole(physics), **both)
     if recipe.coefficients == "bounded":
         table = np.asarray(picked.cda_m2)

@@ -13,6 +13,7 @@ import numpy as np
 
 from experiments.paper1_halves import AUXILIARY_SD_W, coefficient, fitted, paper_table
 from experiments.pinn_buses import BUSES, buses
+from hdev_jax.errors import InputError
 from hdev_jax.fleet import simulate
 from hdev_jax.inference import ParameterTable
 from hdev_jax.inference.sheet import read_sheet
@@ -73,9 +74,12 @@ class Data:
     @cached_property
     def _calibrated(self) -> list[Vehicle]:
         """Each vehicle with c_rr, C_d·A and auxiliary load by closed form from its training rows; one without any has
-        the median ratios of the others to their tables."""
+        the others' median ratios to their tables, and their median load."""
         fits = [calibrated(m) if np.any(m.use == 0) else None for m in self.vehicles]
-        ratio = np.median([f for f in fits if f is not None], axis=0)
+        known = [f for f in fits if f is not None]
+        if not known:
+            raise InputError("no vehicle has a training route; hold out less, or take more routes")
+        ratio = np.median(known, axis=0)
         out = []
         for m, f in zip(self.vehicles, fits, strict=True):
             c_rr, cda, load = ratio if f is None else f
@@ -195,7 +199,7 @@ def _buses(fold: int, share: float, missions: int) -> Data:
         rest = np.flatnonzero(use == 0)
         use[rest[1::4]] = 1
         if share < 1:
-            use[rest[0::1][max(1, round(share * len(rest))) :]] = 4
+            use[rest[max(1, round(share * len(rest))) :]] = 4
         table = paper_table((0.0080, 0.0016), (6.0, 1.0)).plus(
             coefficient("battery.auxiliary_w", "W", 5000.0, 3000.0, positive=False)
         )

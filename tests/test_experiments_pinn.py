@@ -25,6 +25,22 @@ def test_a_model_takes_over_what_it_does_not_change():
         chosen(config("studies/pinn_ablations", 'models.ours.like="ours without effects"'))
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("effects.fog={}", "'fog' is no effect"),
+        ("effects.tyre_warmup={distanz_m=3.0}", "'distanz_m' is none of excess, distance_m"),
+        ('variants=["A", "A"]', "there twice"),
+        ('held_variants=["nope"]', "'nope' is no variant"),
+        ("folds=[0, 1]", "split once"),
+        ("grid_values=[[1.0]]", "found 1"),
+    ],
+)
+def test_a_config_that_cannot_be_is_refused_in_one_line(change, said):
+    with pytest.raises(InputError, match=said):
+        list(tasks(config("paper1/table2", change)))
+
+
 def test_every_ablation_of_the_networks_changes_one_thing():
     models = chosen(config("studies/pinn_ablations"))
     for name, model in models.items():

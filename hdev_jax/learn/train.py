@@ -123,7 +123,8 @@ def train(
     `tell(epoch, loss, score)` after each epoch.
 
     **Raises:** `NotFiniteError` with the batch; of several members, one whose loss is not finite stops, and keeps
-    what it had. `InputError` where `held` never had a finite score, and for a checkpoint of another training.
+    what it had. `InputError` where `held` never had a finite score, and for a checkpoint of other shapes; that it is of
+    the same data and settings is the caller's to see to.
     """
     entries = jax.tree.leaves(data)[0].shape[0]
     batch = min(plan.batch, entries)
