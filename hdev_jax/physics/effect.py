@@ -60,7 +60,7 @@ class Point(eqx.Module):
 class Grouped(eqx.Module):
     """A coefficient with one value for each vehicle, trip, gear or kind of surface, looked up by the row's id."""
 
-    values: Float[Array, " group"]
+    values: Float[Array, "*row group"]
     by: str = eqx.field(static=True)
 
     def at(self, row: Segments) -> Real:
