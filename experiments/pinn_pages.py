@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import NullFormatter
 
 from experiments.figures import save_figure, styled
 from experiments.pinn_scores import QUANTILES, pooled
@@ -292,7 +293,13 @@ def _curves(run: Run, curves: Mapping[tuple[str, str], list[tuple[float, list[fl
         ax.set_yscale("log")
         ax.set_xlabel("training routes used [%]")
         ax.set_ylabel("RMSE [Wh]")
-        ax.set_title({"test": "Test routes", "unseen": "Variants or season never trained on"}[use] + " (synthetic)")
+        # plain numbers: the project's look does not set powers of ten
+        ax.set_xticks(sorted({100 * s for k, points in curves.items() if k[1] == use for s, _ in points}))
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter(lambda x, _: f"{x:g}")
+            axis.set_minor_formatter(NullFormatter())
+        ax.set_yticks([y for y in (5, 10, 20, 50, 100, 200) if ax.get_ylim()[0] <= y <= ax.get_ylim()[1]])
+        ax.set_title({"test": "Test routes", "unseen": "Never trained on"}[use] + " (synthetic)")
         ax.legend(fontsize=7)
         tidy(ax)
     save_figure(run, fig, "shares")
