@@ -82,7 +82,7 @@ def told(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["tasks_left_out"]:
         said.append(f"{metrics['tasks_left_out']} more are in the config and were not run.")
     if metrics.get("tasks_in_one_program"):
-        said.append(f"{metrics['tasks_in_one_program']} of its tasks ran side by side in one program (vmap).")
+        said.append(f"{metrics['tasks_in_one_program']} of its tasks ran side by side in one program.")
     if metrics.get("skipped"):
         said.append(f"{len(metrics['skipped'])} could not be made as asked for.")
     if metrics.get("missed"):
