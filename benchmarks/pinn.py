@@ -168,8 +168,8 @@ class Learner:
         data = jax.tree.map(jnp.asarray, stretches(self.rows, 1))
         return Epochs(
             lambda tell: train(
-                self.objective, weights, memory, data, optax.adam(RATE), Plan(most, BATCH), members=True, tell=tell,
-                key=jax.random.split(jax.random.key(1), count), settings=jnp.tile(self.settings, (count, 1)),
+                self.objective, weights, memory, data, optax.adam(RATE), Plan(most, BATCH), members="in turn",
+                tell=tell, key=jax.random.split(jax.random.key(1), count), settings=jnp.tile(self.settings, (count, 1)),
             )
         )  # fmt: skip
 

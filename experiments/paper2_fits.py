@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.paper2_diagnosed import Diagnosed
 from experiments.paper2_models import structure
 from hdev_jax.errors import InputError
 from hdev_jax.learn import (
@@ -23,7 +24,7 @@ from hdev_jax.learn.classical import search_classical
 from hdev_jax.learn.recurrent import train_recurrent
 from hdev_jax.learn.sequences import energy_kwh, mean_squared
 
-__all__ = ["KINDS", "Mean", "evaluated", "fitted", "step_seconds"]
+__all__ = ["KINDS", "Mean", "evaluated", "fitted", "recurrent", "step_seconds"]
 
 DIVERGED_KW = 1e6  # far beyond any battery of a car
 Model = Any
@@ -48,16 +49,16 @@ def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     return [with_theta(model, fit.theta[k]) for k in order], [float(fit.loss[k]) for k in order]
 
 
-def _recurrent(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
-    """A network for each start, ordered by its error on the training trip."""
+def recurrent(s: dict[str, Any], trip: Trip, seed: int, without: np.ndarray | None = None) -> Fit:
+    """A network for each start, ordered by its error on the training trip, on the rows that are not left out of it."""
     keys = jax.random.split(jax.random.key(seed), s["starts"])
     huber = s["huber_kw"] if s["huber_kw"] else np.inf
-    models = [
-        train_recurrent(s["cell"], trip, key=k, source=Channels(tuple(s["inputs"])), units=s["units"],
-                        steps=s["steps"], length=s["length"], rate=s["rate"], decay=s["decay"], huber=huber)
-        for k in keys
-    ]  # fmt: skip
-    loss = [mean_squared(m.predict(trip) - m.measured(trip)) for m in models]
+    models = train_recurrent(
+        s["cell"], trip, keys=keys, source=Channels(tuple(s["inputs"])), units=s["units"], steps=s["steps"],
+        length=s["length"], rate=s["rate"], decay=s["decay"], huber=huber, without=without,
+    )  # fmt: skip
+    known = np.ones(len(trip), bool) if without is None else ~without
+    loss = [mean_squared((m.predict(trip) - m.measured(trip))[known]) for m in models]
     order = np.argsort(loss)
     return [models[k] for k in order], [loss[k] for k in order]
 
@@ -108,14 +109,21 @@ class _Persistence:
         return np.asarray(trip.target)[1:]
 
 
+def _diagnosed(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
+    """The declared car with what a diagnosis of the training trip adds."""
+    model = Diagnosed.of(trip, seed)
+    return [model], [mean_squared(model.predict(trip) - model.measured(trip))]
+
+
 def _persistence(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     return [_Persistence()], [0.0]
 
 
 KINDS: dict[str, Callable[[dict[str, Any], Trip, int], Fit]] = {
     "narx": _narx,
-    "recurrent": _recurrent,
+    "recurrent": recurrent,
     "classical": _classical,
+    "diagnosed": _diagnosed,
     "persistence": _persistence,
 }
 

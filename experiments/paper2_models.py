@@ -18,8 +18,10 @@ class Settings(Strict):
         "source", "inputs", "kernel_order", "outputs", "lags", "units", "seen", "linear", "huber_kw", "ridge_size",
         "ridge_slope",
     )  # fmt: skip
+    # the same of a recurrent network
+    TRAINING: ClassVar = ("kind", "cell", "inputs", "units", "length", "rate", "decay", "huber_kw")
 
-    kind: Literal["narx", "recurrent", "classical", "persistence"]
+    kind: Literal["narx", "recurrent", "classical", "diagnosed", "persistence"]
     why: str = ""  # what the row is, for the table
     # which of several starts is the model: that of least loss on the training trip, or the mean of all
     rule: Literal["least", "ensemble"] = "least"
@@ -46,6 +48,10 @@ class Settings(Strict):
     decay: float = 0.03
     model: Literal["tree", "boosted", "robust_linear", "support_vectors"] = "tree"
     trials: int = Field(12, ge=1)
+
+    def chosen(self) -> dict[str, Any]:
+        """What can be chosen of a model by rows left out."""
+        return self.model_dump(mode="json", include=set(self.TRAINING if self.kind == "recurrent" else self.STRUCTURE))
 
     def task(self) -> dict[str, Any]:
         """Plain values for a task: all that decides the model."""

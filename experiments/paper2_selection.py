@@ -14,13 +14,15 @@ from pydantic import Field
 from experiments.config import Strict
 from experiments.paper2_choice import chosen_keys, collect
 from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_fits import recurrent
 from experiments.paper2_models import Settings, structure
 from hdev_jax.errors import InputError
-from hdev_jax.learn.selection import validated
+from hdev_jax.learn import Trip
+from hdev_jax.learn.selection import Score, by_blocks, validated
 
 __all__ = ["SOURCES", "Config", "Group", "collect", "run", "tasks"]
 
-SOURCES = ("paper2_selection.py", "paper2_models.py", "paper2_data.py")
+SOURCES = ("paper2_selection.py", "paper2_models.py", "paper2_data.py", "paper2_fits.py")
 
 
 class Group(Strict):
@@ -48,6 +50,8 @@ class Config(Strict):
     starts: int = 4
     blocks: int = 3
     steps: int = 80
+    recurrent_starts: int = 2
+    recurrent_steps: int = 1000
     rows: int = 0
     train: str = "1"
     seed: int = 0
@@ -65,22 +69,42 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     for key, group in config.picked.items():
         for name, keys in group.tried.items():
             settings = chosen_keys(config.models[group.model], keys)
+            recurs = settings.get("kind") == "recurrent"
             yield {
-                "group": key, "name": name, "settings": settings, "starts": config.starts, "blocks": config.blocks,
-                "steps": config.steps, "rows": config.rows, "train": config.train,
-                "seed": config.seed, "data": kia_fingerprint(),
+                "group": key, "name": name, "settings": settings, "blocks": config.blocks,
+                "starts": config.recurrent_starts if recurs else config.starts,
+                "steps": config.recurrent_steps if recurs else config.steps,
+                "rows": config.rows, "train": config.train, "seed": config.seed, "data": kia_fingerprint(),
             }  # fmt: skip
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
     """Errors of rows left out, one step ahead."""
     trip, s = kia_trips(task["rows"] or None)[task["train"]], task["settings"]
+    score, parameters = (_recurrent if s.get("kind") == "recurrent" else _narx)(task, trip)
+    return {
+        "least_mse": score.least, "ensemble_mse": score.ensemble, "mean_mse": score.mse,
+        "median_mse": float(np.median(score.by_start)), "blocks_mse": score.blocks, "edge_mse": score.edge,
+        "starts": len(score.by_start), "parameters": parameters,
+    }  # fmt: skip
+
+
+def _narx(task: dict[str, Any], trip: Trip) -> tuple[Score, int]:
+    s = task["settings"]
     score = validated(
         structure(s), trip, key=jax.random.key(task["seed"]), count=task["starts"], blocks=task["blocks"],
         huber=s["huber_kw"] or np.inf, ridge={"size": s["ridge_size"], "slope": s["ridge_slope"]}, steps=task["steps"],
     )  # fmt: skip
-    return {
-        "least_mse": score.least, "ensemble_mse": score.ensemble, "mean_mse": score.mse,
-        "median_mse": float(np.median(score.by_start)), "blocks_mse": score.blocks, "edge_mse": score.edge,
-        "starts": len(score.by_start), "parameters": structure(s).shape.size,
-    }  # fmt: skip
+    return score, structure(s).shape.size
+
+
+def _recurrent(task: dict[str, Any], trip: Trip) -> tuple[Score, int]:
+    sizes = []
+
+    def fit(without: np.ndarray) -> Any:
+        s = {**task["settings"], "starts": task["starts"], "steps": task["steps"]}
+        models, _ = recurrent(s, trip, task["seed"], without)
+        sizes.append(models[0].parameters)
+        return models
+
+    return by_blocks(fit, trip, count=task["blocks"]), sizes[0]

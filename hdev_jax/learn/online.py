@@ -49,13 +49,11 @@ def update(
     beta, covariance = state
     predicted = x @ beta
     error = y - predicted
-    weight = xp.minimum(1.0, corner / xp.maximum(abs(error), 1e-300))
     along = covariance @ x
-    gain = along / (forgetting / weight + x @ along)
+    gain = along / (forgetting * xp.maximum(1.0, abs(error) / corner) + x @ along)
     smaller = covariance - gain[:, None] * along[None, :]  # symmetric to rounding, whatever the order of the product
-    grown = xp.trace(smaller) < ceiling * forgetting
-    covariance = smaller / xp.where(grown, forgetting, 1.0)
-    return Recursive(beta + gain * error, covariance), predicted
+    grown = smaller.trace() < ceiling * forgetting
+    return Recursive(beta + gain * error, smaller / forgetting**grown), predicted
 
 
 @jax.jit

@@ -152,7 +152,8 @@ def fit(
         keys, settings = keys[0], settings[0]
     trained = train(
         Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optimiser, plan, key=keys,
-        held=jax.tree.map(jnp.asarray, check), settings=settings, members=not single, checkpoint=checkpoint, tell=tell,
+        held=jax.tree.map(jnp.asarray, check), settings=settings, members="" if single else "in turn",
+        checkpoint=checkpoint, tell=tell,
     )  # fmt: skip
     weights, memory = trained.weights, trained.memory
     if single:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.sequences import Scale, Trip
@@ -89,7 +89,7 @@ def train_recurrent(
     kind: str,
     trip: Trip,
     *,
-    key: PRNGKeyArray,
+    keys: Key[Array, " start"],
     source: Source | None = None,
     units: int = 10,
     steps: int = 4000,
@@ -99,39 +99,53 @@ def train_recurrent(
     rate: float = 0.02,
     decay: float = 0.03,
     huber: float = np.inf,
-) -> RecurrentModel:
-    """Adam with a cosine schedule from `rate` to 0 over `steps` batches (or as many more as fill the last pass over the
-    trip) of windows from all places of the trip.
+    without: Bool[np.ndarray, " row"] | None = None,
+) -> list[RecurrentModel]:
+    """A network from each start, all in one program: Adam with a cosine schedule from `rate` to 0 over `steps` batches
+    (or as many more as fill the last pass over the trip) of windows from all places of the trip.
 
     **Arguments:** `length` rows of a window count, after `burn_in` that only fill the memory; `decay` of the
     weights (Loshchilov and Hutter 2019), of the cell, not of the read-out, times the rate; `huber`, corner of the
-    loss in the target's unit. Raises `InputError` for a trip shorter than a window.
+    loss in the target's unit; `without`, rows that no window counts. A start whose loss is not finite stays where it
+    was. Raises `InputError` for a trip that has no window.
     """
     import optax
 
     source = Channels() if source is None else source
     columns = source(trip)
     window = length + burn_in
-    if len(trip) <= window:
-        raise InputError(f"trip {trip.name}: {len(trip)} rows, a window has {window}; make `length` shorter")
-    scales = Scale.of(columns), Scale.of(trip.target)
+    known = np.ones(len(trip), bool) if without is None else ~np.asarray(without)
+    # how many unknown rows a window counts, from where it begins
+    unknown = np.concatenate([[0], np.cumsum(~known)])
+    begins = np.arange(max(len(trip) - window + 1, 0))
+    places = begins[unknown[begins + window] == unknown[begins + burn_in]]
+    if not len(places):
+        raise InputError(
+            f"trip {trip.name}: {known.sum()} rows to train on, a window has {window}; make `length` shorter"
+        )
+    scales = Scale.of(columns[known]), Scale.of(np.asarray(trip.target)[known])
     x = jnp.asarray(scales[0].apply(columns), dtype=jnp.float32)
     y = jnp.asarray(scales[1].apply(trip.target), dtype=jnp.float32)
     corner = min(huber / float(scales[1].sd), 1e6)
-    begin, draw = jax.random.split(key)
-    network = Recurrent(kind, x.shape[1], units, key=begin)
-    weights, static = eqx.partition(network, eqx.is_array)
+    begin, draw = jax.vmap(jax.random.split, out_axes=1)(keys)
+    networks = [Recurrent(kind, x.shape[1], units, key=k) for k in begin]
+    weights = jax.tree.map(lambda *w: jnp.stack(w), *(eqx.filter(n, eqx.is_array) for n in networks))
+    static = eqx.filter(networks[0], eqx.is_array, inverse=True)
     cell_only = eqx.tree_at(
         lambda n: n.cell, jax.tree.map(lambda _: False, weights), jax.tree.map(lambda _: True, weights.cell)
     )
-    places = jnp.arange(x.shape[0] - window + 1)
     each = max(len(places) // batch, 1)
     epochs = -(-steps // each)
     schedule = optax.cosine_decay_schedule(rate, epochs * each)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=decay, mask=cell_only))
     objective = _Windows(static, x, y, burn_in, window, corner)
-    trained = train(objective, weights, None, places, optimiser, Plan(epochs, batch), key=draw)
-    return RecurrentModel(eqx.combine(trained.weights, static), source, *scales)
+    trained = train(
+        objective, weights, None, jnp.asarray(places), optimiser, Plan(epochs, batch), key=draw, members="side by side"
+    )
+    return [
+        RecurrentModel(eqx.combine(jax.tree.map(lambda w, k=k: w[k], trained.weights), static), source, *scales)
+        for k in range(len(networks))
+    ]
 
 
 @dataclass(frozen=True)
@@ -153,6 +167,3 @@ class _Windows:
             jax.vmap(eqx.combine(weights, self.static))(self.x[at])[:, self.burn_in :] - self.y[at][:, self.burn_in :]
         )
         return jnp.mean(optax.huber_loss(error, delta=self.corner)) / self.corner, memory
-
-    def score(self, weights: Any, memory: Any, data: Any, settings: Any) -> Array:
-        raise NotImplementedError("nothing is held out of the one training trip")

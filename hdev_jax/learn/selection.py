@@ -1,17 +1,26 @@
 """Choices made on the training trip alone: blocks of time left out, and what lies at the edge left out too."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from hdev_jax.learn.narx import Narx, Structure, fit_prediction, prepared, starts, with_theta
+from hdev_jax.learn.narx import Structure, fit_prediction, prepared, starts, with_theta
 from hdev_jax.learn.sequences import Trip, blocks, mean_squared
 
-__all__ = ["Score", "edge", "folds", "validated"]
+__all__ = ["Score", "by_blocks", "edge", "folds", "validated"]
+
+
+@runtime_checkable
+class Predicts(Protocol):
+    """A fitted model: one step ahead, and what that is to be compared with."""
+
+    def predict(self, trip: Trip) -> Float[np.ndarray, " row"]: ...
+
+    def measured(self, trip: Trip) -> Float[np.ndarray, " row"]: ...
 
 
 @dataclass(frozen=True)
@@ -20,11 +29,12 @@ class Score:
 
     `mse`, of both, counts a row of the edge twice: once as time, once as the edge. These three are means over starts;
     `least` is of both for the start of least training loss in each fold, `ensemble` for the mean of all predictions.
+    Where the edge was not left out, `edge` is None and the others are of blocks alone.
     """
 
     mse: float
     blocks: float
-    edge: float
+    edge: float | None
     least: float
     ensemble: float
     by_start: tuple[float, ...]
@@ -73,22 +83,30 @@ def validated(
     # in each fold the start of least loss first
     order = np.argsort(np.nan_to_num(np.asarray(fit.loss), nan=np.inf).reshape(len(left_out), count), axis=1)
     thetas = np.take_along_axis(np.asarray(fit.theta).reshape(len(left_out), count, -1), order[:, :, None], axis=1)
-    return _score(model, trip, left_out, [[with_theta(model, t) for t in fold] for fold in thetas])
+    return _score(trip, left_out, [[with_theta(model, t) for t in fold] for fold in thetas], edge=True)
 
 
-def _score(model: Narx, trip: Trip, left_out: list[np.ndarray], fitted: Sequence[Sequence[Narx]]) -> Score:
-    measured, starts_of = model.measured(trip), len(fitted[0])
-    error = np.zeros((starts_of, len(measured)))
-    at_edge = np.zeros((starts_of, int(left_out[-1].sum())))
-    for rows, models in zip(left_out, fitted, strict=True):
-        for k, m in enumerate(models):
-            e = m.predict(trip)[rows] - measured[rows]
-            if rows is left_out[-1]:
-                at_edge[k] = e
-            else:
-                error[k, rows] = e
-    both: Float[np.ndarray, "start row"] = np.concatenate([error, at_edge], axis=1)
+def by_blocks(fit: Callable[[np.ndarray], Sequence[Predicts]], trip: Trip, *, count: int, warm: int = 0) -> Score:
+    """As `validated`, of models that read every row of a trip in turn: `count` blocks of time are left out, no edge.
+
+    **Arguments:** `fit`, models from each start, the best first, fitted without the rows `[row]` that it is given;
+    `warm`, rows at the trip's begin that are not counted, for a memory that is empty there.
+    """
+    number = blocks(len(trip), count)
+    left_out = [(number == k) & (np.arange(len(trip)) >= warm) for k in range(count)]
+    return _score(trip, left_out, [fit(number == k) for k in range(count)], edge=False)
+
+
+def _score(trip: Trip, left_out: list[np.ndarray], fitted: Sequence[Sequence[Predicts]], *, edge: bool) -> Score:
+    """Of what each fold's models say of the rows left out; the last fold is the edge where there is one."""
+    measured = fitted[0][0].measured(trip)
+    errors = [
+        np.stack([m.predict(trip)[rows] - measured[rows] for m in models])
+        for rows, models in zip(left_out, fitted, strict=True)
+    ]
+    both: Float[np.ndarray, "start row"] = np.concatenate(errors, axis=1)
     return Score(
-        mse=mean_squared(both), blocks=mean_squared(error), edge=mean_squared(at_edge), least=mean_squared(both[0]),
+        mse=mean_squared(both), blocks=mean_squared(np.concatenate(errors[:-1] if edge else errors, axis=1)),
+        edge=mean_squared(errors[-1]) if edge else None, least=mean_squared(both[0]),
         ensemble=mean_squared(both.mean(axis=0)), by_start=tuple(np.mean(both**2, axis=1)),
     )  # fmt: skip

@@ -9,7 +9,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import atomic_file
 
-__all__ = ["NotFiniteError", "Objective", "Plan", "Trained", "train"]
+__all__ = ["NotFiniteError", "Objective", "Plan", "Scored", "Trained", "train"]
 
 
 class NotFiniteError(InputError):
@@ -38,13 +38,14 @@ class NotFiniteError(InputError):
 
 @runtime_checkable
 class Objective(Protocol):
-    """What is minimised, and what a validation set is scored by.
-
-    `loss(weights, memory, batch, key, settings)` is the scalar to minimise and the memory after the batch;
-    `score(weights, memory, data, settings)` a scalar, lower is better.
-    """
+    """What is minimised: `loss(weights, memory, batch, key, settings)`, a scalar, and the memory after the batch."""
 
     def loss(self, weights: Any, memory: Any, batch: Any, key: PRNGKeyArray, settings: Any) -> tuple[Array, Any]: ...
+
+
+@runtime_checkable
+class Scored(Objective, Protocol):
+    """An objective that a validation set can be scored by: `score(weights, memory, data, settings)`, less is better."""
 
     def score(self, weights: Any, memory: Any, data: Any, settings: Any) -> Array: ...
 
@@ -108,7 +109,7 @@ def train(
     key: PRNGKeyArray | Key[Array, " member"],
     held: Any = None,
     settings: Any = None,
-    members: bool = False,
+    members: Literal["", "in turn", "side by side"] = "",
     checkpoint: Path | None = None,
     every: int = 5,
     tell: Callable[[int, float, float], None] | None = None,
@@ -117,21 +118,25 @@ def train(
 
     **Arguments:** `data` and `held`, pytrees of arrays with one leading axis; `settings`, numbers for the objective
     (loss weights); with `members`, `weights`, `memory`, `key` and `settings` have a leading axis of members, the data
-    are the same for all. They take turns by epochs, `jax.lax.map`: on a CPU that is faster than `jax.vmap`, whose
-    batched products of small matrices are slow and fill the caches (16 of 256-128 units: 1.2 times). `checkpoint`, a
-    file that is written every so many epochs; where it is there, training goes on from it, to the same numbers.
-    `tell(epoch, loss, score)` after each epoch.
+    are the same for all. In turn, epoch by epoch (`jax.lax.map`), is faster on a CPU where a step fills the machine:
+    `jax.vmap`'s batched products fill the caches (16 of 256-128 units: 1.2 times). Side by side (`jax.vmap`) is faster
+    where a step is many small operations, as of a recurrent cell. `checkpoint`, a file that is written every so many
+    epochs; where it is there, training goes on from it, to the same numbers. `tell(epoch, loss, score)` after each
+    epoch.
 
     **Raises:** `NotFiniteError` with the batch; of several members, one whose loss is not finite stops, and keeps
     what it had. `InputError` where `held` never had a finite score, and for a checkpoint of other shapes; that it is of
     the same data and settings is the caller's to see to.
     """
+    if held is not None and not isinstance(objective, Scored):
+        raise TypeError(f"{type(objective).__name__} has no score, and rows are held out")
     entries = jax.tree.leaves(data)[0].shape[0]
     batch = min(plan.batch, entries)
     epoch: Callable[..., Any] = functools.partial(_epoch, objective, optimiser, plan, batch)
     start: Callable[..., Any] = functools.partial(_start, optimiser, plan)
     if members:
-        epoch = functools.partial(_in_turn, epoch)
+        each = functools.partial(_in_turn, epoch)
+        epoch = each if members == "in turn" else jax.vmap(epoch, in_axes=(0, 0, 0, None, None))
         start = jax.vmap(start)
     step: Any = eqx.filter_jit(epoch)
     state = start(weights, memory)
@@ -194,7 +199,7 @@ def _shuffled(key: PRNGKeyArray, epoch: Any, entries: int, batch: int) -> Array:
 
 
 def _epoch(
-    objective: Objective,
+    objective: Any,
     optimiser: optax.GradientTransformation,
     plan: Plan,
     batch: int,

@@ -59,17 +59,36 @@ def test_forgetting_outside_its_range_is_one_line():
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_recurrent_network_learns(kind):
     trip = drive(600)
-    model = train_recurrent(kind, trip, key=jax.random.key(0), units=4, steps=150, batch=16, length=32, burn_in=8)
-    error = model.predict(trip) - model.measured(trip)
-    assert np.mean(error**2) < 0.3 * np.var(trip.target)
-    assert model.parameters == sum(x.size for x in jax.tree.leaves(model.network) if hasattr(x, "size"))
+    keys = jax.random.split(jax.random.key(0), 2)
+    settings = {"units": 4, "steps": 150, "batch": 16, "length": 32, "burn_in": 8}
+    models = train_recurrent(kind, trip, keys=keys, **settings)
+    for model in models:
+        error = model.predict(trip) - model.measured(trip)
+        assert np.mean(error**2) < 0.3 * np.var(trip.target)
+        assert model.parameters == sum(x.size for x in jax.tree.leaves(model.network) if hasattr(x, "size"))
+    assert np.abs(models[0].predict(trip) - models[1].predict(trip)).max() > 1e-3
+    (alone,) = train_recurrent(kind, trip, keys=keys[1:], **settings)
+    np.testing.assert_allclose(alone.predict(trip), models[1].predict(trip), rtol=1e-3, atol=1e-2)
+
+
+def test_recurrent_network_learns_nothing_of_rows_that_are_left_out():
+    trip = drive(600)
+    without = (np.arange(600) >= 200) & (np.arange(600) < 350)
+    keys = jax.random.split(jax.random.key(0), 1)
+    settings = {"units": 4, "steps": 20, "batch": 16, "length": 32, "burn_in": 8, "without": without}
+    changed = dataclasses.replace(trip, target=np.where(without, 77.0, trip.target))
+    (first,) = train_recurrent("gru", trip, keys=keys, **settings)
+    (again,) = train_recurrent("gru", changed, keys=keys, **settings)
+    np.testing.assert_array_equal(first.predict(trip), again.predict(trip))
+    with pytest.raises(InputError, match="30 rows to train on"):
+        train_recurrent("gru", trip, keys=keys, **{**settings, "without": np.arange(600) >= 30})
 
 
 def test_recurrent_refuses_in_one_line():
     with pytest.raises(InputError, match="one of lstm, gru"):
-        train_recurrent("rnn", drive(300), key=jax.random.key(0))
+        train_recurrent("rnn", drive(300), keys=jax.random.split(jax.random.key(0), 1))
     with pytest.raises(InputError, match="a window has"):
-        train_recurrent("lstm", drive(100), key=jax.random.key(0))
+        train_recurrent("lstm", drive(100), keys=jax.random.split(jax.random.key(0), 1))
 
 
 @pytest.mark.parametrize("kind", CLASSICAL)

@@ -165,7 +165,8 @@ def test_training_stops_and_the_best_epoch_is_kept():
     assert np.isnan(told[-1][2])
 
 
-def test_members_side_by_side_are_each_as_alone_and_one_that_diverges_harms_no_other():
+@pytest.mark.parametrize("how", ["in turn", "side by side"])
+def test_members_are_each_as_alone_and_one_that_diverges_harms_no_other(how):
     plan = Plan(epochs=8, batch=7, patience=2, stop_after=3)
     keys = jax.random.split(KEY, 4)
     settings = jnp.asarray([1.0, 3e38, 0.5, 20.0], jnp.float32)  # the second overflows, the last is not stable
@@ -173,7 +174,7 @@ def test_members_side_by_side_are_each_as_alone_and_one_that_diverges_harms_no_o
     make = lambda w, m, k, s, **more: train(  # noqa: E731
         Line(noise=0.2), w, m, rows(), optax.sgd(0.05), plan, key=k, settings=s, held=rows(9, 1), **more
     )
-    every = make(weights, memory, keys, settings, members=True)
+    every = make(weights, memory, keys, settings, members=how)
     assert np.isfinite(every.weights).all()
     np.testing.assert_array_equal(every.weights[1], weights[1])  # it has what it had
     assert np.isnan(every.losses[1]).all()
