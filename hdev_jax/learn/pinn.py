@@ -39,7 +39,8 @@ class Recipe:
       `free`, the table times an exponential; `table`, not predicted at all.
     - `coefficient_inputs`: `all` features, or those that a coefficient can depend on (`physical`).
     - `coefficient_loss`: squares of the distance from the table, `relative` to it or `absolute`.
-    - `by_vehicle`: coefficients and effects have a part of each vehicle's own, shrunk to the fleet's.
+    - `by_vehicle`: coefficients and effects have what trained vehicles have in common, their mean, and a part of each
+      vehicle's own about it; a vehicle that was not trained on has the mean.
     - `loss`: `squares` (equation 7), or the normal `likelihood` of measured and of physical energy, whose variances
       are learned, which is what weighs the terms against each other (Kendall, Gal and Cipolla, CVPR 2018).
     - `energy_head`: with the head, or without; `stretch`, rows of a stretch of a trip whose sum counts too (1: none):
@@ -85,7 +86,8 @@ class Prediction(eqx.Module):
 
 class Pinn(eqx.Module):
     """Weights of a recipe. `common` [2] and `own` [vehicle, 2] are logarithms of coefficients over their tables;
-    `sizes` and `own_sizes` are the effects' sizes in units of their usual scale.
+    `sizes` and `own_sizes` are the effects' sizes in units of their usual scale. What is a vehicle's own counts from
+    the mean over vehicles.
 
     `scale_wh` is the unit of the energy head.
 
@@ -187,10 +189,16 @@ class Pinn(eqx.Module):
         return Prediction(base + residual, physics, residual, c_rr, cda, sd), heads, memory
 
 
+def _centred(table: Array) -> Array:
+    """What each vehicle has of its own, about the mean. Were it not, the own parts could take all that the vehicles
+    share and leave the common part, which is all that is known of an unseen vehicle, at the tables."""
+    return table - jnp.mean(table, axis=0, keepdims=True)
+
+
 def _of(table: Array, vehicle: Ids) -> Array:
-    """The vehicle's entry; zero for one that was not trained on."""
+    """The vehicle's own part; zero for one that was not trained on."""
     zero = jnp.zeros((1, *table.shape[1:]), table.dtype)
-    return jnp.concatenate([table, zero])[jnp.minimum(vehicle, table.shape[0])]
+    return jnp.concatenate([_centred(table), zero])[jnp.minimum(vehicle, table.shape[0])]
 
 
 @eqx.filter_jit
@@ -255,8 +263,9 @@ class Objective:
             whole = lambda x: jnp.sum((w * x).reshape(shape), axis=1)  # noqa: E731
             sd = jnp.sqrt(whole(p.sd_wh**2) + (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + 1e-6)
             data = data + jnp.sum(_normal(whole(error), sd) * (whole(w) > 0)) / count
-        own = sum(jnp.sum(x**2) for x in model.own_sizes.values()) + sum(jnp.sum(x**2) for x in model.sizes.values())
-        prior = 0.5 * (jnp.sum(model.own**2) + jnp.sum(model.common**2)) / _LOG_SD**2 + 0.5 * own
+        sizes = [*map(_centred, model.own_sizes.values()), *model.sizes.values()]
+        logs = jnp.sum(_centred(model.own) ** 2) + jnp.sum(model.common**2)
+        prior = 0.5 * logs / _LOG_SD**2 + 0.5 * sum(jnp.sum(x**2) for x in sizes)
         by_row = jnp.sum(w[:, None] * heads.coefficients**2) / count
         return data, physics, prior / self.rows + 0.01 * by_row
 
