@@ -90,7 +90,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             + ("measured buses" if config.data == "ztbus" else "a synthetic one, whose noise they share by no means"),
             "training, validation and test by route" if config.data == "fleet" else "missions held out, by fold",
             "features without units hold the energy by the calibrated kernel: no black box is quite without physics",
-            "errors of coefficients: median of predicted over true, less one; spray is air in the truth",
+            "errors of coefficients: median of predicted over true, less one; spray counts as air",
             *_lost(results),
             *([GIVEN] if config.data == "fleet" else []),
             "effects in ours: " + ", ".join(next(used, ["none"])),

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads, Network
-from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, coefficients_that_hold, energy, wheel_energy, with_coefficients
-from hdev_jax.physics import Effect, Grouped
+from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, energy, wheel_energy, with_coefficients
+from hdev_jax.physics import Effect, Grouped, coefficients_that_hold
 from hdev_jax.segments import Column, Ids
 
 __all__ = ["C_RR_LIMIT", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
@@ -209,7 +209,8 @@ def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
     if not model.effects:
         return p
     car = with_coefficients(rows.car, p.c_rr, p.cda_m2, *model.effects_of(rows))
-    return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, coefficients_that_hold(car, rows.segments))
+    both = jax.vmap(coefficients_that_hold)(car, jax.tree.map(jnp.asarray, rows.segments))
+    return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, both)
 
 
 def ready(model: Pinn, memory: eqx.nn.State) -> Callable[[Rows], Prediction]:

@@ -18,16 +18,13 @@ from hdev_jax.errors import InputError
 from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Effect, Vehicle
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
-from hdev_jax.physics.effect import resolve
-from hdev_jax.physics.library import WITH_AIR, WITH_WEIGHT
-from hdev_jax.physics.road import mean_square_speed, weight_on_road
+from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Column, Ids, Segments
 
 __all__ = [
     "FEATURES",
     "PHYSICAL",
     "Rows",
-    "coefficients_that_hold",
     "concatenated",
     "energy",
     "row_wise",
@@ -100,21 +97,6 @@ def wheel_energy(car: Vehicle, segments: Segments) -> Float[Array, " row"]:
     """Energy at the wheels of each row by the kernel [Wh] (paper 1, equation 4)."""
     force = jax.vmap(lambda c, s: c.force(jax.tree.map(lambda x: x[None], s))[0])(car, segments)
     return force * segments.distance_m / 3600.0
-
-
-@eqx.filter_jit
-def coefficients_that_hold(car: Vehicle, segments: Segments) -> tuple[Float[Array, " row"], Float[Array, " row"]]:
-    """c_rr and C_d·A [m²] of each row with all effects that go with the weight, and with the air (at least 0.1 m/s of
-    it). `car` has a value of each coefficient for each row. Of `wet_road`, spray counts as rolling."""
-
-    def one(c: Vehicle, s: Segments) -> tuple[Any, Any]:
-        c = resolve(c, s)
-        force = {e.id: e.force(s, c) for e in c.effects if e.id in WITH_WEIGHT + WITH_AIR}
-        air = 0.5 * AIR_DENSITY_KGPM3 * jnp.maximum(mean_square_speed(s), 1e-2)
-        rolling = sum(f for k, f in force.items() if k in WITH_WEIGHT)
-        return rolling / weight_on_road(s, c), sum(f for k, f in force.items() if k in WITH_AIR) / air
-
-    return jax.vmap(one)(car, segments)
 
 
 def row_wise(effect: Effect | type[Effect]) -> bool:
