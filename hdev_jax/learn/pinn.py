@@ -20,7 +20,7 @@ from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, energy, wheel_energy, with_
 from hdev_jax.physics import Effect, Grouped, coefficients_that_hold
 from hdev_jax.segments import Column, Ids
 
-__all__ = ["C_RR_LIMIT", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
+__all__ = ["C_RR_LIMIT", "Choices", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
 
 C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
 _LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
@@ -28,10 +28,10 @@ _BY_ROW = 0.5  # how far the network's head moves a free coefficient, in logarit
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What is built and what is minimised.
+class Choices:
+    """What is built and what is minimised, but for the inputs.
 
-    - `features`, names of columns; `units`, `normalised`, `dropout`: the network.
+    - `units`, `normalised`, `dropout`: the network.
     - `predicted`, what E_pred of equation 7 is: `residual`, the physics with predicted coefficients plus what the
       energy head says; `alone`, what that head says; `table`, the physics at the tables plus what the head says.
     - `physics`: `battery` (equation 5) or `wheel` (equation 4 as equation 7 cites it).
@@ -47,7 +47,6 @@ class Recipe:
       a composite likelihood, rows and sums being the same data twice.
     """
 
-    features: tuple[str, ...]
     units: tuple[int, ...] = (256, 128)
     normalised: bool = True
     dropout: float = 0.1
@@ -61,6 +60,13 @@ class Recipe:
     loss: Literal["squares", "likelihood"] = "squares"
     energy_head: bool = True
     stretch: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Choices):
+    """Choices and inputs: `features`, names of columns."""
+
+    features: tuple[str, ...]
 
 
 class Sized(NamedTuple):

@@ -16,7 +16,7 @@ from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
 
-__all__ = ["Ensemble", "Member", "fit", "stretches"]
+__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "fit", "stretches"]
 
 PAPER_WEIGHTS = (1.0, 0.1, 0.01)  # λ₁, λ₂, λ₃ of section 3.3.2
 _AT_ONCE = 2**13  # rows of a prediction; of more, what the hidden layers say does not fit the caches

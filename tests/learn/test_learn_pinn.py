@@ -23,7 +23,7 @@ from hdev_jax.learn.pinn_rows import concatenated
 from hdev_jax.learn.train import Plan
 from hdev_jax.physics import LIBRARY
 
-PLAIN = Recipe(FEATURES, units=(6,), normalised=False, dropout=0.0)
+PLAIN = Recipe(features=FEATURES, units=(6,), normalised=False, dropout=0.0)
 AUXILIARY = Sized(LIBRARY["auxiliary_power"], (("power_w", 0),))
 KEY = jax.random.key(0)
 
