@@ -47,7 +47,6 @@ class Model(Strict, Choices):
     weights: tuple[float, float, float] = Field(PAPER_WEIGHTS, strict=False)
     members: int = Field(1, ge=1)  # of an ensemble
     rate: float = Field(0.005, gt=0)
-    decay: float = Field(0.0, ge=0)
     batch: int = Field(1024, ge=1)
 
 
@@ -77,7 +76,6 @@ class Config(Strict):
     page: Literal["table", "coefficients", "shares", "grid"] = "table"
     coefficient: Literal["c_rr", "cda_m2"] = "c_rr"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    wanted: dict[str, float] = Field(default_factory=dict)
     seed: int = 1
 
 
@@ -260,7 +258,6 @@ def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]
         members,
         plan=plan,
         rate=spec.rate,
-        decay=spec.decay,
         effects=sized(tasks[0]["effects"]),
     )
     shown = np.isin(use, (2, 3))

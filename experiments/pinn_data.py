@@ -55,7 +55,6 @@ class Data:
 
     vehicles: tuple[Member, ...]
     trained: int
-    synthetic: bool
 
     def rows(self, features: Sequence[str], effects: Sequence[str] = ()) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
@@ -162,7 +161,7 @@ def _fleet(
             v.id, v.segments.without(*TELLS), v.energy_wh, v.tabular, paper_table(v.variant.c_rr, v.variant.cda_m2),
             route, by_route[route - begin], v.truth["c_rr"], v.truth["cda_m2"], v.variant,
         ))  # fmt: skip
-    return Data(tuple(members), sum(m.id not in held for m in members), synthetic=True)
+    return Data(tuple(members), sum(m.id not in held for m in members))
 
 
 def _thin(made: list[Any], share: float, seed: int) -> None:
@@ -206,4 +205,4 @@ def _buses(fold: int, share: float, missions: int) -> Data:
         energy = np.concatenate([m.energy_wh for m in own])
         members.append(Member(bus, segments, energy, vehicle, table, trip + first, use[trip]))
         first += len(own)
-    return Data(tuple(members), len(members), synthetic=False)
+    return Data(tuple(members), len(members))

@@ -120,7 +120,7 @@ def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
 
 def networks(
     rows: Rows, use: np.ndarray, recipe: Recipe, data: Data, members: Sequence[tuple[int, Sequence[float]]], *,
-    plan: Plan, rate: float, decay: float, effects: tuple[Sized, ...], checkpoint: Path | None = None,
+    plan: Plan, rate: float, effects: tuple[Sized, ...],
 ) -> Ensemble:  # fmt: skip
     """Members by seed and weights, trained side by side on the training rows, kept at their best on the validation."""
     from hdev_jax import progress
@@ -132,7 +132,6 @@ def networks(
             progress.step(f"epoch {epoch + 1}: loss {loss:.4g}, validation {score:.4g}")
 
     return fit(
-        recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate, decay=decay,
-        members=seeds, effects=effects, checkpoint=checkpoint,
-        tell=tell,
+        recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate,
+        members=seeds, effects=effects, tell=tell,
     )  # fmt: skip

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -108,16 +107,15 @@ def fit(
     members: Sequence[Member],
     plan: Plan,
     rate: float = 0.005,
-    decay: float = 0.0,
     effects: tuple[Sized, ...] = (),
-    checkpoint: Path | None = None,
     tell: Callable[[int, float, float], None] | None = None,
 ) -> Ensemble:
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
-    **Arguments:** `vehicles`, how many there are in `rows`; `decay`, of the weights (AdamW). All members train in one
-    program. **Raises:** `NotFiniteError` where a single member's loss is not finite; `InputError` where there are no
-    rows, or where a table's c_rr is not within the bounds that the recipe keeps it in.
+    **Arguments:** `vehicles`, how many there are in `rows`. All members train in one program.
+
+    **Raises:** `NotFiniteError` where a single member's loss is not finite; `InputError` where there are no rows, or
+    where a table's c_rr is not within the bounds that the recipe keeps it in.
     """
     if not len(rows) or not len(held):
         raise InputError(f"{len(rows)} rows to train on and {len(held)} held out; some of both are needed")
@@ -145,14 +143,13 @@ def fit(
     memory = jax.tree.map(lambda *x: jnp.stack(x), *(s for _, s in made))
     keys = jnp.stack([jax.random.fold_in(jax.random.key(m.seed), 1) for m in members])
     settings = jnp.asarray([m.weights for m in members], jnp.float32)
-    optimiser = optax.adamw(rate, weight_decay=decay) if decay else optax.adam(rate)
     single = len(members) == 1
     if single:
         weights, memory = jax.tree.map(lambda x: x[0], (weights, memory))
         keys, settings = keys[0], settings[0]
     trained = train(
-        Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optimiser, plan, key=keys,
-        held=jax.tree.map(jnp.asarray, check), settings=settings, members=not single, checkpoint=checkpoint, tell=tell,
+        Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optax.adam(rate), plan,
+        key=keys, held=jax.tree.map(jnp.asarray, check), settings=settings, members=not single, tell=tell,
     )  # fmt: skip
     weights, memory = trained.weights, trained.memory
     if single:
