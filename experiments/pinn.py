@@ -38,7 +38,7 @@ class Model(Strict, Choices):
 
     kind: Literal["vehicles", "lightgbm", "network"] = "network"
     like: str = ""  # another model of the config, of which this one is a delta
-    features: Literal["printed", "channels", "unitless"] = "channels"
+    features: Literal["printed", "channels", "unitless", "raw"] = "channels"
     # of the choices, what a config can get wrong; strict would refuse a list of TOML for a tuple
     units: tuple[int, ...] = Field(Choices.units, strict=False)
     dropout: float = Field(Choices.dropout, ge=0, lt=1)

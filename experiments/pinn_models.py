@@ -29,7 +29,7 @@ def names_of(features: str, data: Data) -> tuple[str, ...]:
     needs = {
         "wind_along": ("wind_speed_mps",), "wind_across": ("wind_speed_mps",), "wet": ("wet_road",),
         "surface_1": ("road_surface",), "surface_2": ("road_surface",), "surface_3": ("road_surface",),
-        "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",),
+        "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",), "ambient_temp_c": ("ambient_temp_c",),
     }  # fmt: skip
     return tuple(n for n in FEATURES[features] if have.has(*needs.get(n, ())))
 

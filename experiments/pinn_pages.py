@@ -91,7 +91,8 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "the paper's numbers are of its own, private fleet; ours are of "
             + ("measured buses" if config.data == "ztbus" else "a synthetic one, whose noise they share by no means"),
             "training, validation and test by route" if config.data == "fleet" else "missions held out, by fold",
-            "features without units hold the energy by the calibrated kernel: no black box is quite without physics",
+            "features without units hold the energy by the calibrated kernel: only a black box with no kernel, where "
+            "there is one, is without physics",
             "errors of coefficients: median of predicted over true, less one; spray counts as air",
             *_lost(results),
             *([GIVEN] if config.data == "fleet" else []),

@@ -50,6 +50,14 @@ def test_every_ablation_of_the_networks_changes_one_thing():
         assert len(changed) == (name not in ("ours", "paper")), name
 
 
+def test_a_black_box_without_a_kernel_differs_by_its_inputs_alone():
+    models = chosen(config("paper1/table2"))
+    for name, base in (("LightGBM, no kernel", "lightgbm"), ("network, no kernel", "network without physics")):
+        one, other = models[name], models[base]
+        assert {k for k in type(one).model_fields if getattr(one, k) != getattr(other, k)} == {"features"}
+        assert one.features == "raw"
+
+
 def test_loss_weights_come_by_pairs_and_train_together():
     every = list(tasks(config("studies/pinn_weights")))
     weights = {tuple(t["weights"]) for t in every}

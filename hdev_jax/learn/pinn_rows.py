@@ -36,7 +36,8 @@ __all__ = [
 _REFERENCE_M = 100.0  # the length of the paper's segments; √(g·100 m) is the unit of speed
 _PADDED = 4096
 
-# The paper's three; with what the physics needs besides; with everything that has no unit.
+# The paper's three; with what the physics needs besides; with everything that has no unit; and for black boxes without
+# any kernel the log's own columns and the sheet's numbers, nothing being worked out of them.
 _PRINTED = ("speed_mps", "mass_kg", "grade_rad")
 _CHANNELS = (*_PRINTED, "accel_mps2", "c_rr_table", "cda_table")
 _UNITLESS = (
@@ -44,7 +45,8 @@ _UNITLESS = (
     "duration", "length", "elapsed", "mass_of_sheet", "temperature", "wind_along", "wind_across", "wet", "surface_1",
     "surface_2", "surface_3", "warmth", "cornering", "efficiency", "halt",
 )  # fmt: skip
-FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS}
+_RAW = (*_CHANNELS, "duration_s", "distance_m", "ambient_temp_c", "mass_table_kg", "auxiliary_table_w")
+FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
 # Those that a coefficient may depend on: not the power that is asked for, nor how steep it is.
 PHYSICAL = ("froude", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3",
             "warmth", "cornering")  # fmt: skip
@@ -203,12 +205,16 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
     match name.rpartition("_"):
         case "surface", _, k:
             return (channel("road_surface") == int(k)) * one
-        case _ if name in ("speed_mps", "accel_mps2"):
+        case _ if name in ("speed_mps", "accel_mps2", "duration_s", "distance_m"):
             return np.asarray(getattr(s, name))
         case _ if name == "mass_kg":
             return mass
-        case _ if name == "grade_rad":
-            return channel("grade_rad")
+        case _ if name in ("grade_rad", "ambient_temp_c"):
+            return channel(name)
+        case _ if name == "mass_table_kg":
+            return float(vehicle.mass_kg) * one
+        case _ if name == "auxiliary_table_w":
+            return (float(vehicle.effect("auxiliary").auxiliary_w) if vehicle.has("auxiliary") else 0.0) * one
         case _ if name == "c_rr_table":
             return c_rr * one
         case _ if name == "cda_table":

@@ -160,10 +160,23 @@ def test_features_are_what_their_names_say():
         "specific_energy": 3600 * energy_by_hand(s) / (mass * g * 100), "efficiency": np.full(60, 0.85),
         "halt": distance == 0, "surface_2": s.channels["road_surface"] == 2, "warmth": np.exp(-gone / 6000),
         "wind_across": (s.channels["wind_speed_mps"] * np.sin(delta)) ** 2 / (g * 100),
+        "duration_s": s.duration_s, "distance_m": distance, "ambient_temp_c": s.channels["ambient_temp_c"],
+        "mass_table_kg": np.full(60, 30e3), "auxiliary_table_w": np.full(60, 2000.0),
     }  # fmt: skip
     for name, column in expected.items():
         np.testing.assert_allclose(x[name], column, rtol=2e-5, atol=1e-6, err_msg=name)
     assert set(PHYSICAL) <= set(FEATURES["unitless"])
+
+
+def test_what_a_black_box_without_a_kernel_is_given_does_not_depend_on_the_kernels_energy():
+    s = road()
+    calibrated = truck({**TABLE, "c_rr": 0.012, "cda_m2": 9.0, "auxiliary_w": 9e3})
+
+    def features(name, of):
+        return rows_of(truck(), s, np.zeros(60), number=0, features=FEATURES[name], calibrated=of).features
+
+    np.testing.assert_array_equal(features("raw", None), features("raw", calibrated))
+    assert np.abs(features("unitless", None) - features("unitless", calibrated)).max() > 0.01
 
 
 def test_bad_input_is_one_line():
