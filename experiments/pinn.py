@@ -15,13 +15,14 @@ from pydantic import Field
 from experiments import pinn_pages
 from experiments.config import Strict
 from experiments.data import MissingDataError, fingerprint
-from experiments.pinn_buses import bus_files
+from experiments.pinn_buses import bus_sources
 from experiments.pinn_data import Data, load
 from experiments.pinn_models import bayesian, boosted, diagnosed, kernel, names_of, networks, said, sized
 from experiments.pinn_scores import scores
+from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, DivergedError
 from hdev_jax.learn.pinn_rows import energy
 from hdev_jax.learn.train import Plan
 from hdev_jax.physics import LIBRARY
@@ -32,7 +33,8 @@ __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_togeth
 SOURCES = ("pinn.py", "pinn_data.py", "pinn_models.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py")
 
 
-class Model(Strict, Choices):
+# frozen as `Choices` is: by the setting of `Strict`, which a type checker does not see
+class Model(Strict, Choices):  # pyright: ignore[reportGeneralTypeIssues]
     """A row of the table. `kind`: what by vehicle needs no network (`vehicles`), LightGBM, or a network, whose recipe
     is made of these choices."""
 
@@ -90,7 +92,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
             if config.data == "ztbus":
                 try:
-                    data["files"] = fingerprint(bus_files(config.routes))
+                    data["files"] = fingerprint(bus_sources(config.routes))
                 except MissingDataError:
                     return
             for name, model in chosen(config).items():
@@ -250,16 +252,13 @@ def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]
     recipe = Recipe(features=names_of(spec.features, data), **choices)
     plan = Plan(tasks[0]["epochs"], spec.batch, 0.5, tasks[0]["patience"], stop_after=tasks[0]["stop_after"])
     members = [(t["seed"] * 1000 + k, t["weights"]) for t in tasks for k in range(spec.members)]
-    ensemble = networks(
-        rows,
-        use,
-        recipe,
-        data,
-        members,
-        plan=plan,
-        rate=spec.rate,
-        effects=sized(tasks[0]["effects"]),
-    )
+    try:
+        ensemble = networks(
+            rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=sized(tasks[0]["effects"])
+        )
+    except DivergedError as e:
+        progress.step(f"{tasks[0]['name']}: {e}")
+        return [{"diverged": True} for _ in tasks]
     shown = np.isin(use, (2, 3))
     picked, uses = rows.take(shown), use[shown]
     every = ensemble.predict(picked)

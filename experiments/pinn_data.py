@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.paper1_halves import AUXILIARY_SD_W, coefficient, fitted, paper_table
-from experiments.pinn_buses import BUSES, buses
+from experiments.pinn_buses import BUSES, SHEET, buses
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import simulate
 from hdev_jax.inference import ParameterTable
@@ -23,7 +22,6 @@ from hdev_jax.segments import Segments
 
 __all__ = ["Data", "Member", "load"]
 
-BUS_SHEET = Path(__file__).parents[1] / "configs" / "vehicles" / "ztbus_road.toml"
 # What no network and no learner is told: it would tell the force of the drive, and with it the energy.
 TELLS = ("requested_torque_nm", "brake_pressure_pa", "halt_brake", "door_open", "passengers", "gear_middle")
 SPLIT = (0.70, 0.15)  # training and validation, by route (paper 1, section 3.3.2); the rest tests
@@ -175,7 +173,7 @@ def _thin(made: list[Any], share: float, seed: int) -> None:
 
 
 def _buses(fold: int, share: float, missions: int) -> Data:
-    sheet = read_sheet(BUS_SHEET)
+    sheet = read_sheet(SHEET)
     members, first = [], 0
     every = buses(missions=missions)
     for bus in BUSES:

@@ -46,11 +46,31 @@ def _gathered(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
     return out
 
 
-def _line(name: str, use: str, found: list[dict[str, Any]], of: int) -> dict[str, Any]:
-    """A row of the table; where `of` seeds are there, errors are of all of them together."""
+def _distinct(results: Results) -> dict[tuple[str, str], tuple[int, int]]:
+    """Rows and trips by (way, use) without those that another seed has, too: of each fold and vehicle once."""
+    once: dict[tuple[str, str], dict[tuple[Any, ...], tuple[int, int]]] = {}
+    for task, result in results:
+        of = (task["data"].get("fold"), task.get("vehicle"))
+        for key, (scored,) in _gathered([(task, result)]).items():
+            once.setdefault(key, {})[of] = (scored["rows"], scored["trips"])
+    return {key: (sum(n for n, _ in of.values()), sum(t for _, t in of.values())) for key, of in once.items()}
+
+
+def _trainings(results: Results) -> dict[str, tuple[int, int]]:
+    """By model that is trained: how many trainings there are, and how many of them diverged."""
+    out: dict[str, tuple[int, int]] = {}
+    for task, result in results:
+        if task["model"]["kind"] != "vehicles":
+            n, lost = out.get(task["name"], (0, 0))
+            out[task["name"]] = (n + 1, lost + ("diverged" in result))
+    return out
+
+
+def _line(name: str, use: str, found: list[dict[str, Any]], distinct: tuple[int, int]) -> dict[str, Any]:
+    """A row of the table; of several seeds, errors are of all of them together."""
     p = pooled(found)
     return {
-        "model": name, "rows of": use, "n": p["rows"] // of, "trips": p["trips"] // of, "RMSE [Wh]": p["rmse_wh"],
+        "model": name, "rows of": use, "n": distinct[0], "trips": distinct[1], "RMSE [Wh]": p["rmse_wh"],
         "PE [%]": p["pe_percent"], "PE of a trip, mean [%]": p["trip_pe_mean"],
         "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
@@ -62,17 +82,22 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     """Every model on the same rows, the paper's numbers beside those that it prints."""
     gathered = _gathered(results)
     data = "measured (ZTBus)" if config.data == "ztbus" else "synthetic fleet"
-    seeds = {name: len(config.seeds) for name, m in config.models.items() if m.kind != "vehicles"}
+    distinct, trainings = _distinct(results), _trainings(results)
     rows, lines = [], []
     for (way, use), found in gathered.items():
         p = pooled(found)
-        line = _line(way, use, found, seeds.get(way.split(",")[0], 1))
+        line = _line(way, use, found, distinct[way, use])
         name = NAMED.get(way, way)
         paper = config.paper.get(name) if use == "test" else None
         lines.append({"data": data, **line, "paper RMSE": (paper or {}).get("rmse"),
                       "paper PE": (paper or {}).get("pe")})  # fmt: skip
         mine = {"rmse": p.pop("rmse_wh"), "pe": p.pop("pe_percent"), **p}
         rows.append({"name": name if use == "test" else f"{name} ({use})", "paper": paper, "ours": mine})
+    for model, (n, lost) in trainings.items():
+        if n == lost:
+            name, said = NAMED.get(model, model), f"diverged, {lost} of {n} trainings"
+            lines.append({"data": data, "model": f"{model}: {said}", "rows of": "test", "n": 0})
+            rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": said})
     write_tables(run, "table", lines, config.caption)
     at_bound = _at_bound(results)
     if at_bound:
@@ -118,14 +143,14 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": rows,
         "better_than_paper": 0, "of": 0, "missed": [],
-        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth"],
+        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth", *_lost(results)],
     }  # fmt: skip
 
 
 def _lost(results: Results) -> list[str]:
     """How many trainings diverged, where any did."""
-    lost = [t["name"] for t, r in results if "diverged" in r]
-    return [f"{len(lost)} trainings diverged and are in no row: {', '.join(sorted(set(lost)))}"] if lost else []
+    lost = [f"{model} {k} of {n}" for model, (n, k) in _trainings(results).items() if k]
+    return [f"trainings that diverged, and are in no error: {', '.join(lost)}"] if lost else []
 
 
 def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound: Mapping[str, Any]) -> list[str]:
@@ -210,6 +235,8 @@ def _spread(ax: Any, at: float, q: Sequence[float], colour: str, label: str | No
 def _boxes(run: Run, quantiles: Mapping[str, Any], name: str, label: str) -> None:
     """Figures 6 and 7: the prediction by truck model, and what the paper could not know, the truth."""
     ways = [k for k in (PAPER_MODEL, OURS) if k in quantiles]
+    if not ways:
+        raise InputError("every training of the networks diverged; lower the rate")
     models = [m for m in MODELS if all(m in quantiles[k] for k in ways)]
     fig = figure(8.0, 3.4)
     ax = fig.add_subplot()
@@ -326,12 +353,12 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
     for task, result in results:
         if "network" in result:
             found.setdefault(tuple(task["weights"]), []).append(pooled([result["network"]["test"]])["rmse_wh"])
+    if not found:
+        raise InputError("every training of the grid diverged; lower the rate")
     lines = [{"λ₁": w[0], "λ₂": w[1], "λ₃": w[2], "seeds": len(x), "RMSE [Wh]": float(np.median(x)), "least": min(x),
               "most": max(x)} for w, x in sorted(found.items())]  # fmt: skip
     write_tables(run, "grid", lines, config.caption)
     _maps(run, {w: float(np.median(x)) for w, x in found.items()})
-    if not lines:
-        raise InputError("every training of the grid diverged; lower the rate")
     best = min(lines, key=lambda x: x["RMSE [Wh]"])
     lost = sum("diverged" in r for _, r in results)
     where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"

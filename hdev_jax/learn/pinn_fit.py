@@ -15,10 +15,14 @@ from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
 
-__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "fit", "stretches"]
+__all__ = ["PAPER_WEIGHTS", "DivergedError", "Ensemble", "Member", "fit", "stretches"]
 
 PAPER_WEIGHTS = (1.0, 0.1, 0.01)  # λ₁, λ₂, λ₃ of section 3.3.2
 _AT_ONCE = 2**13  # rows of a prediction; of more, what the hidden layers say does not fit the caches
+
+
+class DivergedError(InputError):
+    """No network of a fit had a finite loss and a finite score."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +118,8 @@ def fit(
 
     **Arguments:** `vehicles`, how many there are in `rows`. All members train in one program.
 
-    **Raises:** `NotFiniteError` where a single member's loss is not finite; `InputError` where there are no rows, or
-    where a table's c_rr is not within the bounds that the recipe keeps it in.
+    **Raises:** `DivergedError` where no member is left; `InputError` where there are no rows, or where a table's c_rr
+    is not within the bounds that the recipe keeps it in.
     """
     if not len(rows) or not len(held):
         raise InputError(f"{len(rows)} rows to train on and {len(held)} held out; some of both are needed")
@@ -147,10 +151,13 @@ def fit(
     if single:
         weights, memory = jax.tree.map(lambda x: x[0], (weights, memory))
         keys, settings = keys[0], settings[0]
-    trained = train(
-        Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optax.adam(rate), plan,
-        key=keys, held=jax.tree.map(jnp.asarray, check), settings=settings, members=not single, tell=tell,
-    )  # fmt: skip
+    try:
+        trained = train(
+            Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optax.adam(rate), plan,
+            key=keys, held=jax.tree.map(jnp.asarray, check), settings=settings, members=not single, tell=tell,
+        )  # fmt: skip
+    except InputError as e:  # without a checkpoint it refuses nothing but what is not finite
+        raise DivergedError(str(e)) from e
     weights, memory = trained.weights, trained.memory
     if single:
         weights, memory = jax.tree.map(lambda x: x[None], (weights, memory))

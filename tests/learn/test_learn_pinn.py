@@ -18,7 +18,7 @@ from scipy.stats import norm
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads
 from hdev_jax.learn.pinn import Objective, Pinn, Recipe, Sized, predict
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, fit, stretches
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, DivergedError, Member, fit, stretches
 from hdev_jax.learn.pinn_rows import concatenated
 from hdev_jax.learn.train import Plan
 from hdev_jax.physics import LIBRARY
@@ -292,6 +292,12 @@ def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
         np.testing.assert_allclose(few.energy_wh, all_of.energy_wh[some], rtol=1e-6)
         np.testing.assert_allclose(few.c_rr, all_of.c_rr[some], rtol=1e-6)
     np.testing.assert_allclose(made.mean(rows).energy_wh, (first.energy_wh + second.energy_wh) / 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
+def test_a_fit_of_which_nothing_is_left_says_so(rows, seeds):
+    with pytest.raises(DivergedError, match=r"not finite|finite score"):
+        fit(PLAIN, rows, rows, vehicles=2, members=[Member(s) for s in seeds], plan=Plan(epochs=3), rate=1e30)
 
 
 def test_what_cannot_be_built_is_said_in_one_line(rows):
