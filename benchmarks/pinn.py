@@ -297,7 +297,7 @@ def training(rows: Rows, vehicles: int, turns: int, compiled: bool) -> dict[str,
         print("PyTorch is not here (the extra `benchmarks`): its part is left out")
     count = len(rows) // BATCH * BATCH
     for dropout in (0.1, 0.0):
-        learner = Learner(Recipe(FEATURES["channels"], dropout=dropout), rows, vehicles)
+        learner = Learner(Recipe(features=FEATURES["channels"], dropout=dropout), rows, vehicles)
         for part in ("whole", "network"):
             whole, name = part == "whole", f"{part}_dropout_{dropout:g}"
             sides: dict[str, Callable[[], Any]] = {
@@ -330,7 +330,7 @@ def training(rows: Rows, vehicles: int, turns: int, compiled: bool) -> dict[str,
 
 def inference(rows: Rows, vehicles: int) -> dict[str, float]:
     """Microseconds of one row, seconds of 550,000."""
-    learner = Learner(Recipe(FEATURES["channels"]), rows, vehicles)
+    learner = Learner(Recipe(features=FEATURES["channels"]), rows, vehicles)
     one = jax.tree.map(lambda x: x[:1], rows)
     with_numbers = ready(learner.model, learner.memory)
     ways = {"ready": lambda: with_numbers(one), "predict": lambda: predict(learner.model, learner.memory, one)}
@@ -357,7 +357,7 @@ def inference(rows: Rows, vehicles: int) -> dict[str, float]:
 
 def members(rows: Rows, vehicles: int, counts: list[int], turns: int) -> dict[str, float]:
     """Microseconds of a member and row in training, together and alone; minutes of the grid, 100 epochs each."""
-    learner = Learner(Recipe(FEATURES["channels"]), rows, vehicles)
+    learner = Learner(Recipe(features=FEATURES["channels"]), rows, vehicles)
     sides: dict[str, Callable[[], Any]] = {"alone": learner.epochs(turns + 2)}
     sides |= {f"{n}_together": learner.members(n, turns + 2) for n in counts}
     times = by_turns(sides, turns)

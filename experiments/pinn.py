@@ -6,6 +6,7 @@ diagnosed effects) one vehicle. Networks that differ in seed and loss weights al
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
@@ -14,48 +15,40 @@ from pydantic import Field
 from experiments import pinn_pages
 from experiments.config import Strict
 from experiments.data import MissingDataError, fingerprint
-from experiments.pinn_buses import bus_files
+from experiments.pinn_buses import bus_sources
 from experiments.pinn_data import Data, load
 from experiments.pinn_models import bayesian, boosted, diagnosed, kernel, names_of, networks, said, sized
 from experiments.pinn_scores import scores
+from hdev_jax import progress
 from hdev_jax.errors import InputError
-from hdev_jax.learn.pinn import Recipe
+from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
 from hdev_jax.learn.pinn_rows import energy
-from hdev_jax.learn.train import Plan
+from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
 from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = ("pinn.py", "pinn_data.py", "pinn_models.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py")
-PAPER = (1.0, 0.1, 0.01)
 
 
-class Model(Strict):
+# frozen as `Choices` is: by the setting of `Strict`, which a type checker does not see
+class Model(Strict, Choices):  # pyright: ignore[reportGeneralTypeIssues]
     """A row of the table. `kind`: what by vehicle needs no network (`vehicles`), LightGBM, or a network, whose recipe
-    is that of `hdev_jax.learn.pinn.Recipe`."""
+    is made of these choices."""
 
     kind: Literal["vehicles", "lightgbm", "network"] = "network"
     like: str = ""  # another model of the config, of which this one is a delta
-    features: Literal["printed", "channels", "unitless"] = "channels"
-    units: list[int] = Field(default_factory=lambda: [256, 128])
-    normalised: bool = True
-    dropout: float = Field(0.1, ge=0, lt=1)
-    predicted: Literal["residual", "alone", "table"] = "residual"
-    physics: Literal["battery", "wheel"] = "battery"
-    coefficients: Literal["bounded", "free", "table"] = "bounded"
-    clamp: float = 0.5
-    coefficient_inputs: Literal["all", "physical"] = "all"
-    coefficient_loss: Literal["relative", "absolute"] = "relative"
-    by_vehicle: bool = False
-    loss: Literal["squares", "likelihood"] = "squares"
-    energy_head: bool = True
-    stretch: int = Field(1, ge=1)
+    features: Literal["printed", "channels", "unitless", "raw"] = "channels"
+    # of the choices, what a config can get wrong; strict would refuse a list of TOML for a tuple
+    units: tuple[int, ...] = Field(Choices.units, strict=False)
+    dropout: float = Field(Choices.dropout, ge=0, lt=1)
+    stretch: int = Field(Choices.stretch, ge=1)
     effects: bool = False  # those of the config
-    weights: list[float] = Field(default_factory=lambda: list(PAPER), min_length=3, max_length=3)
+    weights: tuple[float, float, float] = Field(PAPER_WEIGHTS, strict=False)
     members: int = Field(1, ge=1)  # of an ensemble
     rate: float = Field(0.005, gt=0)
-    decay: float = Field(0.0, ge=0)
     batch: int = Field(1024, ge=1)
 
 
@@ -85,7 +78,6 @@ class Config(Strict):
     page: Literal["table", "coefficients", "shares", "grid"] = "table"
     coefficient: Literal["c_rr", "cda_m2"] = "c_rr"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    wanted: dict[str, float] = Field(default_factory=dict)
     seed: int = 1
 
 
@@ -100,7 +92,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
             }  # fmt: skip
             if config.data == "ztbus":
                 try:
-                    data["files"] = fingerprint(bus_files(config.routes))
+                    data["files"] = fingerprint(bus_sources(config.routes))
                 except MissingDataError:
                     return
             for name, model in chosen(config).items():
@@ -157,7 +149,7 @@ def _checked(config: Config) -> None:
         raise InputError("config, key folds: the fleet is split once, [0]; folds are of ztbus")
 
 
-def _weights(config: Config, model: Model) -> list[list[float]]:
+def _weights(config: Config, model: Model) -> list[tuple[float, ...]]:
     """Loss weights that a model is trained with."""
     if not config.grid_values:
         return [model.weights]
@@ -165,14 +157,14 @@ def _weights(config: Config, model: Model) -> list[list[float]]:
     for i, j in ((0, 1), (0, 2), (1, 2)):
         for a in config.grid_values[i]:
             for b in config.grid_values[j]:
-                w = list(PAPER)
+                w: list[float] = list(PAPER_WEIGHTS)
                 w[i], w[j] = a, b
                 found.append(tuple(w))
-    return [list(w) for w in dict.fromkeys(found)]
+    return list(dict.fromkeys(found))
 
 
 def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> Iterator[dict[str, Any]]:
-    task: dict[str, Any] = {"data": data, "name": name, "model": model.model_dump(exclude={"like"})}
+    task: dict[str, Any] = {"data": data, "name": name, "model": model.model_dump(mode="json", exclude={"like"})}
     if model.kind == "vehicles":
         for vehicle in _vehicles(config):
             known = config.diagnosed == ["all"] or (config.data == "fleet" and _id(config, vehicle) in config.diagnosed)
@@ -256,23 +248,17 @@ def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
 
 def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     spec = Model(**tasks[0]["model"])
-    recipe = Recipe(
-        features=names_of(spec.features, data), units=tuple(spec.units),
-        **{k: getattr(spec, k) for k in Recipe.__dataclass_fields__ if k not in ("features", "units")},
-    )  # fmt: skip
+    choices = {f.name: getattr(spec, f.name) for f in fields(Choices)}
+    recipe = Recipe(features=names_of(spec.features, data), **choices)
     plan = Plan(tasks[0]["epochs"], spec.batch, 0.5, tasks[0]["patience"], stop_after=tasks[0]["stop_after"])
     members = [(t["seed"] * 1000 + k, t["weights"]) for t in tasks for k in range(spec.members)]
-    ensemble = networks(
-        rows,
-        use,
-        recipe,
-        data,
-        members,
-        plan=plan,
-        rate=spec.rate,
-        decay=spec.decay,
-        effects=sized(tasks[0]["effects"]),
-    )
+    try:
+        ensemble = networks(
+            rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=sized(tasks[0]["effects"])
+        )
+    except DivergedError as e:
+        progress.step(f"{tasks[0]['name']}: {e}")
+        return [{"diverged": True} for _ in tasks]
     shown = np.isin(use, (2, 3))
     picked, uses = rows.take(shown), use[shown]
     every = ensemble.predict(picked)
@@ -315,11 +301,21 @@ def _scored(
     if recipe.coefficients != "table" or recipe.predicted != "alone":
         physics = mean["physics_wh"] if recipe.physics == "battery" else _at_battery(picked, mean)
         out["physics"] = scores(data, use, whole(physics), **both)
-    if recipe.coefficients == "bounded":
-        table = np.asarray(picked.cda_m2)
-        near = {"c_rr": mean["c_rr"] >= 0.99 * 0.02,
-                "cda_m2": np.abs(np.abs(mean["cda_m2"] / table - 1) - recipe.clamp) <= 0.01 * recipe.clamp}  # fmt: skip
-        out["at_bound"] = {k: float(np.mean(x[uses == 2])) for k, x in near.items()}
+    if recipe.coefficients == "bounded" and np.any(uses == 2):
+        out["at_bound"] = _at_bound(recipe, np.asarray(picked.cda_m2), own, uses == 2)
+    return out
+
+
+def _at_bound(recipe: Recipe, table: np.ndarray, own: Sequence[Any], at: np.ndarray) -> dict[str, int]:
+    """Of the rows `at`, over all members: how many predictions there are, and how many are within 1 % of the range of
+    either bound of each coefficient."""
+    ranges = {"c_rr": (0.0, C_RR_LIMIT), "cda_m2": (1.0 - recipe.clamp, 1.0 + recipe.clamp)}
+    out = {"rows": len(own) * int(at.sum()), "c_rr": 0, "cda_m2": 0}
+    for p in own:
+        for name, x in (("c_rr", np.asarray(p.c_rr)), ("cda_m2", np.asarray(p.cda_m2) / table)):
+            low, high = ranges[name]
+            near = 0.01 * (high - low)
+            out[name] += int(np.sum((x[at] <= low + near) | (x[at] >= high - near)))
     return out
 
 

@@ -9,10 +9,12 @@ from experiments.data import ORIGIN, MissingDataError, data_folder
 from hdev_jax.logs import TARGETS, by_distance, read_log
 from hdev_jax.segments import Segments
 
-__all__ = ["BUSES", "Mission", "bus_files", "buses", "read_mission"]
+__all__ = ["BUSES", "SHEET", "Mission", "bus_files", "bus_sources", "buses", "read_mission"]
 
 BUSES = ("B183", "B208")
-ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "ztbus.toml"
+_CONFIGS = Path(__file__).parents[1] / "configs"
+ADAPTER = _CONFIGS / "adapters" / "ztbus.toml"
+SHEET = _CONFIGS / "vehicles" / "ztbus_road.toml"
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,20 @@ def bus_files(missions: int = 0) -> list[Path]:
     return [p for files in of.values() for p in files[: missions or None]]
 
 
+def bus_sources(missions: int = 0) -> list[Path]:
+    """Every file that rows of the buses are made of: `bus_files`, their slopes where they are there, adapter and sheet.
+
+    Raises what `bus_files` does.
+    """
+    files = bus_files(missions)
+    return [*files, *(s for f in files if (s := _slope(f)).is_file()), ADAPTER, SHEET]
+
+
+def _slope(path: Path) -> Path:
+    """Where the slope of a mission is."""
+    return path.with_name(f"{path.name.split('.')[0]}.grade.csv.gz")
+
+
 def read_mission(path: Path, length_m: float = 100.0) -> Mission:
     """The mission in a file of `bus_files`, by `length_m` of road.
 
@@ -58,7 +74,7 @@ def read_mission(path: Path, length_m: float = 100.0) -> Mission:
     """
     log = by_distance(read_log(path, ADAPTER), length_m)
     if not log.segments.has("grade_rad"):
-        raise MissingDataError(f"{path}: its slope, {path.name.split('.')[0]}.grade.csv.gz, is not beside it")
+        raise MissingDataError(f"{path}: its slope, {_slope(path).name}, is not beside it")
     segments = log.segments.without(*TARGETS)
     return Mission(log.trip_names[0], log.vehicle_names[0], segments, log.target("energy_wh"))
 

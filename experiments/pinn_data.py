@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.paper1_halves import AUXILIARY_SD_W, coefficient, fitted, paper_table
-from experiments.pinn_buses import BUSES, buses
+from experiments.pinn_buses import BUSES, SHEET, buses
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import simulate
 from hdev_jax.inference import ParameterTable
@@ -23,7 +22,6 @@ from hdev_jax.segments import Segments
 
 __all__ = ["Data", "Member", "load"]
 
-BUS_SHEET = Path(__file__).parents[1] / "configs" / "vehicles" / "ztbus_road.toml"
 # What no network and no learner is told: it would tell the force of the drive, and with it the energy.
 TELLS = ("requested_torque_nm", "brake_pressure_pa", "halt_brake", "door_open", "passengers", "gear_middle")
 SPLIT = (0.70, 0.15)  # training and validation, by route (paper 1, section 3.3.2); the rest tests
@@ -55,7 +53,6 @@ class Data:
 
     vehicles: tuple[Member, ...]
     trained: int
-    synthetic: bool
 
     def rows(self, features: Sequence[str], effects: Sequence[str] = ()) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
@@ -162,7 +159,7 @@ def _fleet(
             v.id, v.segments.without(*TELLS), v.energy_wh, v.tabular, paper_table(v.variant.c_rr, v.variant.cda_m2),
             route, by_route[route - begin], v.truth["c_rr"], v.truth["cda_m2"], v.variant,
         ))  # fmt: skip
-    return Data(tuple(members), sum(m.id not in held for m in members), synthetic=True)
+    return Data(tuple(members), sum(m.id not in held for m in members))
 
 
 def _thin(made: list[Any], share: float, seed: int) -> None:
@@ -176,7 +173,7 @@ def _thin(made: list[Any], share: float, seed: int) -> None:
 
 
 def _buses(fold: int, share: float, missions: int) -> Data:
-    sheet = read_sheet(BUS_SHEET)
+    sheet = read_sheet(SHEET)
     members, first = [], 0
     every = buses(missions=missions)
     for bus in BUSES:
@@ -206,4 +203,4 @@ def _buses(fold: int, share: float, missions: int) -> Data:
         energy = np.concatenate([m.energy_wh for m in own])
         members.append(Member(bus, segments, energy, vehicle, table, trip + first, use[trip]))
         first += len(own)
-    return Data(tuple(members), len(members), synthetic=False)
+    return Data(tuple(members), len(members))

@@ -1,5 +1,6 @@
 """What is compared on the same rows: tables, the paper's regression, trees, networks, the kernel with found effects."""
 
+import dataclasses
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from hdev_jax.learn.pinn_fit import Ensemble, fit
 from hdev_jax.learn.pinn_fit import Member as Seed
 from hdev_jax.learn.pinn_rows import FEATURES, Rows
 from hdev_jax.learn.train import Plan
+from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle, at_null
 
 __all__ = ["bayesian", "boosted", "diagnosed", "kernel", "names_of", "networks", "said", "sized"]
@@ -27,7 +29,7 @@ def names_of(features: str, data: Data) -> tuple[str, ...]:
     needs = {
         "wind_along": ("wind_speed_mps",), "wind_across": ("wind_speed_mps",), "wet": ("wet_road",),
         "surface_1": ("road_surface",), "surface_2": ("road_surface",), "surface_3": ("road_surface",),
-        "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",),
+        "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",), "ambient_temp_c": ("ambient_temp_c",),
     }  # fmt: skip
     return tuple(n for n in FEATURES[features] if have.has(*needs.get(n, ())))
 
@@ -82,14 +84,11 @@ def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dic
     from hdev_jax.fleet import FleetConfig
     from hdev_jax.fleet.sheets import write_sheet
     from hdev_jax.inference.sheet import read_sheet
-    from hdev_jax.logs import read_log
 
     known = np.unique(m.routes[m.where(0)])[: routes + 1]
-    at = np.flatnonzero(np.isin(m.routes, known))
     with tempfile.TemporaryDirectory() as folder:
-        _write_log(m, at, Path(folder) / "log.parquet")
         write_sheet(m.variant, FleetConfig(), Path(folder))
-        problem = prepare(read_log(Path(folder) / "log.parquet"), read_sheet(Path(folder) / f"{m.id}.toml"))
+        problem = prepare(_log_of(m, known), read_sheet(Path(folder) / f"{m.id}.toml"))
         # one route more than is learnt from: the loop wants a test trip, and what it says of that is not used
         split = split_trips(problem.log, None, [problem.log.trip_names[-1]])
         done = diagnose(problem, split, LIBRARY, seed=seed, tell=progress.step)
@@ -98,16 +97,12 @@ def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dic
     return done.after, found, values
 
 
-def _write_log(m: Member, at: np.ndarray, path: Path) -> None:
-    import pandas as pd
-
-    s = m.segments.take(at)
-    columns: dict[str, Any] = {"trip_id": m.routes[at].astype(str), "vehicle_id": m.id}
-    for k in ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps"):
-        columns[k] = np.asarray(getattr(s, k))
-    columns |= {k: np.asarray(x) for k, x in s.channels.items()}
-    columns["energy_wh"] = m.energy_wh[at]
-    pd.DataFrame(columns).to_parquet(path)
+def _log_of(m: Member, routes: np.ndarray) -> Log:
+    """The log of these routes of a vehicle."""
+    at = np.flatnonzero(np.isin(m.routes, routes))
+    names, trip = np.unique(m.routes[at], return_inverse=True)
+    segments = dataclasses.replace(m.segments.take(at), trip=trip, vehicle=np.zeros(len(at), int))
+    return Log(segments, {"energy_wh": m.energy_wh[at]}, tuple(map(str, names)), (m.id,))
 
 
 def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
@@ -125,7 +120,7 @@ def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
 
 def networks(
     rows: Rows, use: np.ndarray, recipe: Recipe, data: Data, members: Sequence[tuple[int, Sequence[float]]], *,
-    plan: Plan, rate: float, decay: float, effects: tuple[Sized, ...], checkpoint: Path | None = None,
+    plan: Plan, rate: float, effects: tuple[Sized, ...],
 ) -> Ensemble:  # fmt: skip
     """Members by seed and weights, trained side by side on the training rows, kept at their best on the validation."""
     from hdev_jax import progress
@@ -137,7 +132,6 @@ def networks(
             progress.step(f"epoch {epoch + 1}: loss {loss:.4g}, validation {score:.4g}")
 
     return fit(
-        recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate, decay=decay,
-        members=seeds, effects=effects, checkpoint=checkpoint,
-        tell=tell,
+        recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate,
+        members=seeds, effects=effects, tell=tell,
     )  # fmt: skip

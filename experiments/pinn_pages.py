@@ -10,6 +10,7 @@ from experiments.figures import save_figure, styled
 from experiments.pinn_scores import QUANTILES, pooled
 from experiments.tables import write_tables
 from hdev_jax.errors import InputError
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
 from hdev_jax.rundir import Run
 
@@ -45,11 +46,31 @@ def _gathered(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
     return out
 
 
-def _line(name: str, use: str, found: list[dict[str, Any]], of: int) -> dict[str, Any]:
-    """A row of the table; where `of` seeds are there, errors are of all of them together."""
+def _distinct(results: Results) -> dict[tuple[str, str], tuple[int, int]]:
+    """Rows and trips by (way, use) without those that another seed has, too: of each fold and vehicle once."""
+    once: dict[tuple[str, str], dict[tuple[Any, ...], tuple[int, int]]] = {}
+    for task, result in results:
+        of = (task["data"].get("fold"), task.get("vehicle"))
+        for key, (scored,) in _gathered([(task, result)]).items():
+            once.setdefault(key, {})[of] = (scored["rows"], scored["trips"])
+    return {key: (sum(n for n, _ in of.values()), sum(t for _, t in of.values())) for key, of in once.items()}
+
+
+def _trainings(results: Results) -> dict[str, tuple[int, int]]:
+    """By model that is trained: how many trainings there are, and how many of them diverged."""
+    out: dict[str, tuple[int, int]] = {}
+    for task, result in results:
+        if task["model"]["kind"] != "vehicles":
+            n, lost = out.get(task["name"], (0, 0))
+            out[task["name"]] = (n + 1, lost + ("diverged" in result))
+    return out
+
+
+def _line(name: str, use: str, found: list[dict[str, Any]], distinct: tuple[int, int]) -> dict[str, Any]:
+    """A row of the table; of several seeds, errors are of all of them together."""
     p = pooled(found)
     return {
-        "model": name, "rows of": use, "n": p["rows"] // of, "trips": p["trips"] // of, "RMSE [Wh]": p["rmse_wh"],
+        "model": name, "rows of": use, "n": distinct[0], "trips": distinct[1], "RMSE [Wh]": p["rmse_wh"],
         "PE [%]": p["pe_percent"], "PE of a trip, mean [%]": p["trip_pe_mean"],
         "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
@@ -61,22 +82,28 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     """Every model on the same rows, the paper's numbers beside those that it prints."""
     gathered = _gathered(results)
     data = "measured (ZTBus)" if config.data == "ztbus" else "synthetic fleet"
-    seeds = {name: len(config.seeds) for name, m in config.models.items() if m.kind != "vehicles"}
+    distinct, trainings = _distinct(results), _trainings(results)
     rows, lines = [], []
     for (way, use), found in gathered.items():
         p = pooled(found)
-        line = _line(way, use, found, seeds.get(way.split(",")[0], 1))
+        line = _line(way, use, found, distinct[way, use])
         name = NAMED.get(way, way)
         paper = config.paper.get(name) if use == "test" else None
         lines.append({"data": data, **line, "paper RMSE": (paper or {}).get("rmse"),
                       "paper PE": (paper or {}).get("pe")})  # fmt: skip
         mine = {"rmse": p.pop("rmse_wh"), "pe": p.pop("pe_percent"), **p}
         rows.append({"name": name if use == "test" else f"{name} ({use})", "paper": paper, "ours": mine})
+    for model, (n, lost) in trainings.items():
+        if n == lost:
+            name, said = NAMED.get(model, model), f"diverged, {lost} of {n} trainings"
+            lines.append({"data": data, "model": f"{model}: {said}", "rows of": "test", "n": 0})
+            rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": said})
     write_tables(run, "table", lines, config.caption)
-    at_bound = {t["name"]: r["at_bound"] for t, r in results if "at_bound" in r}
+    at_bound = _at_bound(results)
     if at_bound:
         bound = [{"model": n, "c_rr": 100 * b["c_rr"], "C_d·A": 100 * b["cda_m2"]} for n, b in at_bound.items()]
-        write_tables(run, "bounds", bound, "Share of predictions within 1 % of a bound [%], test rows")
+        caption = "Share of predictions within 1 % of the range of a bound [%], test rows of all trainings"
+        write_tables(run, "bounds", bound, caption)
     effects = _effects(results)
     if effects:
         write_tables(run, "effects", effects, "What the diagnosis found, by vehicle: how often, and its median size")
@@ -89,8 +116,9 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "the paper's numbers are of its own, private fleet; ours are of "
             + ("measured buses" if config.data == "ztbus" else "a synthetic one, whose noise they share by no means"),
             "training, validation and test by route" if config.data == "fleet" else "missions held out, by fold",
-            "features without units hold the energy by the calibrated kernel: no black box is quite without physics",
-            "errors of coefficients: median of predicted over true, less one; spray is air in the truth",
+            "features without units hold the energy by the calibrated kernel: only a black box with no kernel, where "
+            "there is one, is without physics",
+            "errors of coefficients: median of predicted over true, less one; spray counts as air",
             *_lost(results),
             *([GIVEN] if config.data == "fleet" else []),
             "effects in ours: " + ", ".join(next(used, ["none"])),
@@ -115,14 +143,14 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": rows,
         "better_than_paper": 0, "of": 0, "missed": [],
-        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth"],
+        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth", *_lost(results)],
     }  # fmt: skip
 
 
 def _lost(results: Results) -> list[str]:
     """How many trainings diverged, where any did."""
-    lost = [t["name"] for t, r in results if "diverged" in r]
-    return [f"{len(lost)} trainings diverged and are in no row: {', '.join(sorted(set(lost)))}"] if lost else []
+    lost = [f"{model} {k} of {n}" for model, (n, k) in _trainings(results).items() if k]
+    return [f"trainings that diverged, and are in no error: {', '.join(lost)}"] if lost else []
 
 
 def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound: Mapping[str, Any]) -> list[str]:
@@ -151,6 +179,18 @@ def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound:
                 out.append(f"ours: {k} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, 5 wanted")
     out += [f"{n}: {100 * max(b.values()):.1f} % at a bound" for n, b in at_bound.items() if n == OURS]
     return out
+
+
+def _at_bound(results: Results) -> dict[str, dict[str, float]]:
+    """By model, the shares of predictions at a bound of each coefficient, over all its seeds and folds."""
+    found: dict[str, list[dict[str, int]]] = {}
+    for task, result in results:
+        if "at_bound" in result:
+            found.setdefault(task["name"], []).append(result["at_bound"])
+    return {
+        name: {k: sum(b[k] for b in every) / sum(b["rows"] for b in every) for k in ("c_rr", "cda_m2")}
+        for name, every in found.items()
+    }
 
 
 def _effects(results: Results) -> list[dict[str, Any]]:
@@ -195,6 +235,8 @@ def _spread(ax: Any, at: float, q: Sequence[float], colour: str, label: str | No
 def _boxes(run: Run, quantiles: Mapping[str, Any], name: str, label: str) -> None:
     """Figures 6 and 7: the prediction by truck model, and what the paper could not know, the truth."""
     ways = [k for k in (PAPER_MODEL, OURS) if k in quantiles]
+    if not ways:
+        raise InputError("every training of the networks diverged; lower the rate")
     models = [m for m in MODELS if all(m in quantiles[k] for k in ways)]
     fig = figure(8.0, 3.4)
     ax = fig.add_subplot()
@@ -311,12 +353,12 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
     for task, result in results:
         if "network" in result:
             found.setdefault(tuple(task["weights"]), []).append(pooled([result["network"]["test"]])["rmse_wh"])
+    if not found:
+        raise InputError("every training of the grid diverged; lower the rate")
     lines = [{"λ₁": w[0], "λ₂": w[1], "λ₃": w[2], "seeds": len(x), "RMSE [Wh]": float(np.median(x)), "least": min(x),
               "most": max(x)} for w, x in sorted(found.items())]  # fmt: skip
     write_tables(run, "grid", lines, config.caption)
     _maps(run, {w: float(np.median(x)) for w, x in found.items()})
-    if not lines:
-        raise InputError("every training of the grid diverged; lower the rate")
     best = min(lines, key=lambda x: x["RMSE [Wh]"])
     lost = sum("diverged" in r for _, r in results)
     where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"
@@ -331,13 +373,12 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
 
 @styled
 def _maps(run: Run, found: Mapping[tuple[float, ...], float]) -> None:
-    printed = (1.0, 0.1, 0.01)
     pairs = [(i, j) for i, j in ((1, 2), (0, 1), (0, 2))
-             if len({(w[i], w[j]) for w in found if _held(w, i, j, printed)}) > 3]  # fmt: skip
+             if len({(w[i], w[j]) for w in found if _held(w, i, j)}) > 3]  # fmt: skip
     fig = figure(3.6 * max(len(pairs), 1), 3.2)
     low, high = min(found.values()), np.percentile(list(found.values()), 95)
     for k, (i, j) in enumerate(pairs):
-        part = {(w[i], w[j]): x for w, x in found.items() if _held(w, i, j, printed)}
+        part = {(w[i], w[j]): x for w, x in found.items() if _held(w, i, j)}
         rows, columns = sorted({a for a, _ in part}), sorted({b for _, b in part})
         values = np.array([[part.get((a, b), np.nan) for b in columns] for a in rows])
         ax = fig.add_subplot(1, len(pairs), k + 1)
@@ -350,10 +391,10 @@ def _maps(run: Run, found: Mapping[tuple[float, ...], float]) -> None:
         ax.set_xlabel(f"λ{'₁₂₃'[j]}")
         ax.set_ylabel(f"λ{'₁₂₃'[i]}")
         third = ({0, 1, 2} - {i, j}).pop()
-        ax.set_title(f"RMSE [Wh], λ{'₁₂₃'[third]} = {printed[third]:g}")
+        ax.set_title(f"RMSE [Wh], λ{'₁₂₃'[third]} = {PAPER_WEIGHTS[third]:g}")
     save_figure(run, fig, "grid")
 
 
-def _held(w: tuple[float, ...], i: int, j: int, printed: tuple[float, ...]) -> bool:
+def _held(w: tuple[float, ...], i: int, j: int) -> bool:
     """Whether the weight that is in neither axis is the printed one."""
-    return all(w[k] == printed[k] for k in range(3) if k not in (i, j))
+    return all(w[k] == PAPER_WEIGHTS[k] for k in range(3) if k not in (i, j))

@@ -5,8 +5,10 @@ import gzip
 import numpy as np
 import pytest
 
+from experiments.config import CONFIGS, resolve, typed
 from experiments.data import MissingDataError
-from experiments.pinn_buses import ADAPTER, BUSES, bus_files, buses, read_mission
+from experiments.pinn import Config, tasks
+from experiments.pinn_buses import ADAPTER, BUSES, SHEET, bus_files, bus_sources, buses, read_mission
 from hdev_jax.logs import TARGETS, read_log
 
 
@@ -40,6 +42,28 @@ def test_missing_data_says_where_it_is_from(tmp_path, monkeypatch):
     (tmp_path / "ztbus" / "B183_2021-01-01_00-00-00_2021-01-01_01-00-00.csv").touch()
     with pytest.raises(MissingDataError, match=r"no mission of B208 in .*ztbus: they are from doi.org"):
         bus_files()
+
+
+def test_a_task_on_buses_changes_with_any_file_that_its_rows_are_made_of(tmp_path, monkeypatch):
+    monkeypatch.setenv("HDEV_DATA", str(tmp_path))
+    (tmp_path / "ztbus").mkdir()
+    for bus in BUSES:
+        for end in ("csv", "grade.csv.gz"):
+            (tmp_path / "ztbus" / f"{bus}_2021.{end}").write_text("1")
+    sources = bus_sources()
+    assert sorted(p.name for p in sources[:4]) == sorted(p.name for p in (tmp_path / "ztbus").iterdir())
+    assert sources[4:] == [ADAPTER, SHEET]
+    config = typed(Config, resolve(CONFIGS / "studies" / "pinn_buses.toml"), "pinn_buses")
+
+    def told():
+        return {t["data"]["files"] for t in tasks(config)}
+
+    before = told()
+    (tmp_path / "ztbus" / "B208_2021.grade.csv.gz").write_text("2")
+    assert len(before) == len(told()) == 1
+    assert before != told()
+    (tmp_path / "ztbus" / "B208_2021.grade.csv.gz").unlink()
+    assert len(bus_sources()) == 5
 
 
 def test_a_mission_without_its_slope_is_missing_data(data_dir, tmp_path):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from experiments.config import CONFIGS, resolve, typed
-from experiments.pinn import PAPER, Config, chosen, tasks, together
+from experiments.pinn import Config, chosen, tasks, together
 from experiments.pinn_data import load
 from experiments.pinn_scores import pooled, scores
 from hdev_jax.errors import InputError
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
 
 
 def config(name, *sets):
@@ -49,11 +50,19 @@ def test_every_ablation_of_the_networks_changes_one_thing():
         assert len(changed) == (name not in ("ours", "paper")), name
 
 
+def test_a_black_box_without_a_kernel_differs_by_its_inputs_alone():
+    models = chosen(config("paper1/table2"))
+    for name, base in (("LightGBM, no kernel", "lightgbm"), ("network, no kernel", "network without physics")):
+        one, other = models[name], models[base]
+        assert {k for k in type(one).model_fields if getattr(one, k) != getattr(other, k)} == {"features"}
+        assert one.features == "raw"
+
+
 def test_loss_weights_come_by_pairs_and_train_together():
     every = list(tasks(config("studies/pinn_weights")))
     weights = {tuple(t["weights"]) for t in every}
     assert len(every) == 3 * len(weights) == 3 * 61
-    assert all(sum(a != b for a, b in zip(w, PAPER, strict=True)) <= 2 for w in weights)
+    assert all(sum(a != b for a, b in zip(w, PAPER_WEIGHTS, strict=True)) <= 2 for w in weights)
     assert len({together(t) for t in every}) == 1
 
 

@@ -20,9 +20,7 @@ from hdev_jax.fleet.roads import STEPS, RouteBatch, draw_routes
 from hdev_jax.fleet.rows import TRUTH_ONLY, log_rows, measured, padded
 from hdev_jax.fleet.shifting import Program, engaged, load_share, shift_lines
 from hdev_jax.fleet.variants import AXLE_LOAD_SHARE, Variant
-from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Machine, Vehicle
-from hdev_jax.physics.library import WITH_AIR, WITH_WEIGHT
-from hdev_jax.physics.road import mean_square_speed
+from hdev_jax.physics import AIR_DENSITY_KGPM3, Driveline, Machine, Vehicle, coefficients_that_hold
 from hdev_jax.segments import Segments
 
 __all__ = ["ROUTES_PER_BATCH", "Batch", "VehiclePart", "batches", "shares"]
@@ -194,6 +192,9 @@ def _energy(vehicle: Vehicle, program: Program, segments: Segments) -> tuple[Any
     if vehicle.has("time_skew"):
         hours = segments.duration_s / 3600.0
         shown = vehicle.effect("time_skew").observe(energy / hours, segments) * hours
+    for e in plain.effects:
+        segments = e.derive(segments)
+    c_rr, cda = jax.vmap(partial(coefficients_that_hold, plain))(jax.tree.map(jnp.asarray, segments))
     ratio = program.ratio_radpm[gear - 1]
     motor_speed, torque = speed * ratio, force / ratio
     out = {
@@ -211,7 +212,8 @@ def _energy(vehicle: Vehicle, program: Program, segments: Segments) -> tuple[Any
         "energy_shown_wh": shown,
         "mass_kg": segments.channels["mass_kg"],
         "grade_rad": grade,
-        **_coefficients(plain, segments, parts),
+        "c_rr": c_rr,
+        "cda_m2": cda,
         **{f"energy_wh:{k}": x for k, x in parts.items()},
     }
     return lines, out
@@ -222,26 +224,3 @@ def _at_the_wheels(vehicle: Vehicle) -> Vehicle:
     road = tuple(e for e in vehicle.effects if e.stage == "road")
     one = jnp.ones_like(vehicle.mass_kg)
     return Vehicle(road, mass_kg=vehicle.mass_kg, driveline=Driveline(one), machine=Machine(one, one))
-
-
-def _coefficients(vehicle: Vehicle, segments: Segments, parts: dict[str, Any]) -> dict[str, Any]:
-    """c_rr and C_d·A that hold in each row: all effects that go with the weight, and all that go with the air."""
-    weight = segments.channels["mass_kg"] * GRAVITY_MPS2 * jnp.cos(segments.channels["grade_rad"])
-    square = mean_square_speed(segments)
-    metres = jnp.where(segments.distance_m > 0, segments.distance_m, 1.0)
-    spray: Any = 0.0
-    if vehicle.has("wet_road"):  # half of that effect is rolling, half is air
-        wet = vehicle.effect("wet_road")
-        air = eqx.tree_at(lambda e: e.excess, wet, jnp.zeros_like(wet.excess))
-        spray = jax.vmap(lambda row: air.force(row, vehicle))(segments)
-
-    def force(ids: tuple[str, ...]) -> Any:
-        return sum(parts[k] for k in ids if k in parts) * (3600.0 / metres)
-
-    moves = segments.distance_m > 0
-    c_rr = (force(WITH_WEIGHT) - spray) / weight
-    cda = (force(WITH_AIR) + spray) / (0.5 * AIR_DENSITY_KGPM3 * jnp.where(square > 0, square, 1.0))
-    return {
-        "c_rr": jnp.where(moves, c_rr, vehicle.effect("rolling").c_rr),
-        "cda_m2": jnp.where(moves & (square > 0), cda, vehicle.effect("aero").cda_m2),
-    }

@@ -16,11 +16,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads, Network
-from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, coefficients_that_hold, energy, wheel_energy, with_coefficients
-from hdev_jax.physics import Effect, Grouped
+from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, energy, wheel_energy, with_coefficients
+from hdev_jax.physics import Effect, Grouped, coefficients_that_hold
 from hdev_jax.segments import Column, Ids
 
-__all__ = ["C_RR_LIMIT", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
+__all__ = ["C_RR_LIMIT", "Choices", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
 
 C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
 _LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
@@ -28,10 +28,10 @@ _BY_ROW = 0.5  # how far the network's head moves a free coefficient, in logarit
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """What is built and what is minimised.
+class Choices:
+    """What is built and what is minimised, but for the inputs.
 
-    - `features`, names of columns; `units`, `normalised`, `dropout`: the network.
+    - `units`, `normalised`, `dropout`: the network.
     - `predicted`, what E_pred of equation 7 is: `residual`, the physics with predicted coefficients plus what the
       energy head says; `alone`, what that head says; `table`, the physics at the tables plus what the head says.
     - `physics`: `battery` (equation 5) or `wheel` (equation 4 as equation 7 cites it).
@@ -39,14 +39,14 @@ class Recipe:
       `free`, the table times an exponential; `table`, not predicted at all.
     - `coefficient_inputs`: `all` features, or those that a coefficient can depend on (`physical`).
     - `coefficient_loss`: squares of the distance from the table, `relative` to it or `absolute`.
-    - `by_vehicle`: coefficients and effects have a part of each vehicle's own, shrunk to the fleet's.
+    - `by_vehicle`: coefficients and effects have what trained vehicles have in common, their mean, and a part of each
+      vehicle's own about it; a vehicle that was not trained on has the mean.
     - `loss`: `squares` (equation 7), or the normal `likelihood` of measured and of physical energy, whose variances
       are learned, which is what weighs the terms against each other (Kendall, Gal and Cipolla, CVPR 2018).
     - `energy_head`: with the head, or without; `stretch`, rows of a stretch of a trip whose sum counts too (1: none):
       a composite likelihood, rows and sums being the same data twice.
     """
 
-    features: tuple[str, ...]
     units: tuple[int, ...] = (256, 128)
     normalised: bool = True
     dropout: float = 0.1
@@ -60,6 +60,13 @@ class Recipe:
     loss: Literal["squares", "likelihood"] = "squares"
     energy_head: bool = True
     stretch: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Choices):
+    """Choices and inputs: `features`, names of columns."""
+
+    features: tuple[str, ...]
 
 
 class Sized(NamedTuple):
@@ -85,7 +92,8 @@ class Prediction(eqx.Module):
 
 class Pinn(eqx.Module):
     """Weights of a recipe. `common` [2] and `own` [vehicle, 2] are logarithms of coefficients over their tables;
-    `sizes` and `own_sizes` are the effects' sizes in units of their usual scale.
+    `sizes` and `own_sizes` are the effects' sizes in units of their usual scale. What is a vehicle's own counts from
+    the mean over vehicles.
 
     `scale_wh` is the unit of the energy head.
 
@@ -187,10 +195,16 @@ class Pinn(eqx.Module):
         return Prediction(base + residual, physics, residual, c_rr, cda, sd), heads, memory
 
 
+def _centred(table: Array) -> Array:
+    """What each vehicle has of its own, about the mean. Were it not, the own parts could take all that the vehicles
+    share and leave the common part, which is all that is known of an unseen vehicle, at the tables."""
+    return table - jnp.mean(table, axis=0, keepdims=True)
+
+
 def _of(table: Array, vehicle: Ids) -> Array:
-    """The vehicle's entry; zero for one that was not trained on."""
+    """The vehicle's own part; zero for one that was not trained on."""
     zero = jnp.zeros((1, *table.shape[1:]), table.dtype)
-    return jnp.concatenate([table, zero])[jnp.minimum(vehicle, table.shape[0])]
+    return jnp.concatenate([_centred(table), zero])[jnp.minimum(vehicle, table.shape[0])]
 
 
 @eqx.filter_jit
@@ -201,7 +215,8 @@ def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
     if not model.effects:
         return p
     car = with_coefficients(rows.car, p.c_rr, p.cda_m2, *model.effects_of(rows))
-    return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, coefficients_that_hold(car, rows.segments))
+    both = jax.vmap(coefficients_that_hold)(car, jax.tree.map(jnp.asarray, rows.segments))
+    return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, both)
 
 
 def ready(model: Pinn, memory: eqx.nn.State) -> Callable[[Rows], Prediction]:
@@ -255,8 +270,9 @@ class Objective:
             whole = lambda x: jnp.sum((w * x).reshape(shape), axis=1)  # noqa: E731
             sd = jnp.sqrt(whole(p.sd_wh**2) + (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + 1e-6)
             data = data + jnp.sum(_normal(whole(error), sd) * (whole(w) > 0)) / count
-        own = sum(jnp.sum(x**2) for x in model.own_sizes.values()) + sum(jnp.sum(x**2) for x in model.sizes.values())
-        prior = 0.5 * (jnp.sum(model.own**2) + jnp.sum(model.common**2)) / _LOG_SD**2 + 0.5 * own
+        sizes = [*map(_centred, model.own_sizes.values()), *model.sizes.values()]
+        logs = jnp.sum(_centred(model.own) ** 2) + jnp.sum(model.common**2)
+        prior = 0.5 * logs / _LOG_SD**2 + 0.5 * sum(jnp.sum(x**2) for x in sizes)
         by_row = jnp.sum(w[:, None] * heads.coefficients**2) / count
         return data, physics, prior / self.rows + 0.01 * by_row
 

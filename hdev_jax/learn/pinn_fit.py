@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,7 +15,7 @@ from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
 
-__all__ = ["Ensemble", "Member", "fit", "stretches"]
+__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "fit", "stretches"]
 
 PAPER_WEIGHTS = (1.0, 0.1, 0.01)  # λ₁, λ₂, λ₃ of section 3.3.2
 _AT_ONCE = 2**13  # rows of a prediction; of more, what the hidden layers say does not fit the caches
@@ -108,16 +107,15 @@ def fit(
     members: Sequence[Member],
     plan: Plan,
     rate: float = 0.005,
-    decay: float = 0.0,
     effects: tuple[Sized, ...] = (),
-    checkpoint: Path | None = None,
     tell: Callable[[int, float, float], None] | None = None,
 ) -> Ensemble:
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
-    **Arguments:** `vehicles`, how many there are in `rows`; `decay`, of the weights (AdamW). All members train in one
-    program. **Raises:** `NotFiniteError` where a single member's loss is not finite; `InputError` where there are no
-    rows, or where a table's c_rr is not within the bounds that the recipe keeps it in.
+    **Arguments:** `vehicles`, how many there are in `rows`. All members train in one program.
+
+    **Raises:** `DivergedError` where no member is left; `InputError` where there are no rows, or where a table's c_rr
+    is not within the bounds that the recipe keeps it in.
     """
     if not len(rows) or not len(held):
         raise InputError(f"{len(rows)} rows to train on and {len(held)} held out; some of both are needed")
@@ -145,15 +143,14 @@ def fit(
     memory = jax.tree.map(lambda *x: jnp.stack(x), *(s for _, s in made))
     keys = jnp.stack([jax.random.fold_in(jax.random.key(m.seed), 1) for m in members])
     settings = jnp.asarray([m.weights for m in members], jnp.float32)
-    optimiser = optax.adamw(rate, weight_decay=decay) if decay else optax.adam(rate)
     single = len(members) == 1
     if single:
         weights, memory = jax.tree.map(lambda x: x[0], (weights, memory))
         keys, settings = keys[0], settings[0]
     trained = train(
-        Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optimiser, plan, key=keys,
-        held=jax.tree.map(jnp.asarray, check), settings=settings, members="" if single else "in turn",
-        checkpoint=checkpoint, tell=tell,
+        Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optax.adam(rate), plan,
+        key=keys, held=jax.tree.map(jnp.asarray, check), settings=settings, members="" if single else "in turn",
+        tell=tell,
     )  # fmt: skip
     weights, memory = trained.weights, trained.memory
     if single:

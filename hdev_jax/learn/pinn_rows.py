@@ -18,16 +18,13 @@ from hdev_jax.errors import InputError
 from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Effect, Vehicle
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
-from hdev_jax.physics.effect import resolve
-from hdev_jax.physics.library import WITH_AIR, WITH_WEIGHT
-from hdev_jax.physics.road import mean_square_speed, weight_on_road
+from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Column, Ids, Segments
 
 __all__ = [
     "FEATURES",
     "PHYSICAL",
     "Rows",
-    "coefficients_that_hold",
     "concatenated",
     "energy",
     "row_wise",
@@ -39,7 +36,8 @@ __all__ = [
 _REFERENCE_M = 100.0  # the length of the paper's segments; √(g·100 m) is the unit of speed
 _PADDED = 4096
 
-# The paper's three; with what the physics needs besides; with everything that has no unit.
+# The paper's three; with what the physics needs besides; with everything that has no unit; and for black boxes without
+# any kernel the log's own columns and the sheet's numbers, nothing being worked out of them.
 _PRINTED = ("speed_mps", "mass_kg", "grade_rad")
 _CHANNELS = (*_PRINTED, "accel_mps2", "c_rr_table", "cda_table")
 _UNITLESS = (
@@ -47,7 +45,8 @@ _UNITLESS = (
     "duration", "length", "elapsed", "mass_of_sheet", "temperature", "wind_along", "wind_across", "wet", "surface_1",
     "surface_2", "surface_3", "warmth", "cornering", "efficiency", "halt",
 )  # fmt: skip
-FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS}
+_RAW = (*_CHANNELS, "duration_s", "distance_m", "ambient_temp_c", "mass_table_kg", "auxiliary_table_w")
+FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
 # Those that a coefficient may depend on: not the power that is asked for, nor how steep it is.
 PHYSICAL = ("froude", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3",
             "warmth", "cornering")  # fmt: skip
@@ -100,21 +99,6 @@ def wheel_energy(car: Vehicle, segments: Segments) -> Float[Array, " row"]:
     """Energy at the wheels of each row by the kernel [Wh] (paper 1, equation 4)."""
     force = jax.vmap(lambda c, s: c.force(jax.tree.map(lambda x: x[None], s))[0])(car, segments)
     return force * segments.distance_m / 3600.0
-
-
-@eqx.filter_jit
-def coefficients_that_hold(car: Vehicle, segments: Segments) -> tuple[Float[Array, " row"], Float[Array, " row"]]:
-    """c_rr and C_d·A [m²] of each row with all effects that go with the weight, and with the air (at least 0.1 m/s of
-    it). `car` has a value of each coefficient for each row. Of `wet_road`, spray counts as rolling."""
-
-    def one(c: Vehicle, s: Segments) -> tuple[Any, Any]:
-        c = resolve(c, s)
-        force = {e.id: e.force(s, c) for e in c.effects if e.id in WITH_WEIGHT + WITH_AIR}
-        air = 0.5 * AIR_DENSITY_KGPM3 * jnp.maximum(mean_square_speed(s), 1e-2)
-        rolling = sum(f for k, f in force.items() if k in WITH_WEIGHT)
-        return rolling / weight_on_road(s, c), sum(f for k, f in force.items() if k in WITH_AIR) / air
-
-    return jax.vmap(one)(car, segments)
 
 
 def row_wise(effect: Effect | type[Effect]) -> bool:
@@ -221,12 +205,16 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
     match name.rpartition("_"):
         case "surface", _, k:
             return (channel("road_surface") == int(k)) * one
-        case _ if name in ("speed_mps", "accel_mps2"):
+        case _ if name in ("speed_mps", "accel_mps2", "duration_s", "distance_m"):
             return np.asarray(getattr(s, name))
         case _ if name == "mass_kg":
             return mass
-        case _ if name == "grade_rad":
-            return channel("grade_rad")
+        case _ if name in ("grade_rad", "ambient_temp_c"):
+            return channel(name)
+        case _ if name == "mass_table_kg":
+            return float(vehicle.mass_kg) * one
+        case _ if name == "auxiliary_table_w":
+            return (float(vehicle.effect("auxiliary").auxiliary_w) if vehicle.has("auxiliary") else 0.0) * one
         case _ if name == "c_rr_table":
             return c_rr * one
         case _ if name == "cda_table":

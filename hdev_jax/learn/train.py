@@ -21,10 +21,14 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import atomic_file
 
-__all__ = ["NotFiniteError", "Objective", "Plan", "Scored", "Trained", "train"]
+__all__ = ["DivergedError", "NotFiniteError", "Objective", "Plan", "Scored", "Trained", "train"]
 
 
-class NotFiniteError(InputError):
+class DivergedError(InputError):
+    """Nothing came of a training: of its data, or of its rate."""
+
+
+class NotFiniteError(DivergedError):
     """A loss or its slope is NaN or infinite; the batch that it came from: `epoch`, `step` and `rows` of the data."""
 
     def __init__(self, epoch: int, step: int, rows: np.ndarray):
@@ -125,8 +129,8 @@ def train(
     epoch.
 
     **Raises:** `NotFiniteError` with the batch; of several members, one whose loss is not finite stops, and keeps
-    what it had. `InputError` where `held` never had a finite score, and for a checkpoint of other shapes; that it is of
-    the same data and settings is the caller's to see to.
+    what it had. `DivergedError` where `held` never had a finite score. `InputError` for a checkpoint of other shapes; that
+    it is of the same data and settings is the caller's to see to.
     """
     if held is not None and not isinstance(objective, Scored):
         raise TypeError(f"{type(objective).__name__} has no score, and rows are held out")
@@ -158,7 +162,7 @@ def train(
             with atomic_file(checkpoint) as path, path.open("wb") as file:
                 eqx.tree_serialise_leaves(file, state)
     if held is not None and not np.isfinite(np.asarray(state.score)).any():
-        raise InputError("training: no epoch has a finite score; look for a bad row in what is held out")
+        raise DivergedError("training: no epoch has a finite score; look for a bad row in what is held out")
     kept, remembered = state.best if held is not None else (state.weights, state.memory)
     return Trained(kept, remembered, np.asarray(state.losses), np.asarray(state.scores), done)
 

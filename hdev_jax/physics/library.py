@@ -13,26 +13,12 @@ from hdev_jax.segments import Segments
 __all__ = [
     "DECLARED",
     "LIBRARY",
-    "WITH_AIR",
-    "WITH_WEIGHT",
     "at_null",
     "derived",
     "library",
     "most_group",
     "unavailable",
 ]
-
-# Effects that together are a rolling resistance coefficient, and those that together are a drag area.
-WITH_WEIGHT = (
-    "rolling",
-    "rolling_temperature",
-    "rolling_speed",
-    "tyre_warmup",
-    "road_surface",
-    "wet_road",
-    "cornering",
-)
-WITH_AIR = ("aero", "headwind", "constant_headwind", "crosswind", "air_density", "drafting")
 
 DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, road.Aero, loads.Auxiliary)
 

@@ -95,9 +95,15 @@ class WetRoad(Effect):
     spray: Any
 
     def force(self, row, car):
-        water = row.channels["wet_road"]
-        rolling = self.excess * car.rolling() * weight_on_road(row, car)
-        return water * (rolling + self.spray * car.drag() * mean_square_speed(row))
+        return self.rolling(row, car) + self.spraying(row, car)
+
+    def rolling(self, row, car):
+        """The part that goes with the weight [N]."""
+        return row.channels["wet_road"] * self.excess * car.rolling() * weight_on_road(row, car)
+
+    def spraying(self, row, car):
+        """The part that goes with the drag area [N]."""
+        return row.channels["wet_road"] * self.spray * car.drag() * mean_square_speed(row)
 
 
 class RoadSurface(Effect):

@@ -20,10 +20,10 @@ from hdev_jax.learn.heads import Heads
 from hdev_jax.learn.pinn import Objective, Pinn, Recipe, Sized, predict
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, fit, stretches
 from hdev_jax.learn.pinn_rows import concatenated
-from hdev_jax.learn.train import Plan
+from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
 
-PLAIN = Recipe(FEATURES, units=(6,), normalised=False, dropout=0.0)
+PLAIN = Recipe(features=FEATURES, units=(6,), normalised=False, dropout=0.0)
 AUXILIARY = Sized(LIBRARY["auxiliary_power"], (("power_w", 0),))
 KEY = jax.random.key(0)
 
@@ -157,8 +157,10 @@ def test_the_likelihood_and_its_stretches_by_hand(rows):
     found, slope = value(weights, batch)
 
     energy, coefficients = said(model, rows)
-    log = np.asarray(model.common) + np.asarray(model.own)[rows.vehicle] + 0.5 * coefficients
-    watts = 1000.0 * np.asarray(model.sizes["auxiliary_power.power_w"] + model.own_sizes["auxiliary_power.power_w"])
+    about_mean = lambda x: np.asarray(x) - np.mean(np.asarray(x), axis=0)  # noqa: E731
+    log = np.asarray(model.common) + about_mean(model.own)[rows.vehicle] + 0.5 * coefficients
+    own_sizes = about_mean(model.own_sizes["auxiliary_power.power_w"])
+    watts = 1000.0 * (np.asarray(model.sizes["auxiliary_power.power_w"]) + own_sizes)
     law = by_hand(rows, rows.c_rr * np.exp(log[:, 0]), rows.cda_m2 * np.exp(log[:, 1]))
     law = law + watts[rows.vehicle] * rows.segments.duration_s / 3600
     floor, share = np.exp(np.asarray(model.noise[::2], float)) * 50.0, np.exp(np.asarray(model.noise[1::2], float))
@@ -173,8 +175,8 @@ def test_the_likelihood_and_its_stretches_by_hand(rows):
             off_by = np.exp(float(model.drift)) * law[part].sum()
             data += minus(error[part].sum(), np.sqrt((sd[part] ** 2).sum() + off_by**2))
     square = lambda x: float(np.sum(np.square(x)))  # noqa: E731
-    sizes = square(model.sizes["auxiliary_power.power_w"]) + square(model.own_sizes["auxiliary_power.power_w"])
-    prior = 0.5 * (square(model.own) + square(model.common)) / 0.3**2 + 0.5 * sizes
+    sizes = square(model.sizes["auxiliary_power.power_w"]) + square(own_sizes)
+    prior = 0.5 * (square(about_mean(model.own)) + square(model.common)) / 0.3**2 + 0.5 * sizes
     terms = (data / 80, minus(off, loose).sum() / 80, prior / 1000 + 0.01 * square(coefficients) / 80)
     np.testing.assert_allclose(found, np.dot(lam, terms), rtol=1e-4)
 
@@ -194,14 +196,14 @@ def test_a_vehicle_that_was_not_trained_on_has_what_the_fleet_has_in_common(rows
     )
     for number in (0, 1, 2):
         some = eqx.tree_at(lambda r: r.vehicle, rows, np.full(len(rows), number, np.int32))
-        own = np.zeros(2) if number == 2 else np.asarray(model.own[number])
+        own = np.zeros(2) if number == 2 else np.asarray(model.own[number]) - np.mean(model.own, axis=0)
         heads = Heads(jnp.zeros(len(rows), jnp.float32), jnp.zeros((len(rows), 2), jnp.float32))
         c_rr, cda = model.coefficients(heads, some)
         factor = np.exp(np.asarray(model.common) + own)
         np.testing.assert_allclose(c_rr, rows.c_rr * factor[0], rtol=1e-5)
         np.testing.assert_allclose(cda, rows.cda_m2 * factor[1], rtol=1e-5)
-        size = model.sizes["auxiliary_power.power_w"]
-        size = size if number == 2 else size + model.own_sizes["auxiliary_power.power_w"][number]
+        size, own_size = (m["auxiliary_power.power_w"] for m in (model.sizes, model.own_sizes))
+        size = size if number == 2 else size + own_size[number] - np.mean(own_size)
         np.testing.assert_allclose(model.effects_of(some)[0].power_w, 1000.0 * float(size) * np.ones(80), rtol=1e-5)
     # and its coefficients do not depend on the power that is asked for
     steeper = np.array(rows.features)
@@ -213,8 +215,19 @@ def test_a_vehicle_that_was_not_trained_on_has_what_the_fleet_has_in_common(rows
     assert np.abs(one.residual_wh - other.residual_wh).max() > 0.1
 
 
-def test_planted_coefficients_of_each_vehicle_are_found():
-    planted = ((0.0072, 5.2, 1500.0), (0.0050, 7.1, 3000.0))
+def test_a_constant_on_all_own_parts_changes_no_prediction(rows):
+    model, memory = made(recipe(coefficients="free", by_vehicle=True, loss="likelihood"), effects=(AUXILIARY,))
+    more = eqx.tree_at(
+        lambda m: (m.own, m.own_sizes), model, jax.tree.map(lambda x: x + 0.5, (model.own, model.own_sizes))
+    )
+    every = eqx.tree_at(lambda r: r.vehicle, rows, np.arange(len(rows), dtype=np.int32) % 3)  # an unseen one among them
+    one, other = (predict(m, memory, every) for m in (model, more))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-3), one, other)
+    assert np.abs(one.energy_wh - predict(model, memory, rows).energy_wh).max() > 1.0
+
+
+def test_planted_coefficients_of_each_vehicle_are_found_and_an_unseen_one_lies_between():
+    planted = ((0.0084, 4.3, 1500.0), (0.0070, 5.3, 3000.0))  # on one side of the table, 0.006 and 6 m²
     rng, parts = np.random.default_rng(1), []
     for k, (c_rr, cda, watts) in enumerate(planted):
         s = road(480, 12, seed=10 + k)
@@ -229,7 +242,16 @@ def test_planted_coefficients_of_each_vehicle_are_found():
         plan=Plan(epochs=60, batch=160, patience=5), rate=0.03, effects=(AUXILIARY,),
     )  # fmt: skip
     (p,) = made.predict(rows)
-    sizes = made.model.sizes["auxiliary_power.power_w"] + made.model.own_sizes["auxiliary_power.power_w"][0]
+    unseen = eqx.tree_at(lambda r: r.vehicle, rows, np.full(len(rows), 2, np.int32))
+    (new,) = made.predict(unseen)
+    moving = np.asarray(rows.segments.distance_m) > 0
+    for name, low, high in (("c_rr", 0.0070, 0.0084), ("cda_m2", 4.3, 5.3)):
+        middle = np.median(getattr(new, name)[moving])
+        assert middle == pytest.approx(np.sqrt(low * high), rel=0.03), "the mean of those that were trained on"
+        assert low < middle < high
+    common, own = (np.asarray(m["auxiliary_power.power_w"])[0] for m in (made.model.sizes, made.model.own_sizes))
+    sizes = common + own - own.mean()
+    assert 1000.0 * float(common) == pytest.approx(2250.0, rel=0.1)
     for k, (c_rr, cda, watts) in enumerate(planted):
         of = (np.asarray(rows.vehicle) == k) & (np.asarray(rows.segments.distance_m) > 0)
         assert np.median(p.c_rr[of]) == pytest.approx(c_rr, rel=0.03)
@@ -270,6 +292,12 @@ def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
         np.testing.assert_allclose(few.energy_wh, all_of.energy_wh[some], rtol=1e-6)
         np.testing.assert_allclose(few.c_rr, all_of.c_rr[some], rtol=1e-6)
     np.testing.assert_allclose(made.mean(rows).energy_wh, (first.energy_wh + second.energy_wh) / 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1)])
+def test_a_fit_of_which_nothing_is_left_says_so(rows, seeds):
+    with pytest.raises(DivergedError, match=r"not finite|finite score"):
+        fit(PLAIN, rows, rows, vehicles=2, members=[Member(s) for s in seeds], plan=Plan(epochs=3), rate=1e30)
 
 
 def test_what_cannot_be_built_is_said_in_one_line(rows):
