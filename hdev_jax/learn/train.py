@@ -129,8 +129,8 @@ def train(
     epoch.
 
     **Raises:** `NotFiniteError` with the batch; of several members, one whose loss is not finite stops, and keeps
-    what it had. `DivergedError` where `held` never had a finite score. `InputError` for a checkpoint of other shapes; that
-    it is of the same data and settings is the caller's to see to.
+    what it had. `DivergedError` where `held` never had a finite score. `InputError` for a checkpoint of other shapes;
+    that it is of the same data and settings is the caller's to see to.
     """
     if held is not None and not isinstance(objective, Scored):
         raise TypeError(f"{type(objective).__name__} has no score, and rows are held out")
