@@ -15,6 +15,7 @@ from hdev_jax.segments import trip_slices
 __all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 
 LEVEL = 1e-3  # for each of the looks below; there are four, so false alarms stay under one in two hundred logs
+LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
 MOST_ROWS = 30_000  # that the flexible learner is trained on
@@ -229,7 +230,8 @@ def _levels(rows: Rows, plain: Noise) -> tuple[int, float, float] | None:
     gain = noise.log_likelihood - plain.log_likelihood
     if 0.5 * stats.chi2.sf(2.0 * max(gain, 0.0), 1) > LEVEL / 10:
         return None
-    if noise.level_sd**2 < 0.1 * np.mean(rows.residual**2):
+    # the share is one of a grid that holds the least itself: rounding must not decide
+    if noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(rows.residual**2):
         return None
     means = {t: float(np.mean(rows.residual[s])) for t, s in long.items()}
     worst = max(means, key=lambda t: abs(means[t]))
