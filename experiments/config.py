@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hdev_jax.errors import InputError
+from hdev_jax.toml import read_toml
 
 __all__ = [
     "CONFIGS",
@@ -145,12 +146,7 @@ def _layers(path: Path, seen: tuple[Path, ...] = ()) -> list[tuple[Path, dict[st
     """Each file from the first base to `path` itself, with the table as it is after that file."""
     if path.resolve() in seen:
         raise InputError(f"{path}: extends itself")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as e:
-        raise InputError(f"{path}: no such config ({e.strerror})") from e
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: is not TOML: {e}") from e
+    table, _ = read_toml(path, "config")
     if "hdev" in table and isinstance(table.get("config"), dict):
         return [(path, table["config"])]
     base, ablates = table.pop("extends", None), table.pop("ablates", None)

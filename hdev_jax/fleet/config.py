@@ -3,13 +3,13 @@
 import dataclasses
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hdev_jax.errors import InputError
+from hdev_jax.toml import read_toml
 
 __all__ = ["Driving", "FleetConfig", "Gears", "Log", "Truth", "Weather", "load_config", "parse_config"]
 
@@ -113,14 +113,7 @@ class FleetConfig:
 def load_config(path: str | Path) -> FleetConfig:
     """Read a configuration. Raises `InputError`, one line with file, key, what was found and what is accepted."""
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(f"config {path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"config {path}: cannot be read as text ({e})") from None
-    except (ValueError, RecursionError) as e:
-        raise InputError(f"config {path}: not a TOML file: {e}") from None
+    table, _ = read_toml(path, "config")
     if "seed" not in table:
         raise InputError(f"config {path}: seed is missing; a whole number is expected (the same seed, the same fleet)")
     return parse_config(table, f"config {path}")

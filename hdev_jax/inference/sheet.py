@@ -1,6 +1,5 @@
 """The vehicle sheet: read from TOML, where the chain is entered, and traction force from motor torque."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +18,7 @@ from hdev_jax.physics import LIBRARY, Driveline, Effect, EfficiencyMap, Vehicle,
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.vehicle import Entry, Target
 from hdev_jax.segments import Segments
+from hdev_jax.toml import read_toml
 
 __all__ = ["BATTERY_TARGETS", "Built", "Sheet", "choose_entry", "read_sheet", "traction_force_from_torque"]
 
@@ -116,16 +116,7 @@ def read_sheet(path: str | Path, *, library: Mapping[str, type[Effect]] = LIBRAR
     """
     path = Path(path)
     where = f"sheet {path}"
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{where}: no such file") from None
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{where}: cannot be read as text ({e})") from None
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as e:  # ValueError: also a number of more digits than Python converts
-        raise InputError(f"{where}: not a TOML file: {e}") from None
+    table, text = read_toml(path, "sheet")
     declared, others = parse(where, table, library)
     map_path = None
     if "driveline.map" in others:

@@ -2,13 +2,13 @@
 
 import difflib
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hdev_jax.errors import InputError
+from hdev_jax.toml import read_toml
 from hdev_jax.units import COLUMNS, conversion, parse_column, unit_of
 
 __all__ = ["FILLS", "FORMATS", "LAYOUTS", "Adapter", "Companion", "Rule", "near"]
@@ -71,14 +71,7 @@ class Adapter:
     def load(path: str | Path) -> "Adapter":
         """Read a TOML file. Raises `InputError` for whatever is wrong in it."""
         path = Path(path)
-        try:
-            table = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        except FileNotFoundError:
-            raise InputError(f"adapter {path}: no such file") from None
-        except (OSError, UnicodeDecodeError) as e:
-            raise InputError(f"adapter {path}: cannot be read as text ({e})") from None
-        except tomllib.TOMLDecodeError as e:
-            raise InputError(f"adapter {path}: not valid TOML: {e}") from None
+        table, _ = read_toml(path, "adapter")
         return Adapter.from_dict(table, where=path.name)
 
     @staticmethod
