@@ -124,6 +124,21 @@ def test_a_table_says_what_was_searched(trips, tmp_path):
     assert all(f"{word} " in note for word in ("degree", "epsilon", "alpha"))
 
 
+def test_a_table_says_what_was_diagnosed_and_not_that_it_was_searched(trips, tmp_path):
+    table = {
+        "experiment": "paper2", "artefact": "paper2/table8", "caption": "Rows", "show": ["test_mean"], "order": ["car"],
+        "models": {"car": {"kind": "diagnosed"}},
+    }  # fmt: skip
+    config = typed(paper2.Config, table, "table8.toml")
+    (task,) = paper2.tasks(config)
+    result = paper2.run({**task, "settings": {**task["settings"], "kind": "persistence"}})
+    result["settings_found"] = {"effects": ["copper_loss", "time_skew"]}
+    with open_run(tmp_path / "run", {"a": 1}) as run:
+        metrics = paper2.collect(config, [(task, result)], run)
+    assert "car: found on trip 1: effects copper_loss, time_skew" in metrics["notes"]
+    assert not any("Optuna" in note for note in metrics["notes"])
+
+
 @pytest.mark.parametrize(("keys", "says"), [({"huber_kv": 1.0}, "did you mean huber_kw"), ({"units": "a"}, "integer")])
 def test_a_wrong_key_of_what_is_tried_is_one_line(keys, says):
     with pytest.raises(InputError, match=says) as e:
