@@ -6,6 +6,7 @@ from typing import Any
 from experiments.config import typed
 from experiments.paper2_models import Settings
 from experiments.tables import write_tables
+from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run
 
 __all__ = ["chosen_keys", "collect"]
@@ -18,8 +19,11 @@ def chosen_keys(model: Settings, keys: Mapping[str, Any]) -> dict[str, Any]:
 
     **Raises:** `InputError` where a key is none of theirs, or a value of the wrong type.
     """
-    table = {**model.model_dump(mode="json"), **keys}
-    return typed(Settings, table, f"what is tried, {dict(keys)}").chosen()
+    where = f"what is tried, {', '.join(keys)}"
+    settings = typed(Settings, {**model.model_dump(mode="json"), **keys}, where)
+    if odd := [k for k in keys if k not in settings.choices]:
+        raise InputError(f"{where}: key {odd[0]} is not chosen here; keys are {', '.join(settings.choices)}")
+    return settings.chosen()
 
 
 def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from experiments.config import Strict
-from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
 from experiments.paper2_drawings import prediction_figure
 from experiments.paper2_fits import Mean, evaluated, fitted
 from experiments.paper2_models import Settings
@@ -31,8 +31,8 @@ class Config(Strict):
     models: dict[str, Settings]
     window: list[float] = Field(default_factory=list)
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    rows: int = 0
-    train: str = "1"
+    rows: int = Field(0, ge=0)
+    train: TripName = "1"
     seed: int = 0
 
 

@@ -27,31 +27,36 @@ class Settings(Strict):
     rule: Literal["least", "ensemble"] = "least"
     source: Literal["channels", "kernel"] = "channels"
     inputs: list[str] = Field(default_factory=lambda: ["motor_torque_nm", "speed_mps"])
-    kernel_order: int = 2
-    outputs: int = 3
-    lags: list[int] = Field(default_factory=lambda: [0, 1, 2])
-    units: int = 5
+    kernel_order: Literal[1, 2] = 2
+    outputs: int = Field(3, ge=0)
+    lags: list[int] = Field(default_factory=lambda: [0, 1, 2], min_length=1)
+    units: int = Field(5, ge=0)
     seen: Literal["inputs", "all"] = "inputs"
     linear: bool = True
-    huber_kw: float = 0.4  # corner of Huber's loss; 0: squares
-    ridge_size: float = 1e-6
-    ridge_slope: float = 1e-3
+    huber_kw: float = Field(0.4, ge=0)  # corner of Huber's loss; 0: squares
+    ridge_size: float = Field(1e-6, ge=0)
+    ridge_slope: float = Field(1e-3, ge=0)
     starts: int = Field(16, ge=1)
     steps: int = Field(120, ge=1)
     coarse_steps: int = Field(50, ge=1)
-    rtol: float = 1e-5
+    rtol: float = Field(1e-5, ge=0)
     simulation: bool = False
     simulation_steps: int = Field(30, ge=1)
     cell: Literal["lstm", "gru"] = "lstm"
     length: int = Field(128, ge=1)
-    rate: float = 0.02
-    decay: float = 0.03
+    rate: float = Field(0.02, gt=0)
+    decay: float = Field(0.03, ge=0)
     model: Literal["tree", "boosted", "robust_linear", "support_vectors"] = "tree"
     trials: int = Field(12, ge=1)
 
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The keys of what can be chosen of a model by rows left out."""
+        return self.TRAINING if self.kind == "recurrent" else self.STRUCTURE
+
     def chosen(self) -> dict[str, Any]:
         """What can be chosen of a model by rows left out."""
-        return self.model_dump(mode="json", include=set(self.TRAINING if self.kind == "recurrent" else self.STRUCTURE))
+        return self.model_dump(mode="json", include=set(self.choices))
 
     def task(self) -> dict[str, Any]:
         """Plain values for a task: all that decides the model."""

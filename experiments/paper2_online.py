@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PositiveFloat
 
 from experiments.config import Strict
 from experiments.paper2_data import kia_fingerprint, kia_trips
@@ -31,14 +31,14 @@ class Config(Strict):
     experiment: Literal["paper2_online"]
     artefact: str
     caption: str
-    outputs: int = 3
-    lags: list[int] = Field(default_factory=lambda: [0, 1, 2])
-    huber_kw: float = 0.4
-    memories_min: list[float] = Field(default_factory=lambda: [15.0, 30.0, 60.0, 120.0, 240.0], min_length=1)
+    outputs: int = Field(3, ge=0)
+    lags: list[int] = Field(default_factory=lambda: [0, 1, 2], min_length=1)
+    huber_kw: PositiveFloat = 0.4
+    memories_min: list[PositiveFloat] = Field(default_factory=lambda: [15.0, 30.0, 60.0, 120.0, 240.0], min_length=1)
     ageing: float = 0.10  # share of the losses that is added by the end of the trip
     aged_trip: Literal["2", "3", "4"] = "3"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    rows: int = 0
+    rows: int = Field(0, ge=0)
     seed: int = 0
 
 

@@ -31,9 +31,9 @@ class Config(Strict):
     order: list[str] = Field(default_factory=list)
     model: str = "NARXP"
     models: dict[str, Settings]
-    share: float = 2 / 3  # of trip 1, to train on
+    share: float = Field(2 / 3, gt=0, lt=1)  # of trip 1, to train on
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    rows: int = 0
+    rows: int = Field(0, ge=0)
     seed: int = 0
 
 

@@ -1,6 +1,6 @@
-"""Choices of the NARX, on trip 1 alone: orders, units and regularisation by blocks of time and the edge of the data.
+"""Choices of the NARX and of recurrent networks on trip 1 alone: by blocks of time and, of a NARX, the data's edge.
 
-The number that decides is the MSE of rows left out, one step ahead, of blocks and edge together, as a mean over starts;
+The number that decides is the MSE of rows left out, one step ahead, of all that is left out, as a mean over starts;
 `paper2_choice` says which is best by it.
 """
 
@@ -13,7 +13,7 @@ from pydantic import Field
 
 from experiments.config import Strict
 from experiments.paper2_choice import chosen_keys, collect
-from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
 from experiments.paper2_fits import recurrent
 from experiments.paper2_models import Settings, structure
 from hdev_jax.errors import InputError
@@ -47,13 +47,13 @@ class Config(Strict):
     models: dict[str, Settings]
     groups: dict[str, Group]
     only: list[str] = Field(default_factory=list)  # of the groups; none: all
-    starts: int = 4
-    blocks: int = 3
-    steps: int = 80
-    recurrent_starts: int = 2
-    recurrent_steps: int = 1000
-    rows: int = 0
-    train: str = "1"
+    starts: int = Field(4, ge=1)
+    blocks: int = Field(3, ge=2)
+    steps: int = Field(80, ge=1)
+    recurrent_starts: int = Field(2, ge=1)
+    recurrent_steps: int = Field(1000, ge=1)
+    rows: int = Field(0, ge=0)
+    train: TripName = "1"
     seed: int = 0
 
     @property

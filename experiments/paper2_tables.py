@@ -107,6 +107,10 @@ def _digits(x: Any) -> str | None:
     return None if x is None else str(x)
 
 
+def _words(x: Any) -> str | None:
+    return (", ".join(x) or "none") if isinstance(x, list) else _digits(x)
+
+
 def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     """What the columns and rows are, where the table does not say."""
     several = [n for n in found if len(found[n]["losses"]) > 1]
@@ -123,11 +127,10 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     if config.free_run and (ahead := [n for n in found if n in PREDICTION]):
         said.append(f"{', '.join(ahead)}: one step ahead, as the paper has it here; every other row in free run")
     for n in found:
-        if found[n]["settings_found"]:
-            best = ", ".join(f"{k.replace('_', ' ')} {_digits(x)}" for k, x in found[n]["settings_found"].items())
-            said.append(
-                f"{n}: the best of {config.models[n].trials} settings (Optuna, by rows of trip 1 left out): {best}"
-            )
+        if settings := found[n]["settings_found"]:
+            best = ", ".join(f"{k.replace('_', ' ')} {_words(x)}" for k, x in settings.items())
+            searched = f"the best of {config.models[n].trials} settings (Optuna, by rows of trip 1 left out)"
+            said.append(f"{n}: {searched if config.models[n].kind == 'classical' else 'found on trip 1'}: {best}")
     if "change_percent" in config.show and config.order[0] in found:
         said.append(f"change percent: of the test mean, against {config.order[0]}")
     return [*said, *(f"{n}: {config.models[n].why}" for n in found if config.models[n].why)]

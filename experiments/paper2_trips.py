@@ -29,7 +29,7 @@ class Config(Strict):
     trip: TripName = "1"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     reasons: dict[str, str] = Field(default_factory=dict)
-    rows: int = 0
+    rows: int = Field(0, ge=0)
     seed: int = 0
 
 

@@ -26,7 +26,8 @@ def recursive(beta: Any, x: Any = None, *, prior: float = 1e6) -> Recursive:
     if x is None:
         return Recursive(beta, prior * np.eye(len(beta)))
     gram = np.asarray(x).T @ np.asarray(x)
-    return Recursive(beta, np.linalg.inv(gram + np.eye(len(beta)) / prior))
+    inverse = np.linalg.inv(gram + np.eye(len(beta)) / prior)
+    return Recursive(beta, (inverse + inverse.T) / 2)
 
 
 def update(
@@ -43,17 +44,20 @@ def update(
     K = P·x/(λ/w + xᵀ·P·x), β ← β + K·(y − xᵀβ), P ← (P − K·xᵀ·P)/λ (Ljung, System Identification, 1999, 11.13), with
     Huber's weight w = min(1, corner/|e|). λ = 1 and an infinite corner is least squares of all rows so far.
 
-    **Arguments:** `forgetting` λ in (0, 1]; `ceiling`: P grows no more once its trace is there, so that standing still,
-    which tells nothing, does not wind it up; `xp`, NumPy where a row comes at a time, JAX inside a program.
+    **Arguments:** `state`, its P symmetric; `forgetting` λ in (0, 1]; `corner` above 0; `ceiling`: P grows no more once
+    its trace is there, so that standing still, which tells nothing, does not wind it up; `xp`, NumPy where a row comes
+    at a time, JAX inside a program.
     """
     beta, covariance = state
     predicted = x @ beta
     error = y - predicted
     along = covariance @ x
-    gain = along / (forgetting * xp.maximum(1.0, abs(error) / corner) + x @ along)
-    smaller = covariance - gain[:, None] * along[None, :]  # symmetric to rounding, whatever the order of the product
+    size = forgetting * xp.maximum(1.0, abs(error) / corner) + x @ along
+    # a product of equals is symmetric to the last bit: what is not would grow by 1/λ with every row, no row lowers it
+    root = along / xp.sqrt(size)
+    smaller = covariance - root[:, None] * root[None, :]
     grown = smaller.trace() < ceiling * forgetting
-    return Recursive(beta + gain * error, smaller / forgetting**grown), predicted
+    return Recursive(beta + along * (error / size), smaller / forgetting**grown), predicted
 
 
 @jax.jit

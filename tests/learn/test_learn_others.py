@@ -11,7 +11,7 @@ from learn_rows import drive
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.classical import CLASSICAL, search_classical
-from hdev_jax.learn.online import follow, recursive
+from hdev_jax.learn.online import follow, recursive, update
 from hdev_jax.learn.recurrent import train_recurrent
 
 
@@ -35,6 +35,33 @@ def test_forgetting_weighs_rows_by_age():
     w = factor ** np.arange(len(y))[::-1]
     expected = np.linalg.solve((x * w[:, None]).T @ x, (x * w[:, None]).T @ y)
     np.testing.assert_allclose(state.beta, expected, rtol=1e-5)
+
+
+def test_an_update_is_a_weighted_row_of_information():
+    """P⁻¹ ← λ·P⁻¹ + w·x·xᵀ, P⁻¹·β ← λ·P⁻¹·β + w·x·y, with Huber's weight of the error before the row; JAX as NumPy."""
+    (x, y), corner, factor = rows(300), 0.15, 0.98
+    y[::7] += 3.0
+    state = recursive(np.zeros(3), np.eye(3))
+    information, target, weights = np.linalg.inv(state.covariance), np.zeros(3), []
+    followed, told = follow(state, x, y, forgetting=factor, corner=corner)
+    for k in range(len(y)):
+        error = y[k] - x[k] @ np.linalg.solve(information, target)
+        weights.append(min(1.0, corner / abs(error)))
+        information = factor * information + weights[-1] * np.outer(x[k], x[k])
+        target = factor * target + weights[-1] * x[k] * y[k]
+        state, predicted = update(state, x[k], y[k], factor, corner, xp=np)
+        assert predicted == pytest.approx(told[k], rel=1e-9, abs=1e-9)
+    assert min(weights) < 0.1 < 1.0 == max(weights)
+    np.testing.assert_allclose(state.beta, np.linalg.solve(information, target), rtol=1e-8)
+    np.testing.assert_allclose(state.covariance, np.linalg.inv(information), rtol=1e-8, atol=1e-15)
+    np.testing.assert_allclose(followed.beta, state.beta, rtol=1e-9)
+
+
+def test_many_memories_after_the_start_it_still_follows():
+    x, y = rows(12_000, 6)
+    state, predicted = follow(recursive(np.zeros(6), x[:50]), x, y, forgetting=0.99)
+    np.testing.assert_array_equal(state.covariance, state.covariance.T)
+    assert np.std(predicted[-2000:] - y[-2000:]) < 0.12
 
 
 def test_a_change_is_followed():

@@ -124,7 +124,30 @@ def test_a_table_says_what_was_searched(trips, tmp_path):
     assert all(f"{word} " in note for word in ("degree", "epsilon", "alpha"))
 
 
-@pytest.mark.parametrize(("keys", "says"), [({"huber_kv": 1.0}, "did you mean huber_kw"), ({"units": "a"}, "integer")])
+def test_a_table_says_what_was_diagnosed_and_not_that_it_was_searched(trips, tmp_path):
+    table = {
+        "experiment": "paper2", "artefact": "paper2/table8", "caption": "Rows", "show": ["test_mean"], "order": ["car"],
+        "models": {"car": {"kind": "diagnosed"}},
+    }  # fmt: skip
+    config = typed(paper2.Config, table, "table8.toml")
+    (task,) = paper2.tasks(config)
+    result = paper2.run({**task, "settings": {**task["settings"], "kind": "persistence"}})
+    result["settings_found"] = {"effects": ["copper_loss", "time_skew"]}
+    with open_run(tmp_path / "run", {"a": 1}) as run:
+        metrics = paper2.collect(config, [(task, result)], run)
+    assert "car: found on trip 1: effects copper_loss, time_skew" in metrics["notes"]
+    assert not any("Optuna" in note for note in metrics["notes"])
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"huber_kv": 1.0}, "did you mean huber_kw"),
+        ({"units": "a"}, "integer"),
+        ({"huber_kv": "a" * 300}, "key huber_kv"),
+        ({"starts": 3}, "key starts is not chosen"),
+    ],
+)
 def test_a_wrong_key_of_what_is_tried_is_one_line(keys, says):
     with pytest.raises(InputError, match=says) as e:
         chosen_keys(Settings(kind="narx"), keys)
@@ -169,6 +192,11 @@ def test_a_model_that_no_one_defined_is_one_line(trips, name, sets, tmp_path, mo
         ("table8", "show=[]", "show"), ("table8", "rows=-5", "rows"), ("table4", "models.NARXP.starts=0", "starts"),
         ("table6", "models.RT.trials=0", "trials"), ("fig5", 'trip="9"', "trip"),
         ("online", "memories_min=[]", "memories_min"), ("online", 'aged_trip="1"', "aged_trip"),
+        ("online", "memories_min=[0.0]", "memories_min.0"), ("online", "huber_kw=0.0", "huber_kw"),
+        ("table4", "models.NARXP.huber_kw=-1.0", "huber_kw"), ("table4", "models.NNS.ridge_slope=-1.0", "ridge_slope"),
+        ("table4", "models.physics.kernel_order=7", "kernel_order"), ("table7", "models.LSTM.rate=0.0", "rate"),
+        ("fig12", 'train="9"', "train"), ("fig5", "rows=-5", "rows"), ("pedal", "share=1.0", "share"),
+        ("selection", "recurrent_starts=0", "recurrent_starts"), ("selection", "blocks=1", "blocks"),
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_one_line(name, sets, key, tmp_path):
