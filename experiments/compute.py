@@ -67,14 +67,17 @@ def compute(
     **Raises:** `ClusterError` where the cluster is at fault.
     """
     every: dict[Path, Todo] = {}
-    count = 0
+    count = done = 0
     for a in asked:
         for task in a.tasks:
             count += 1
             at = store.place(a.module, task, kept)
-            if not at.exists():
+            if at.exists():
+                done += 1
+            else:
                 every.setdefault(at, Todo(at, a.module, task, [])).names.append(a.name)
-    log.say(f"{count} tasks, {count - len(every)} done before")
+    shared = count - done - len(every)
+    log.say(f"{count} tasks, {done} done before" + (f", {shared} shared by several configs" if shared else ""))
     failed: dict[str, Exception] = {}
     if not every:
         return failed

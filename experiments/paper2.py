@@ -3,12 +3,13 @@ for the report alone. One task is one model, so tables that show the same model 
 """
 
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
+from experiments.paper2_diagnosed import diagnosis_fingerprint
 from experiments.paper2_fits import Mean, evaluated, fitted, step_seconds
 from experiments.paper2_models import Settings
 from experiments.paper2_tables import collect
@@ -27,7 +28,7 @@ class Config(Strict):
     # what the table compares: keys of the metrics, the first decides which is better
     show: list[str] = Field(min_length=1)
     models: dict[str, Settings]
-    order: list[str]  # rows of the table
+    order: list[str] = Field(min_length=1)  # rows of the table
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     free_run: bool = False  # which of the two configurations the table's columns are of
     timed: bool = False  # also the time of a step
@@ -35,7 +36,13 @@ class Config(Strict):
     rows: int = Field(0, ge=0)  # of each trip; 0: all
     train: TripName = "1"
     test: list[TripName] = Field(default_factory=lambda: ["2", "3", "4"], min_length=1)
-    seed: int = 0
+    seed: int = Field(0, ge=0)
+
+    @model_validator(mode="after")
+    def _test_trips_are_others(self) -> Self:
+        if self.train in self.test:
+            raise ValueError(f"test: trip {self.train} is the training trip")
+        return self
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
@@ -43,8 +50,10 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     common = {"rows": config.rows, "train": config.train, "data": kia_fingerprint()}
     for name in config.order:
         task = {"name": name, "settings": config.models[name].task(), **common}
+        if config.models[name].kind == "diagnosed":
+            task["diagnosis"] = diagnosis_fingerprint()
         yield {**task, "test": config.test, "seed": config.seed}
-        if config.timed:
+        if config.timed and config.models[name].kind == "narx":
             yield {**task, "timed": True}
 
 
@@ -59,7 +68,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     train = trips[task["train"]]
     if task.get("timed"):
         return {"step_seconds": step_seconds(task["settings"], train)}
-    models, losses = fitted(task["settings"], train, task["seed"])
+    fit = fitted(task["settings"], train, task["seed"])
+    models = fit.models
     names = (task["train"], *task["test"])
     starts = [{t: evaluated(m, trips[t]) for t in names} for m in models]
     mean = Mean.of(models, train)
@@ -68,7 +78,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     return {
         "trips": ensemble if is_mean else starts[0],
         "parameters": (mean if is_mean else models[0]).parameters,
-        "losses": losses,
+        "losses": fit.losses,
+        "converged": fit.converged,
         "starts": {t: {k: [s[t][k] for s in starts] for k in ("step_mse", "free_mse")} for t in names},
         "ensemble": {t: {k: ensemble[t][k] for k in ("step_mse", "free_mse")} for t in names},
         "settings_found": getattr(models[0], "settings", {}),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.data import fingerprint
 from hdev_jax.diagnosis.diagnose import diagnose
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.split import Split
@@ -15,10 +16,18 @@ from hdev_jax.learn import Trip
 from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle
 
-__all__ = ["Diagnosed"]
+__all__ = ["Diagnosed", "diagnosis_fingerprint"]
 
 SHEET = Path(__file__).parents[1] / "configs" / "vehicles" / "kia_niro.toml"
 TARGET = "battery_power_kw"
+LOOP = ("diagnosis", "inference", "physics")  # what the loop is made of
+
+
+def diagnosis_fingerprint() -> str:
+    """Of the sheet and of the loop's own code: a task that diagnoses has it among its values, no other one has."""
+    package = Path(__file__).parents[1] / "hdev_jax"
+    sources = sorted(p for part in LOOP for p in (package / part).rglob("*.py"))
+    return fingerprint([SHEET, Path(__file__), *sources])
 
 
 @dataclass(frozen=True)

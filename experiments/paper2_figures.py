@@ -29,7 +29,7 @@ class Config(Strict):
     order: list[str] = Field(default_factory=list)
     model: str = "NARXP"
     models: dict[str, Settings]
-    window: list[float] = Field(default_factory=list)
+    window: tuple[float, float] | None = None
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
     train: TripName = "1"
@@ -46,7 +46,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
 def run(task: dict[str, Any]) -> dict[str, Any]:
     """Its prediction of the training trip, row by row."""
     trip = kia_trips(task["rows"] or None)[task["train"]]
-    models, _ = fitted(task["settings"], trip, task["seed"])
+    models = fitted(task["settings"], trip, task["seed"]).models
     model = Mean.of(models, trip) if task["settings"]["rule"] == "ensemble" else models[0]
     predicted = model.predict(trip)
     return {

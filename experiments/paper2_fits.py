@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +26,20 @@ from hdev_jax.learn.sequences import energy_kwh, mean_squared
 
 __all__ = ["KINDS", "Mean", "evaluated", "fitted", "recurrent", "step_seconds"]
 
+LEAST_ROWS = 20  # of a trip that a model is fitted on
 DIVERGED_KW = 1e6  # far beyond any battery of a car
 Model = Any
-Fit = tuple[list[Model], list[float]]
+
+
+class Fit(NamedTuple):
+    """Models from each start in the order of their loss on the training trip, and those losses.
+
+    `converged` says of each whether the search for its minimum ended by itself; None where there is no such search.
+    """
+
+    models: list[Model]
+    losses: list[float]
+    converged: list[bool] | None = None
 
 
 def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
@@ -46,7 +57,10 @@ def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     if s["simulation"]:
         fit = fit_simulation(model, trip, fit.theta, max_steps=s["simulation_steps"], **common)
     order = np.argsort(np.nan_to_num(np.asarray(fit.loss), nan=np.inf))
-    return [with_theta(model, fit.theta[k]) for k in order], [float(fit.loss[k]) for k in order]
+    return Fit(
+        [with_theta(model, fit.theta[k]) for k in order], [float(fit.loss[k]) for k in order],
+        [bool(fit.converged[k]) for k in order],
+    )  # fmt: skip
 
 
 def recurrent(s: dict[str, Any], trip: Trip, seed: int, without: np.ndarray | None = None) -> Fit:
@@ -60,12 +74,12 @@ def recurrent(s: dict[str, Any], trip: Trip, seed: int, without: np.ndarray | No
     known = np.ones(len(trip), bool) if without is None else ~without
     loss = [mean_squared((m.predict(trip) - m.measured(trip))[known]) for m in models]
     order = np.argsort(loss)
-    return [models[k] for k in order], [loss[k] for k in order]
+    return Fit([models[k] for k in order], [loss[k] for k in order])
 
 
 def _classical(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     model = search_classical(s["model"], trip, trials=s["trials"], seed=seed, source=Channels(tuple(s["inputs"])))
-    return [model], [model.score]
+    return Fit([model], [model.score])
 
 
 class Mean:
@@ -112,11 +126,11 @@ class _Persistence:
 def _diagnosed(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     """The declared car with what a diagnosis of the training trip adds."""
     model = Diagnosed.of(trip, seed)
-    return [model], [mean_squared(model.predict(trip) - model.measured(trip))]
+    return Fit([model], [mean_squared(model.predict(trip) - model.measured(trip))])
 
 
 def _persistence(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
-    return [_Persistence()], [0.0]
+    return Fit([_Persistence()], [0.0])
 
 
 KINDS: dict[str, Callable[[dict[str, Any], Trip, int], Fit]] = {
@@ -128,8 +142,10 @@ KINDS: dict[str, Callable[[dict[str, Any], Trip, int], Fit]] = {
 }
 
 
-def fitted(settings: dict[str, Any], trip: Trip, seed: int) -> tuple[list[Model], list[float]]:
-    """Models in the order of their loss on the training trip, and those losses."""
+def fitted(settings: dict[str, Any], trip: Trip, seed: int) -> Fit:
+    """Fit a model of these settings. Raises `InputError` for a kind that there is not, and for a trip of few rows."""
+    if len(trip) < LEAST_ROWS:
+        raise InputError(f"trip {trip.name}: {len(trip)} rows, at least {LEAST_ROWS} are needed; raise rows, or 0: all")
     if settings["kind"] not in KINDS:
         raise InputError(f"model kind {settings['kind']!r}: one of {', '.join(KINDS)} is expected")
     return KINDS[settings["kind"]](settings, trip, seed)
@@ -163,9 +179,9 @@ def step_seconds(settings: dict[str, Any], trip: Trip, repeats: int = 5) -> floa
     Of a NARX with all parameters at zero: the time does not depend on their values. Raises `InputError` for a model
     that is no NARX.
     """
-    if settings["kind"] not in ("narx", "persistence"):
+    if settings["kind"] != "narx":
         raise InputError(f"model kind {settings['kind']!r}: time is measured of a NARX alone")
-    model = prepared(structure(settings), trip) if settings["kind"] == "narx" else _Persistence()
+    model = prepared(structure(settings), trip)
     model.simulate(trip)
     taken = []
     for _ in range(repeats):

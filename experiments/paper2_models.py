@@ -1,8 +1,8 @@
 """What a model of paper 2's tables is: its settings, and the structure that they declare."""
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from hdev_jax.learn import Channels, KernelTerms, Structure
@@ -48,6 +48,12 @@ class Settings(Strict):
     decay: float = Field(0.03, ge=0)
     model: Literal["tree", "boosted", "robust_linear", "support_vectors"] = "tree"
     trials: int = Field(12, ge=1)
+
+    @model_validator(mode="after")
+    def _cells_have_units(self) -> Self:
+        if self.kind == "recurrent" and not self.units:
+            raise ValueError("units: a recurrent network has at least one")
+        return self
 
     @property
     def choices(self) -> tuple[str, ...]:

@@ -55,7 +55,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     trip = kia_trips(task["rows"] or None, only="1")["1"]
     cut = int(task["share"] * len(trip))
     started = time.perf_counter()
-    models, _ = fitted(task["settings"], trip.part(0, cut), task["seed"])
+    models = fitted(task["settings"], trip.part(0, cut), task["seed"]).models
     seconds = time.perf_counter() - started
     left = trip.part(cut, len(trip))
     every = [evaluated(m, left) for m in models]

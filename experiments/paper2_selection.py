@@ -103,7 +103,7 @@ def _recurrent(task: dict[str, Any], trip: Trip) -> tuple[Score, int]:
 
     def fit(without: np.ndarray) -> Any:
         s = {**task["settings"], "starts": task["starts"], "steps": task["steps"]}
-        models, _ = recurrent(s, trip, task["seed"], without)
+        models = recurrent(s, trip, task["seed"], without).models
         sizes.append(models[0].parameters)
         return models
 

@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 
 from experiments.tables import write_tables
+from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run
 
 __all__ = ["collect"]
 
 DIVERGED_KW2 = 1e6  # an error above this is of a run that left the numbers
+OF_SOME = ("change_percent", "step_ms")  # numbers that not every row has
 PREDICTION = ("NARXP", "NNP")  # the P of their names: one step ahead in whatever table they stand (tables VIII and IX)
 
 
@@ -33,6 +35,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         if first == "test_mean" and spread[first]["starts"] > 1:
             ours["spread"] = spread["test_mean"]
         rows.append({"name": name, "paper": paper, "ours": ours})
+        if odd := [key for key in config.show if key not in ours and key not in (paper or {}) and key not in OF_SOME]:
+            raise InputError(f"config, key show: no number {odd[0]!r}; there are {', '.join(ours)}")
         lines += [_line(name, key, paper or {}, ours, spread.get(key, {})) for key in config.show]
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     compared = [r for r in rows if r["ours"] and r["paper"] and first in r["paper"]]
@@ -124,6 +128,11 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     ]
     if several:
         said.append("least, median and most are over the starts, each number by itself, read afterwards")
+    for n in found:
+        if found[n]["converged"] and not all(found[n]["converged"]):
+            ended, steps = found[n]["converged"], config.models[n]
+            most = f"{steps.simulation_steps} in free run" if steps.simulation else f"{steps.steps}"
+            said.append(f"{n}: {sum(ended)} of {len(ended)} starts converged, the others stopped after {most} steps")
     if config.free_run and (ahead := [n for n in found if n in PREDICTION]):
         said.append(f"{', '.join(ahead)}: one step ahead, as the paper has it here; every other row in free run")
     for n in found:

@@ -213,12 +213,14 @@ def fit_prediction(
     weights: np.ndarray | None = None,
     max_steps: int = 150,
     rtol: float = 1e-6,
-    single: bool = False,
 ) -> Fitted:
     """Fit the one-step error from several starts in one program (paper 2, section III-C).
 
     **Arguments:** `huber`, the corner of the loss in the target's unit; `ridge`, keywords of `penalty`; `weights`
-    `[start, row]` where starts differ in the rows they are fitted on; `single` as in `fit_many`.
+    `[start, row]` where starts differ in the rows they are fitted on.
+
+    Where there are units, products of the Hessian are in float32 (`fit_many`); a structure that is linear in its
+    parameters is solved in one step or two, in double.
     """
     x, y = model.regressors(trip)
     rows = rows_of(x, y)
@@ -226,7 +228,7 @@ def fit_prediction(
     shape = model.structure.shape
     return fit_many(
         shape, rows, jnp.asarray(begin), huber=huber / float(model.output.sd), ridge=penalty(shape, **(ridge or {})),
-        max_steps=max_steps, rtol=rtol, weights=own, single=single,
+        max_steps=max_steps, rtol=rtol, weights=own, single=shape.units > 0,
     )  # fmt: skip
 
 
@@ -243,14 +245,15 @@ def fit_simulation(
 ) -> Fitted:
     """Fit the free run from solutions of the one-step fit (paper 2, section IV), windows of the trip in parallel.
 
-    A window starts from measured outputs, 64 rows before it counts: its start is forgotten by then.
+    A window starts from measured outputs, 64 rows before it counts: its start is forgotten by then. Products of the
+    Hessian as in `fit_prediction`.
     """
     x, y = model.regressors(trip)
     shape = model.structure.shape
     windows = windows_of(x, y, shape.feedback, length=length)
     return fit_many(
         shape, windows, jnp.asarray(begin), huber=huber / float(model.output.sd), ridge=penalty(shape, **(ridge or {})),
-        max_steps=max_steps, rtol=rtol,
+        max_steps=max_steps, rtol=rtol, single=shape.units > 0,
     )  # fmt: skip
 
 

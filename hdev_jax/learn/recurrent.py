@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray
 from hdev_jax.errors import InputError
 from hdev_jax.learn.sequences import Scale, Trip
 from hdev_jax.learn.sources import Channels, Source
-from hdev_jax.learn.train import Plan, train
+from hdev_jax.learn.train import DivergedError, Plan, train
 
 __all__ = ["Recurrent", "RecurrentModel", "train_recurrent"]
 
@@ -107,7 +107,7 @@ def train_recurrent(
     **Arguments:** `length` rows of a window count, after `burn_in` that only fill the memory; `decay` of the
     weights (Loshchilov and Hutter 2019), of the cell, not of the read-out, times the rate; `huber`, corner of the
     loss in the target's unit; `without`, rows that no window counts. A start whose loss is not finite stays where it
-    was. Raises `InputError` for a trip that has no window.
+    was. Raises `InputError` for a trip that has no window, `DivergedError` where no start has a finite loss.
     """
     import optax
 
@@ -142,6 +142,8 @@ def train_recurrent(
     trained = train(
         objective, weights, None, jnp.asarray(places), optimiser, Plan(epochs, batch), key=draw, members="side by side"
     )
+    if not np.isfinite(trained.losses[:, 0]).any():
+        raise DivergedError(f"trip {trip.name}: no {kind} has a finite loss; lower the rate")
     return [
         RecurrentModel(eqx.combine(jax.tree.map(lambda w, k=k: w[k], trained.weights), static), source, *scales)
         for k in range(len(networks))

@@ -86,15 +86,14 @@ def validated(
     return _score(trip, left_out, [[with_theta(model, t) for t in fold] for fold in thetas], edge=True)
 
 
-def by_blocks(fit: Callable[[np.ndarray], Sequence[Predicts]], trip: Trip, *, count: int, warm: int = 0) -> Score:
+def by_blocks(fit: Callable[[np.ndarray], Sequence[Predicts]], trip: Trip, *, count: int) -> Score:
     """As `validated`, of models that read every row of a trip in turn: `count` blocks of time are left out, no edge.
 
-    **Arguments:** `fit`, models from each start, the best first, fitted without the rows `[row]` that it is given;
-    `warm`, rows at the trip's begin that are not counted, for a memory that is empty there.
+    **Arguments:** `fit`, models from each start, the best first, fitted without the rows `[row]` that it is given.
     """
     number = blocks(len(trip), count)
-    left_out = [(number == k) & (np.arange(len(trip)) >= warm) for k in range(count)]
-    return _score(trip, left_out, [fit(number == k) for k in range(count)], edge=False)
+    left_out = [number == k for k in range(count)]
+    return _score(trip, left_out, [fit(rows) for rows in left_out], edge=False)
 
 
 def _score(trip: Trip, left_out: list[np.ndarray], fitted: Sequence[Sequence[Predicts]], *, edge: bool) -> Score:
