@@ -29,7 +29,7 @@ class Config(Strict):
     order: list[str] = Field(default_factory=list)
     model: str = "NARXP"
     models: dict[str, Settings]
-    window: tuple[float, float] | None = None
+    window: list[float] | None = Field(None, min_length=2, max_length=2)
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
     train: TripName = "1"
