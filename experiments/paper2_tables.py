@@ -128,6 +128,7 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     ]
     if several:
         said.append("least, median and most are over the starts, each number by itself, read afterwards")
+        said.append("the starts of a model are fitted side by side in one program (vmap)")
     for n in found:
         if found[n]["converged"] and not all(found[n]["converged"]):
             ended, steps = found[n]["converged"], config.models[n]
