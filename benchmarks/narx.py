@@ -14,7 +14,6 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
+from timing import median_seconds
 
 from hdev_jax.learn import KernelTerms, Structure, Trip, fit_prediction, prepared, starts, with_theta
 from hdev_jax.learn.network import direct, free_run, output
@@ -45,17 +45,6 @@ def drive(rows: int, seed: int = 0) -> Trip:
     channels = {"motor_torque_nm": torque, "motor_speed_radps": turning}
     segments = Segments(none, none, 0.22 * np.arange(rows), np.full(rows, 0.22), 0.22 * speed, speed, speed, channels)
     return Trip("1", 0.22, {"speed_mps": speed, **channels}, late, segments)
-
-
-def timed(call: Callable[[], Any], repeats: int) -> float:
-    """The fastest of `repeats` calls [s], compiled before."""
-    jax.block_until_ready(call())
-    taken = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        jax.block_until_ready(call())
-        taken.append(time.perf_counter() - started)
-    return min(taken)
 
 
 class _ReachedError(Exception):
@@ -116,7 +105,7 @@ def windows(rows: int, units: int) -> dict[str, float]:
     go = jax.jit(partial(simulated, shape))
     ways = {"windows": windows_of(x, y, shape.feedback), "scan": windows_of(x, y, shape.feedback, length=rows, group=1)}
     for name, given in ways.items():
-        out[f"simulation_{name}_s"] = timed(lambda: go(theta, given, jnp.asarray(np.inf)), 3)  # noqa: B023
+        out[f"simulation_{name}_s"] = median_seconds(lambda: go(theta, given, jnp.asarray(np.inf)), 3)  # noqa: B023
     return {**out, "simulation_ratio": out["simulation_scan_s"] / out["simulation_windows_s"]}
 
 
@@ -131,23 +120,22 @@ def speed(rows: int, units: int) -> dict[str, float]:
         x, _ = model.regressors(trip)
         go = jax.jit(partial(free_run, shape))
         one = jnp.asarray(x[0, :3]), jnp.asarray(x[:, 3:])
-        out[f"free_run_us_{seen}"] = 1e6 * timed(lambda: go(theta, *one), 7) / len(x)  # noqa: B023
+        out[f"free_run_us_{seen}"] = 1e6 * median_seconds(lambda: go(theta, *one), 7) / len(x)  # noqa: B023
         short = x[:2000]
         many = jnp.tile(one[0], (64, 1)), jnp.repeat(jnp.asarray(short[:, None, 3:]), 64, axis=1)
-        out[f"free_run_batch_us_{seen}"] = 1e6 * timed(lambda: go(theta, *many), 7) / len(short) / 64  # noqa: B023
+        out[f"free_run_batch_us_{seen}"] = 1e6 * median_seconds(lambda: go(theta, *many), 7) / len(short) / 64  # noqa: B023
         row, ready = np.asarray(x[100]), with_theta(model, theta)
-        started = time.perf_counter()
-        for _ in range(2000):
-            ready.step(row)
-        out[f"one_step_us_{seen}"] = 1e6 * (time.perf_counter() - started) / 2000
+        out[f"one_step_us_{seen}"] = 1e6 * median_seconds(lambda: [ready.step(row) for _ in range(200)], 15) / 200  # noqa: B023
     model = prepared(Structure(KernelTerms(2), units=0), trip)
     x, y = model.regressors(trip)
     z = np.concatenate([np.ones((len(x), 1)), x], axis=1)
-    state = recursive(np.zeros(z.shape[1]))
-    started = time.perf_counter()
-    for k in range(2000):
-        state, _ = update(state, z[k % len(z)], y[k % len(z)], 0.9999, 0.05, 1e9, xp=np)
-    out["update_us"] = 1e6 * (time.perf_counter() - started) / 2000
+
+    def updates() -> None:
+        state = recursive(np.zeros(z.shape[1]))
+        for k in range(200):
+            state, _ = update(state, z[k], y[k], 0.9999, 0.05, 1e9, xp=np)
+
+    out["update_us"] = 1e6 * median_seconds(updates, 15) / 200
     return out
 
 
