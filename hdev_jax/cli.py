@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from hdev_jax import __version__
+from hdev_jax.compiling import compile_quickly, compiles_long
 from hdev_jax.errors import InputError
 
 __all__ = ["main", "parser"]
@@ -250,6 +251,8 @@ class _Help(argparse.HelpFormatter):
 
 
 def _run(verb: str, arguments: dict[str, Any]) -> Any:
+    if "logs" in arguments and compiles_long(arguments["logs"]):
+        compile_quickly()
     import jax
 
     from hdev_jax import api, progress

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from hdev_jax import progress
+from hdev_jax.compiling import compile_quickly
 from hdev_jax.errors import InputError
 
 __all__ = ["main"]
@@ -19,6 +20,7 @@ def main(argv: list[str] | None = None) -> int:
     out: Path = parser.parse_args(argv).out
     seed: int = parser.parse_args(argv).seed
 
+    compile_quickly()
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -21,14 +21,11 @@ for _name, _value in {
     jax.config.update(_name, _value)
     os.environ[_name.upper()] = str(_value)  # the same for the processes that a test starts
 
-# Compiling is most of what the tests do, and each program runs once or twice: XLA does not optimise what it compiles
-# (a quarter of the time for a network's training). The demo, studies and benchmarks run as it compiles by default.
-os.environ["XLA_FLAGS"] = " ".join(
-    (os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0", "--xla_cpu_use_fusion_emitters=false")
-).strip()
-
 # Before any module of the package is imported.
 jaxtyping.install_import_hook("hdev_jax", "beartype.beartype")
+from hdev_jax.compiling import compile_quickly  # noqa: E402
+
+compile_quickly()  # each program runs once or twice; studies and benchmarks run as XLA compiles by default
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 mpl.use("Agg")
