@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hdev_jax.errors import InputError
-from hdev_jax.toml import read_toml
+from hdev_jax.textfiles import read_toml
 
 __all__ = [
     "CONFIGS",

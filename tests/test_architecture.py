@@ -18,7 +18,7 @@ PACKAGE = ROOT / "hdev_jax"
 # From the bottom up. A module imports from lines above its own, and from its own package.
 LAYERS = [
     {"errors", "segments", "progress"},
-    {"compiling", "toml", "units", "rundir"},
+    {"compiling", "textfiles", "units", "rundir"},
     {"logs", "physics"},
     {"inference", "learn", "fleet"},
     {"diagnosis"},

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hdev_jax.errors import InputError
-from hdev_jax.toml import read_toml
+from hdev_jax.textfiles import read_toml
 
 __all__ = ["Driving", "FleetConfig", "Gears", "Log", "Truth", "Weather", "load_config", "parse_config"]
 

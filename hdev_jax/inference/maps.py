@@ -10,6 +10,7 @@ import numpy as np
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import near
 from hdev_jax.physics import EfficiencyMap
+from hdev_jax.textfiles import read_text
 
 __all__ = ["MAP_COLUMNS", "read_map"]
 
@@ -27,13 +28,7 @@ def read_map(path: str | Path) -> EfficiencyMap:
     outside (0, 1], a point given twice, and a hole in the grid.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"efficiency map {path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"efficiency map {path}: cannot be read as text ({e})") from None
-    return _grid(path, _points(path, text))
+    return _grid(path, _points(path, read_text(path, "efficiency map")))
 
 
 def _points(path: Path, text: str) -> dict[tuple[float, float, float], float]:

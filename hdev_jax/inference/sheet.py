@@ -18,7 +18,7 @@ from hdev_jax.physics import LIBRARY, Driveline, Effect, EfficiencyMap, Vehicle,
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.vehicle import Entry, Target
 from hdev_jax.segments import Segments
-from hdev_jax.toml import read_toml
+from hdev_jax.textfiles import read_toml
 
 __all__ = ["BATTERY_TARGETS", "Built", "Sheet", "choose_entry", "read_sheet", "traction_force_from_torque"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hdev_jax.errors import InputError
-from hdev_jax.toml import read_toml
+from hdev_jax.textfiles import read_toml
 from hdev_jax.units import COLUMNS, conversion, parse_column, unit_of
 
 __all__ = ["FILLS", "FORMATS", "LAYOUTS", "Adapter", "Companion", "Rule", "near"]
