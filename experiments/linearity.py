@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field
 
 from experiments.config import Strict
 from experiments.figures import save_figure, styled
@@ -36,7 +37,7 @@ class Config(Strict):
     logs: int = 6
     trips: int = 8
     noise_level: float = 0.02
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
+from pydantic import Field
 
 from experiments.config import Strict
 from experiments.data import MissingDataError, data_folder, fingerprint
@@ -45,7 +46,7 @@ class Config(Strict):
     rows: int = 0  # of each mission; 0: all
     within_percent: float = 3.0
     slope_kg: list[float]
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

@@ -30,7 +30,7 @@ class Config(Strict):
     experiment: Literal["paper1_fig5"]
     artefact: str
     caption: str
-    seed: int = 1
+    seed: int = Field(1, ge=0)
     routes: int = 1120
     variants: list[str] = Field(default_factory=lambda: ["all"])
     held_variants: list[str]

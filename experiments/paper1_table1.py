@@ -43,7 +43,7 @@ class Config(Strict):
     measured: bool = True
     rows: int = 0  # of each measured trip; 0: all
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

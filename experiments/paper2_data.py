@@ -6,13 +6,15 @@ from pathlib import Path
 from typing import Literal
 
 from experiments.data import ORIGIN, MissingDataError, data_folder, fingerprint
+from hdev_jax.errors import InputError
 from hdev_jax.learn import Trip, trips_of
 from hdev_jax.logs import Log, read_log
 from hdev_jax.logs.adapter import Adapter
 
-__all__ = ["TripName", "kia_fingerprint", "kia_log", "kia_trips"]
+__all__ = ["LEAST_ROWS", "TripName", "kia_fingerprint", "kia_log", "kia_trips"]
 
 TripName = Literal["1", "2", "3", "4"]
+LEAST_ROWS = 20  # of a trip that a model is fitted on
 TRIPS: tuple[TripName, ...] = ("1", "2", "3", "4")
 ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "kia_niro.toml"
 
@@ -53,7 +55,12 @@ def _read(adapter: Path, *files: Path) -> Log:
 
 
 def kia_trips(rows: int | None = None, only: str = "") -> dict[str, Trip]:
-    """The trips by name, power in kW; the first `rows` of each where a run is to be tiny."""
+    """The trips by name, power in kW; the first `rows` of each where a run is to be tiny.
+
+    Raises `InputError` where those are too few, and `MissingDataError` without data.
+    """
+    if rows is not None and rows < LEAST_ROWS:
+        raise InputError(f"config, key rows: {rows} rows of a trip, at least {LEAST_ROWS} are needed, or 0: all")
     log = kia_log(only)
     found = trips_of(log.segments, log.target("battery_power_kw"), log.trip_names)
     return {t.name: t.part(0, rows) if rows else t for t in found}

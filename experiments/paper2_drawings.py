@@ -10,7 +10,7 @@ from hdev_jax.learn import Trip
 from hdev_jax.report.canvas import AFTER, GREY, MEASURED, figure, tidy
 from hdev_jax.rundir import Run
 
-__all__ = ["prediction_figure", "signals_figure", "speeds_figure"]
+__all__ = ["MPH", "prediction_figure", "signals_figure", "speeds_figure"]
 
 MPH = 0.44704  # m/s: the international mile (1959)
 

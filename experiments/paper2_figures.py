@@ -33,7 +33,7 @@ class Config(Strict):
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
     train: TripName = "1"
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.paper2_data import LEAST_ROWS
 from experiments.paper2_diagnosed import Diagnosed
-from experiments.paper2_models import structure
+from experiments.paper2_models import corner_kw, penalised, structure
 from hdev_jax.errors import InputError
 from hdev_jax.learn import (
     Channels,
@@ -26,7 +27,6 @@ from hdev_jax.learn.sequences import energy_kwh, mean_squared
 
 __all__ = ["KINDS", "Mean", "evaluated", "fitted", "recurrent", "step_seconds"]
 
-LEAST_ROWS = 20  # of a trip that a model is fitted on
 DIVERGED_KW = 1e6  # far beyond any battery of a car
 Model = Any
 
@@ -45,17 +45,15 @@ class Fit(NamedTuple):
 def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
     """One-step fit from many starts; then, where `simulation`, the free run from its solutions."""
     shape = structure(s)
-    model, ridge = prepared(shape, trip), {"size": s["ridge_size"], "slope": s["ridge_slope"]}
-    huber = s["huber_kw"] if s["huber_kw"] else np.inf
+    model, loss = prepared(shape, trip), penalised(s)
     if shape.units:
         keys = jax.random.split(jax.random.key(seed), s["starts"])
-        begin = starts(model, trip, keys=keys, steps=s["coarse_steps"], huber=huber, ridge=ridge)
+        begin = starts(model, trip, keys=keys, steps=s["coarse_steps"], **loss)
     else:
         begin = jnp.zeros((1, shape.shape.size))
-    common = {"huber": huber, "ridge": ridge, "rtol": s["rtol"]}
-    fit = fit_prediction(model, trip, begin, max_steps=s["steps"], **common)
+    fit = fit_prediction(model, trip, begin, max_steps=s["steps"], rtol=s["rtol"], **loss)
     if s["simulation"]:
-        fit = fit_simulation(model, trip, fit.theta, max_steps=s["simulation_steps"], **common)
+        fit = fit_simulation(model, trip, fit.theta, max_steps=s["simulation_steps"], rtol=s["rtol"], **loss)
     order = np.argsort(np.nan_to_num(np.asarray(fit.loss), nan=np.inf))
     return Fit(
         [with_theta(model, fit.theta[k]) for k in order], [float(fit.loss[k]) for k in order],
@@ -66,10 +64,9 @@ def _narx(s: dict[str, Any], trip: Trip, seed: int) -> Fit:
 def recurrent(s: dict[str, Any], trip: Trip, seed: int, without: np.ndarray | None = None) -> Fit:
     """A network for each start, ordered by its error on the training trip, on the rows that are not left out of it."""
     keys = jax.random.split(jax.random.key(seed), s["starts"])
-    huber = s["huber_kw"] if s["huber_kw"] else np.inf
     models = train_recurrent(
         s["cell"], trip, keys=keys, source=Channels(tuple(s["inputs"])), units=s["units"], steps=s["steps"],
-        length=s["length"], rate=s["rate"], decay=s["decay"], huber=huber, without=without,
+        length=s["length"], rate=s["rate"], decay=s["decay"], huber=corner_kw(s), without=without,
     )  # fmt: skip
     known = np.ones(len(trip), bool) if without is None else ~without
     loss = [mean_squared((m.predict(trip) - m.measured(trip))[known]) for m in models]

@@ -2,12 +2,13 @@
 
 from typing import Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from hdev_jax.learn import Channels, KernelTerms, Structure
 
-__all__ = ["Settings", "structure"]
+__all__ = ["Settings", "corner_kw", "penalised", "structure"]
 
 
 class Settings(Strict):
@@ -67,6 +68,16 @@ class Settings(Strict):
     def task(self) -> dict[str, Any]:
         """Plain values for a task: all that decides the model."""
         return self.model_dump(mode="json", exclude={"why"})
+
+
+def corner_kw(s: dict[str, Any]) -> float:
+    """Corner of Huber's loss in kW; infinite where a model's settings ask for squares."""
+    return s["huber_kw"] or np.inf
+
+
+def penalised(s: dict[str, Any]) -> dict[str, Any]:
+    """Loss and ridge of a NARX, as the fits take them."""
+    return {"huber": corner_kw(s), "ridge": {"size": s["ridge_size"], "slope": s["ridge_slope"]}}
 
 
 def structure(s: dict[str, Any]) -> Structure:

@@ -15,6 +15,7 @@ from pydantic import Field, PositiveFloat
 from experiments.config import Strict
 from experiments.paper2_data import kia_fingerprint, kia_trips
 from experiments.tables import write_tables
+from hdev_jax.errors import InputError
 from hdev_jax.learn import KernelTerms, Narx, Structure, Trip, fit_prediction, prepared, with_theta
 from hdev_jax.learn.online import Recursive, follow, recursive
 from hdev_jax.learn.sequences import energy_kwh, mean_squared
@@ -41,7 +42,7 @@ class Config(Strict):
     aged_trip: Literal["2", "3", "4"] = "3"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
@@ -61,6 +62,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     model = with_theta(model, fit_prediction(model, first, jax.numpy.asarray(zero), huber=task["huber_kw"]).theta[0])
     corner = task["huber_kw"] / float(model.output.sd)
     x1, y1 = _rows(model, first)
+    if np.linalg.matrix_rank(x1) < x1.shape[1]:
+        raise InputError(f"trip 1: {len(first)} rows do not tell {x1.shape[1]} regressors apart; raise rows, or 0: all")
     # columns that are uncorrelated on trip 1: between like columns a covariance that grows loses its sign to rounding
     turn = np.linalg.inv(np.linalg.cholesky(x1.T @ x1 / len(x1))).T
     x1, beta = x1 @ turn, np.linalg.solve(turn, model.theta)

@@ -15,7 +15,7 @@ from experiments.config import Strict
 from experiments.paper2_choice import chosen_keys, collect
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
 from experiments.paper2_fits import recurrent
-from experiments.paper2_models import Settings, structure
+from experiments.paper2_models import Settings, penalised, structure
 from hdev_jax.errors import InputError
 from hdev_jax.learn import Trip
 from hdev_jax.learn.selection import Score, by_blocks, validated
@@ -54,7 +54,7 @@ class Config(Strict):
     recurrent_steps: int = Field(1000, ge=1)
     rows: int = Field(0, ge=0)
     train: TripName = "1"
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
     @property
     def picked(self) -> dict[str, Group]:
@@ -93,7 +93,7 @@ def _narx(task: dict[str, Any], trip: Trip) -> tuple[Score, int]:
     s = task["settings"]
     score = validated(
         structure(s), trip, key=jax.random.key(task["seed"]), count=task["starts"], blocks=task["blocks"],
-        huber=s["huber_kw"] or np.inf, ridge={"size": s["ridge_size"], "slope": s["ridge_slope"]}, steps=task["steps"],
+        steps=task["steps"], **penalised(s),
     )  # fmt: skip
     return score, structure(s).shape.size
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
-from experiments.paper2_drawings import signals_figure, speeds_figure
+from experiments.paper2_drawings import MPH, signals_figure, speeds_figure
 from experiments.tables import write_tables
 from hdev_jax.learn.sequences import energy_kwh
 from hdev_jax.rundir import Run
@@ -16,7 +16,7 @@ from hdev_jax.rundir import Run
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
 SOURCES = ("paper2_trips.py", "paper2_data.py")
-MPH, MILE_M = 0.44704, 1609.344  # m/s and m: the international mile (1959)
+MILE_M = 1609.344  # the international mile (1959)
 
 
 class Config(Strict):
@@ -30,7 +30,7 @@ class Config(Strict):
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     reasons: dict[str, str] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
-    seed: int = 0
+    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

@@ -78,7 +78,7 @@ class Config(Strict):
     page: Literal["table", "coefficients", "shares", "grid"] = "table"
     coefficient: Literal["c_rr", "cda_m2"] = "c_rr"
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
-    seed: int = 1
+    seed: int = Field(1, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

@@ -61,7 +61,7 @@ class Config(Strict):
     cases: dict[str, Case]
     only: list[str] = Field(default_factory=list)  # cases to run; all where none is named
     sets: dict[str, list[list[str]]] = Field(default_factory=dict)
-    seed: int = 1000
+    seed: int = Field(1000, ge=0)
     fdr: float = 0.05
 
     @model_validator(mode="after")

@@ -197,11 +197,20 @@ def test_a_model_that_no_one_defined_is_one_line(trips, name, sets, tmp_path, mo
         ("table4", "models.physics.kernel_order=7", "kernel_order"), ("table7", "models.LSTM.rate=0.0", "rate"),
         ("fig12", 'train="9"', "train"), ("fig5", "rows=-5", "rows"), ("pedal", "share=1.0", "share"),
         ("selection", "recurrent_starts=0", "recurrent_starts"), ("selection", "blocks=1", "blocks"),
+        ("pedal", "seed=-1", "seed"), ("fig5", "seed=-1", "seed"),
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_one_line(name, sets, key, tmp_path):
     with pytest.raises(InputError, match=rf"--set .*key .*{key}"):
         run_config(CONFIGS / "paper2" / f"{name}.toml", [sets], out=tmp_path / "out")
+
+
+@pytest.mark.parametrize(("name", "rows", "words"), [
+    ("fig5", 1, "at least 20"), ("table2", 19, "at least 20"), ("online", 30, "do not tell .* regressors apart"),
+])  # fmt: skip
+def test_trips_of_few_rows_are_one_line(name, rows, words, tmp_path, data_dir):
+    with pytest.raises(InputError, match=f"{rows} rows.*{words}"):
+        run_config(CONFIGS / "paper2" / f"{name}.toml", [f"rows={rows}"], out=tmp_path / "out")
 
 
 def test_a_trip_that_is_not_there_is_one_line(tmp_path, monkeypatch):
