@@ -23,7 +23,10 @@ def main(argv: list[str] | None = None) -> int:
 
     from experiments.config import listed
     from experiments.workers import ClusterError
+    from hdev_jax.compiling import compile_quickly
 
+    if options.compile_quickly:
+        compile_quickly()
     jax.config.update("jax_enable_x64", True)
     try:
         with progress.shown():
@@ -72,6 +75,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--tiny", action="store_true", help="as small as the config's table [tiny] says, to try it")
     parser.add_argument("--docs", type=Path, help="a folder for the tables as a page in Markdown, with its figures")
+    parser.add_argument(
+        "--compile-quickly", action="store_true",
+        help="programs that are not optimised: sooner done where each runs a few times, as in the study of planted "
+        "effects; last bits may differ (a cluster's workers compile as they were started)",
+    )  # fmt: skip
     return parser
 
 

@@ -345,6 +345,7 @@ def _environment(seed: int | None, command: list[str], started: float) -> dict[s
         "python": platform.python_version(),
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "packages": packages,
     }
 
