@@ -90,11 +90,14 @@ def _run_one(options: argparse.Namespace) -> int:
 
     runs = run_config(
         options.config, options.set, out=options.out, workers=_workers(options), scheduler=options.scheduler,
+        quickly=options.compile_quickly,
         kept=options.tasks, fresh=not options.kept, tiny=options.tiny,
     )  # fmt: skip
     if options.docs:
         points = [shown_point(r["sweep"]) for r in runs]
-        write_docs(options.docs, options.config, [Path(r["folder"]) for r in runs], options.set, points)
+        write_docs(
+            options.docs, options.config, [Path(r["folder"]) for r in runs], options.set, points, _flags(options)
+        )
     print(options.out / ("sweep.json" if runs[0]["sweep"] else "metrics.json"))
     return 0
 
@@ -108,7 +111,7 @@ def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
     for name in ("set", "tasks"):
         if getattr(options, name):
             raise InputError(f"--{name}: is for one config; {options.config} is a list of {len(configs)}")
-    where = Where(_workers(options), options.scheduler)
+    where = Where(_workers(options), options.scheduler, options.compile_quickly)
     came = run_list(configs, out=options.out, where=where, tiny=options.tiny, fresh=not options.kept)
     if lines := against(came):
         table = cells(lines, 4)
@@ -117,11 +120,16 @@ def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
             print("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip())
     if options.docs:
         made = {path: [Path(r["folder"]) for r in runs] for path, runs in came.made.items()}
-        write_list_docs(options.docs, options.config, made, came.reasons())
+        write_list_docs(options.docs, options.config, made, came.reasons(), _flags(options))
     print(f"{len(came.made)} of {len(configs)} configs: {options.out / 'index.html'}")
     for why in came.reasons():
         print(f"experiments: {why}", file=sys.stderr)
     return 1 if came.broken else 2 if came.refused else 0
+
+
+def _flags(options: argparse.Namespace) -> list[str]:
+    """What a page names of the command beside the config: what decides how much was run, and how it was compiled."""
+    return [f"--{n.replace('_', '-')}" for n in ("tiny", "kept", "compile_quickly") if getattr(options, n)]
 
 
 def _workers(options: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from experiments import store
 from experiments.log import Log
 from experiments.workers import Job, Outcome, in_turn, on_cluster, on_cores
 from hdev_jax import progress
+from hdev_jax.errors import InputError
 
 __all__ = ["Asked", "Where", "compute"]
 
@@ -23,6 +24,7 @@ class Where:
 
     workers: int = 1
     scheduler: str | None = None
+    quickly: bool = False  # whether programs are compiled without being optimised
 
     def start(self, jobs: Sequence[Job], keys: Sequence[str]) -> Iterator[tuple[int, Outcome]]:
         """The jobs' outcomes as they come."""
@@ -64,7 +66,8 @@ def compute(
 
     **Returns** the exception of each run (by its name) that a task of stopped; without `keep_going` the first ends it.
 
-    **Raises:** `ClusterError` where the cluster is at fault.
+    **Raises:** `ClusterError` where the cluster is at fault, `InputError` for programs compiled quickly where a task
+    measures time.
     """
     every: dict[Path, Todo] = {}
     count = done = 0
@@ -79,23 +82,34 @@ def compute(
     shared = count - done - len(every)
     log.say(f"{count} tasks, {done} done before" + (f", {shared} shared by several configs" if shared else ""))
     failed: dict[str, Exception] = {}
+
+    def fail(group: Sequence[Todo], error: Exception) -> None:
+        log.say(f"{' '.join(t.at.stem for t in group)}: {type(error).__name__}: {error}", shown=False)
+        error.add_note(f"in the task {json.dumps(group[0].task)}")
+        failed.update({name: error for t in group for name in t.names if name not in failed})
+
     if not every:
         return failed
+    if where.quickly and (timed := [t.names[0] for t in every.values() if t.says("alone")]):
+        raise InputError(f"--compile-quickly: {timed[0]} measures time, which it would change; run it without")
     groups = _groups(every.values())
     with contextlib.closing(_outcomes(where, groups)) as outcomes:
         for group, outcome in progress.track(outcomes, "running", total=len(groups)):
             ids = " ".join(t.at.stem for t in group)
             if isinstance(outcome, Exception):
-                log.say(f"{ids}: {type(outcome).__name__}: {outcome}", shown=False)
-                outcome.add_note(f"in the task {json.dumps(group[0].task)}")
-                failed |= {name: outcome for t in group for name in t.names if name not in failed}
+                fail(group, outcome)
                 if not keep_going:
                     break
                 continue
             results, seconds = outcome
             at_once = len(group) if hasattr(group[0].module, "run_together") else 1
             for t, result in zip(group, results, strict=True):
-                store.keep(t.at, t.task, result, seconds / len(group), at_once)
+                try:
+                    store.keep(t.at, t.task, result, seconds / len(group), at_once)
+                except (TypeError, ValueError) as e:  # a number that is none, or what is no JSON
+                    fail([t], e)
+            if failed and not keep_going:
+                break
             how = f", {len(group)} tasks {'in one program' if at_once > 1 else 'in turn'}" if len(group) > 1 else ""
             log.say(f"{ids}: {seconds:.2f} s{how}", shown=False)
     return failed

@@ -69,6 +69,7 @@ def run_config(
     out: str | Path,
     workers: int = 1,
     scheduler: str | None = None,
+    quickly: bool = False,
     kept: str | Path | None = None,
     fresh: bool = True,
     tiny: bool = False,
@@ -76,15 +77,15 @@ def run_config(
 ) -> list[dict[str, Any]]:
     """Run a config, or each point of its sweep in a folder of its own under `out`. **Returns** their metrics.
 
-    **Arguments:** `workers`, `scheduler`: see `Where`; `kept`, a folder for the results of tasks that other runs may
-    share; without it a run keeps them in its own folder until it is complete, and the points of a sweep share one under
-    `out`; `fresh=False` runs no task and reports on those that are kept (`metrics["tasks_left_out"]` says how many are
-    not); `tiny` makes the config as small as its table `[tiny]` says; `replace`: a run of another configuration in
-    `out` gives way.
+    **Arguments:** `workers`, `scheduler`, `quickly`: see `Where`; `kept`, a folder for the results of tasks that other
+    runs may share; without it a run keeps them in its own folder until it is complete, and the points of a sweep share
+    one under `out`; `fresh=False` runs no task and reports on those that are kept (`metrics["tasks_left_out"]` says how
+    many are not); `tiny` makes the config as small as its table `[tiny]` says; `replace`: a run of another
+    configuration in `out` gives way.
 
     **Raises:** `InputError` where the config or `out` is at fault; what a task raises.
     """
-    where = Where(workers, scheduler)
+    where = Where(workers, scheduler, quickly)
     shared = Path(kept) if kept is not None else None
     plans = plan(path, sets, tiny=tiny, kept=None if fresh else shared or Path(out) / "tasks")
     if not plans:

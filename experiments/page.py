@@ -98,16 +98,22 @@ def write_page(run: Run, metrics: dict[str, Any]) -> None:
 
 
 def write_docs(
-    docs: Path, config: str | Path, folders: Sequence[Path], sets: Sequence[str] = (), points: Sequence[str] = ()
-) -> None:
+    docs: Path, config: str | Path, folders: Sequence[Path], sets: Sequence[str] = (), points: Sequence[str] = (),
+    flags: Sequence[str] = (),
+) -> None:  # fmt: skip
     """`docs/NAME.md`, NAME being the config's, its tables and figures, from complete runs of that config.
 
     **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with; `points` of a sweep, one for each
-    run, which head them. Figures go to `docs/figures/NAME/`.
+    run, which head them; `flags` that change what is run. Figures go to `docs/figures/NAME/`.
     """
     name = Path(config).stem
     every = " ".join([shown(config), *(f"--set {s}" for s in sets)])
-    lines = [f"# {_kind(Path(config))}: {name}", "", _by(f"{every} --tasks DIR --out OUT --docs docs"), ""]
+    lines = [
+        f"# {_kind(Path(config))}: {name}",
+        "",
+        _by(f"{' '.join([every, *flags])} --tasks DIR --out OUT --docs docs"),
+        "",
+    ]
     for k, folder in enumerate(folders):
         lines += ["", f"## {points[k]}", ""] if k < len(points) and points[k] else []
         lines += _lines(folder, docs, name, "" if len(folders) == 1 else f"{k}_")
@@ -115,18 +121,25 @@ def write_docs(
 
 
 def write_list_docs(
-    docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]], missing: Sequence[str] = ()
-) -> list[Path]:
+    docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]], missing: Sequence[str] = (),
+    flags: Sequence[str] = (),
+) -> list[Path]:  # fmt: skip
     """`docs/FOLDER.md` for each folder of configs in a list: what decides, every table and figure, paper and ours.
 
-    **Arguments:** `configs`, the list; `made`, the folders of each config's runs; `missing`, why others have none.
+    **Arguments:** `configs`, the list; `made`, the folders of each config's runs; `missing`, why others have none;
+    `flags` that change what is run.
     Figures go to `docs/figures/FOLDER/`.
     """
     pages = []
     for home in dict.fromkeys(path.parent for path in made):
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
-        lines = [f"# {_kind(next(iter(runs)))}", "", _by(f"{shown(configs)} --out OUT --docs docs"), ""]
+        lines = [
+            f"# {_kind(next(iter(runs)))}",
+            "",
+            _by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs"),
+            "",
+        ]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
             lines += [markdown(cells(first, 4), DECIDES)]

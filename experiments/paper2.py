@@ -1,5 +1,7 @@
-"""Paper 2 on its own data: tables IV-X and the studies around them. Every choice is made on trip 1; trips 2-4 are read
-for the report alone. One task is one model, so tables that show the same model share its fit.
+"""Paper 2 on its own data: tables IV-X and the studies around them. Settings are chosen on rows of trip 1; trips 2-4
+are read for the report alone. What was known of them beforehand is what table II says: they brake and accelerate
+harder, which is why rows at the edge of power are left out too. One task is one model: tables that show it share its
+fit.
 """
 
 from collections.abc import Iterator
@@ -9,7 +11,7 @@ from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
-from experiments.paper2_diagnosed import diagnosis_fingerprint
+from experiments.paper2_diagnosed import of_settings
 from experiments.paper2_fits import Mean, evaluated, fitted, step_seconds
 from experiments.paper2_models import Settings
 from experiments.paper2_tables import collect
@@ -49,9 +51,8 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """One for each model of the table; where it is `timed`, one more for each."""
     common = {"rows": config.rows, "train": config.train, "data": kia_fingerprint()}
     for name in config.order:
-        task = {"name": name, "settings": config.models[name].task(), **common}
-        if config.models[name].kind == "diagnosed":
-            task["diagnosis"] = diagnosis_fingerprint()
+        settings = config.models[name].task()
+        task = {"name": name, "settings": settings, **of_settings(settings), **common}
         yield {**task, "test": config.test, "seed": config.seed}
         if config.timed and config.models[name].kind == "narx":
             yield {**task, "timed": True}

@@ -12,6 +12,7 @@ from hdev_jax.rundir import Run
 __all__ = ["chosen_keys", "collect"]
 
 RULES = ("least", "ensemble")
+CHOSEN = ("units", "rate", "ridge_slope", "outputs")  # numbers of which the least and the largest tried are told
 
 
 def chosen_keys(model: Settings, keys: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,7 +35,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     it was fitted on, or the mean of all starts' predictions.
     """
     found = {(task["group"], task["name"]): (task, result) for task, result in results}
-    rows, lines, missed = [], [], []
+    rows, lines, missed, edges = [], [], [], []
     for key, group in config.picked.items():
         model, own = config.models[group.model], {n: found[key, n] for n in group.tried if (key, n) in found}
         best = min(own, key=lambda n: own[n][1]["mean_mse"]) if own else ""
@@ -48,6 +49,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             lines.append({**line, "best": is_best, "in the tables": is_used})
             if not (is_best and group.decides):
                 continue
+            edges += [f"{key}: {what}" for what in _at_the_edge(name, {n: t["settings"] for n, (t, _) in own.items()})]
             rule = min(RULES, key=lambda r: result[f"{r}_mse"])
             if not is_used:
                 missed.append(f"the tables' {group.model} is not the best on trip 1, {name}")
@@ -62,9 +64,30 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "and nothing of another trip enters",
             "The best setting is that of the least mean of MSE over starts",
             "Where nothing else is said, the ridge is 1e-3 and the loss is Huber's with its corner at 0.4 kW",
-            f"LSTM and GRU are judged by blocks of time alone, by {config.recurrent_starts} starts of "
-            f"{config.recurrent_steps} steps; the tables' train for {config.models['LSTM'].steps}, which a smaller "
-            "rate may suit better",
-            "The classical models search theirs on trip 1 by themselves",
+            *_recurrent_notes(config),
+            *([f"At the edge of what was tried: {'; '.join(edges)}"] if edges else []),
+            "Networks and NARX are chosen from these grids; the classical models search theirs on trip 1 by Optuna",
         ],
     }  # fmt: skip
+
+
+def _at_the_edge(best: str, tried: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Numbers of the best setting that are the least or the largest of those tried."""
+    out = []
+    for key in CHOSEN:
+        values = {s[key] for s in tried.values() if key in s}
+        if len(values) > 1 and (own := tried[best][key]) in (min(values), max(values)):
+            out.append(f"{key} {own:g} is the {'least' if own == min(values) else 'largest'}")
+    return out
+
+
+def _recurrent_notes(config: Any) -> list[str]:
+    """How recurrent networks are judged, where there are any."""
+    own = [g.model for g in config.picked.values() if config.models[g.model].kind == "recurrent"]
+    if not own:
+        return []
+    steps = " and ".join(f"{config.models[n].steps} ({n})" for n in own)
+    return [
+        f"{' and '.join(own)} are judged by blocks of time alone, by {config.recurrent_starts} starts of "
+        f"{config.recurrent_steps} steps; the tables' train for more: {steps}"
+    ]

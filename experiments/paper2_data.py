@@ -11,9 +11,10 @@ from hdev_jax.learn import Trip, trips_of
 from hdev_jax.logs import Log, read_log
 from hdev_jax.logs.adapter import Adapter
 
-__all__ = ["LEAST_ROWS", "TripName", "kia_fingerprint", "kia_log", "kia_trips"]
+__all__ = ["LEAST_ROWS", "MPH", "TripName", "kia_fingerprint", "kia_log", "kia_trips"]
 
 TripName = Literal["1", "2", "3", "4"]
+MPH = 0.44704  # m/s: the international mile (1959)
 LEAST_ROWS = 20  # of a trip that a model is fitted on
 TRIPS: tuple[TripName, ...] = ("1", "2", "3", "4")
 ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "kia_niro.toml"

@@ -1,6 +1,8 @@
 """The declared car of paper 2 and what `hdev diagnose` adds to it from the training trip, as a model of the tables."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +18,20 @@ from hdev_jax.learn import Trip
 from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle
 
-__all__ = ["Diagnosed", "diagnosis_fingerprint"]
+__all__ = ["Diagnosed", "of_settings"]
 
 SHEET = Path(__file__).parents[1] / "configs" / "vehicles" / "kia_niro.toml"
 TARGET = "battery_power_kw"
 LOOP = ("diagnosis", "inference", "physics")  # what the loop is made of
 
 
-def diagnosis_fingerprint() -> str:
-    """Of the sheet and of the loop's own code: a task that diagnoses has it among its values, no other one has."""
+def of_settings(settings: Mapping[str, Any]) -> dict[str, str]:
+    """What a task has among its values besides: the fingerprint of the sheet and of the loop, where it diagnoses."""
+    return {"diagnosis": _fingerprint()} if settings["kind"] == "diagnosed" else {}
+
+
+@cache
+def _fingerprint() -> str:
     package = Path(__file__).parents[1] / "hdev_jax"
     sources = sorted(p for part in LOOP for p in (package / part).rglob("*.py"))
     return fingerprint([SHEET, Path(__file__), *sources])

@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 
 from experiments.figures import save_figure, styled
+from experiments.paper2_data import MPH
 from hdev_jax.learn import Trip
 from hdev_jax.report.canvas import AFTER, GREY, MEASURED, figure, tidy
 from hdev_jax.rundir import Run
 
-__all__ = ["MPH", "prediction_figure", "signals_figure", "speeds_figure"]
-
-MPH = 0.44704  # m/s: the international mile (1959)
+__all__ = ["prediction_figure", "signals_figure", "speeds_figure"]
 
 
 @styled

@@ -8,10 +8,12 @@ from pydantic import Field
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
+from experiments.paper2_diagnosed import of_settings
 from experiments.paper2_drawings import prediction_figure
 from experiments.paper2_fits import Mean, evaluated, fitted
 from experiments.paper2_models import Settings
 from experiments.tables import write_tables
+from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
@@ -25,8 +27,6 @@ class Config(Strict):
     experiment: Literal["paper2_figures"]
     artefact: str
     caption: str
-    show: list[str] = Field(default_factory=list)
-    order: list[str] = Field(default_factory=list)
     model: str = "NARXP"
     models: dict[str, Settings]
     window: list[float] | None = Field(None, min_length=2, max_length=2)
@@ -40,7 +40,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """The one model."""
     settings = config.models[config.model].task()
     task = {"settings": settings, "rows": config.rows, "train": config.train, "seed": config.seed}
-    yield {**task, "data": kia_fingerprint()}
+    yield {**task, **of_settings(settings), "data": kia_fingerprint()}
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
@@ -62,9 +62,10 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     predicted = np.asarray(found["predicted"])
     measured = np.asarray(trip.target)[found["first"] :]
     clock = np.arange(found["first"], len(trip)) * trip.dt_s
-    inside = np.ones(len(clock), dtype=bool)
-    if config.window and clock[-1] > config.window[0]:
-        inside = (clock >= config.window[0]) & (clock <= config.window[1])
+    first, last = config.window or (clock[0], clock[-1])
+    inside = (clock >= first) & (clock <= last)
+    if not inside.any():
+        raise InputError(f"config, key window: no row from {first:g} to {last:g} s; the trip ends at {clock[-1]:.0f} s")
     prediction_figure(run, config.artefact, clock[inside], measured[inside], predicted[inside])
     worst = int(np.argmax(np.abs(predicted - measured)))
     ours = {

@@ -40,14 +40,12 @@ class Config(Strict):
     )
     ageing: float = 0.10  # share of the losses that is added by the end of the trip
     aged_trip: Literal["2", "3", "4"] = "3"
-    paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
-    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """As driven, and with the ageing."""
-    common = config.model_dump(mode="json", exclude={"experiment", "artefact", "caption", "paper", "seed", "aged_trip"})
+    common = config.model_dump(mode="json", exclude={"experiment", "artefact", "caption", "aged_trip"})
     for trip in ("", config.aged_trip):
         yield {**common, "aged_trip": trip, "data": kia_fingerprint()}
 
@@ -157,6 +155,8 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
             *([] if memory is None else [
                 f"memory of {memory:g} min, the best of {', '.join(f'{m:g}' for m in config.memories_min)} on the "
                 f"second half of trip 1 after the first{', at the edge of what was tried' if edge else ''}",
+                "frozen: with the coefficients of trip 1; followed: each row by what was learned before it; before and "
+                "after: the whole trip with the coefficients that were known at its first row and at its last",
                 "a short memory follows the driving as well as the car's age",
             ]),
         ],

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from experiments.config import Strict
 from experiments.paper2_data import kia_fingerprint, kia_trips
+from experiments.paper2_diagnosed import of_settings
 from experiments.paper2_fits import evaluated, fitted
 from experiments.paper2_models import Settings
 from experiments.tables import write_tables
@@ -27,8 +28,6 @@ class Config(Strict):
     experiment: Literal["paper2_pedal"]
     artefact: str
     caption: str
-    show: list[str] = Field(default_factory=list)
-    order: list[str] = Field(default_factory=list)
     model: str = "NARXP"
     models: dict[str, Settings]
     share: float = Field(2 / 3, gt=0, lt=1)  # of trip 1, to train on
@@ -42,7 +41,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     settings = config.models[config.model].task()
     for inputs in (settings["inputs"], [*settings["inputs"], "accelerator_pct"]):
         task = {"settings": {**settings, "inputs": inputs}, "share": config.share}
-        yield {**task, "rows": config.rows, "seed": config.seed, "data": kia_fingerprint("1")}
+        yield {**task, **of_settings(settings), "rows": config.rows, "seed": config.seed, "data": kia_fingerprint("1")}
 
 
 def alone(task: dict[str, Any]) -> bool:

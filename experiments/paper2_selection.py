@@ -42,8 +42,6 @@ class Config(Strict):
     experiment: Literal["paper2_selection"]
     artefact: str
     caption: str
-    show: list[str] = Field(default_factory=list)
-    order: list[str] = Field(default_factory=list)
     models: dict[str, Settings]
     groups: dict[str, Group]
     only: list[str] = Field(default_factory=list)  # of the groups; none: all

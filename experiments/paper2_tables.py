@@ -21,6 +21,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     found = {task["name"]: result for task, result in results if not task.get("timed")}
     seconds = {task["name"]: result["step_seconds"] for task, result in results if task.get("timed")}
     rows, lines, first = [], [], config.show[0]
+    if first in OF_SOME:
+        raise InputError(f"config, key show: {first!r} decides no table; name another number first")
     for name in config.order:
         if name not in found:
             rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": "not run"})
@@ -132,8 +134,9 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     for n in found:
         if found[n]["converged"] and not all(found[n]["converged"]):
             ended, steps = found[n]["converged"], config.models[n]
-            most = f"{steps.simulation_steps} in free run" if steps.simulation else f"{steps.steps}"
-            said.append(f"{n}: {sum(ended)} of {len(ended)} starts converged, the others stopped after {most} steps")
+            most = f"{steps.simulation_steps} steps in free run" if steps.simulation else f"{steps.steps} steps"
+            ours = "" if steps.rule == "ensemble" else f", ours {'among them' if ended[0] else 'not among them'}"
+            said.append(f"{n}: {sum(ended)} of {len(ended)} starts converged{ours}; the others stopped after {most}")
     if config.free_run and (ahead := [n for n in found if n in PREDICTION]):
         said.append(f"{', '.join(ahead)}: one step ahead, as the paper has it here; every other row in free run")
     for n in found:

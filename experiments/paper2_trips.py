@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import Field
 
 from experiments.config import Strict
-from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
-from experiments.paper2_drawings import MPH, signals_figure, speeds_figure
+from experiments.paper2_data import MPH, TripName, kia_fingerprint, kia_trips
+from experiments.paper2_drawings import signals_figure, speeds_figure
 from experiments.tables import write_tables
 from hdev_jax.learn.sequences import energy_kwh
 from hdev_jax.rundir import Run
@@ -30,7 +30,6 @@ class Config(Strict):
     paper: dict[str, dict[str, float]] = Field(default_factory=dict)
     reasons: dict[str, str] = Field(default_factory=dict)
     rows: int = Field(0, ge=0)
-    seed: int = Field(0, ge=0)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

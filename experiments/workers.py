@@ -24,6 +24,7 @@ from hdev_jax import progress
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
 FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PATIENCE = 30  # seconds for a scheduler to answer
 
 Job = tuple[str, list[dict[str, Any]]]
@@ -71,6 +72,9 @@ def on_cores(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
     with tempfile.TemporaryDirectory(prefix="hdev-compiled-") as compiled:
         threads = max(1, (os.cpu_count() or 1) // workers)
         spawn = multiprocessing.get_context("spawn")
+        # before they start: NumPy is loaded, with as many threads as there are cores, before anything of ours runs
+        before = {name: os.environ.get(name) for name in _THREADS}
+        os.environ.update(dict.fromkeys(_THREADS, str(threads)))
         pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled, threads))
         try:
             futures = {pool.submit(call, job): i for i, job in enumerate(jobs)}
@@ -85,6 +89,9 @@ def on_cores(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
             for process in processes:
                 process.join()
             raise
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _outcome(future: Any) -> Outcome:
@@ -102,7 +109,7 @@ def _prepare_worker(compiled: str, threads: int) -> None:
     if threads == 1:
         one = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {one}".strip()
-    os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = str(threads)
+    os.environ.update(dict.fromkeys(_THREADS, str(threads)))
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -78,6 +78,27 @@ def test_what_was_killed_resumes(tmp_path, config, monkeypatch):
     assert "4 tasks, 2 done before" in log
 
 
+def test_a_number_that_is_none_stops_its_config_alone(tmp_path, config, monkeypatch, capsys):
+    """In a list; what is right is made, and the page says why the other is not there."""
+    real = squares.run
+    monkeypatch.setattr(squares, "run", lambda t: real(t) | ({"square": float("nan")} if t["by"] == 3.0 else {}))
+    (tmp_path / "bad.toml").write_text('extends = "toy.toml"\nby = 3.0\n')
+    (tmp_path / "list.toml").write_text('configs = ["bad.toml", "toy.toml"]\n')
+    assert main([str(tmp_path / "list.toml"), "--out", str(tmp_path / "out")]) == 1
+    assert "bad" in capsys.readouterr().err
+    assert (tmp_path / "out" / "index.html").exists()
+    with pytest.raises(ValueError, match="JSON compliant") as e:
+        run_config(tmp_path / "bad.toml", out=tmp_path / "run")
+    assert "in the task {" in e.value.__notes__[-1]
+
+
+def test_what_measures_time_is_not_compiled_quickly(tmp_path, config):
+    with pytest.raises(InputError, match="measures time"):
+        run_config(config, ["alone=[2]"], out=tmp_path / "run", quickly=True)
+    assert ran(tmp_path) == []
+    assert len(run_config(config, out=tmp_path / "run", quickly=True)) == 1
+
+
 def test_two_sweeps_share_what_they_share_and_each_is_a_table(tmp_path, config):
     out, kept = tmp_path / "sweep", tmp_path / "kept"
     found = run_config(config, ["sweep.by=[1.0, 2.0]", "sweep.seed={ first = 0, count = 3 }"], out=out, kept=kept)
@@ -252,5 +273,18 @@ def test_what_a_task_depends_on_is_what_its_modules_load(name):
     loaded = {m for m in done.stdout.split() if m.startswith(("hdev_jax.", "experiments."))}
     reached = {f.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for f in files}
     assert loaded <= reached
+    # what SOURCES import beside themselves is for pages, or has a fingerprint of its own
+    beside = {p.stem for start in starts for p in store._imports(start) if p.is_relative_to(store.HERE)}
+    pages = ("_tables", "_figures", "_drawings", "_choice", "_pages")
+    known = {
+        "__init__",
+        "config",
+        "data",
+        "tables",
+        "figures",
+        "paper2_diagnosed",
+        *(Path(s).stem for s in module.SOURCES),
+    }
+    assert {b for b in beside if not b.endswith(pages)} <= known
     tasks_need = {store._name(p) for p in store.reached(starts, experiments=False)}
     assert not tasks_need & {"hdev_jax/cli.py", "hdev_jax/demo.py", "experiments/page.py"}

@@ -160,8 +160,7 @@ def starts(
     rows = rows_of(wide, y)
     some = slice(None, None, max(1, len(y) // 8192))
     own = np.ones((len(keys), len(y))) if weights is None else weights
-    drawn = jax.jit(jax.vmap(partial(_drawn, coarse), in_axes=(None, None, 0, 0)))
-    first = drawn(jnp.asarray(wide[some]), jnp.asarray(y[some]), jnp.asarray(own[:, some]), keys)
+    first = _drawn(coarse, jnp.asarray(wide[some]), jnp.asarray(y[some]), jnp.asarray(own[:, some]), keys)
     chunked = None if weights is None else jnp.stack([rows_of(wide[:, :0], y, w).weight for w in weights])
     fitted = fit_many(
         coarse, rows, first, huber=huber / float(model.output.sd), ridge=penalty(coarse, **(ridge or {})),
@@ -186,7 +185,13 @@ def penalty(shape: Shape, size: float = 0.0, slope: float = 0.0) -> Array:
     return jnp.concatenate([free, jnp.full(n, size), jnp.full(n * q, slope), jnp.zeros(n)])
 
 
-def _drawn(shape: Shape, x: Array, y: Array, weight: Array, key: Array) -> Array:
+@partial(jax.jit, static_argnums=0)
+def _drawn(shape: Shape, x: Array, y: Array, weights: Array, keys: Array) -> Array:
+    """A start for each key, with its own weights of rows."""
+    return jax.vmap(partial(_drawn_once, shape, x, y))(weights, keys)
+
+
+def _drawn_once(shape: Shape, x: Array, y: Array, weight: Array, key: Array) -> Array:
     """Random units, the rest by ridge regression."""
     direction, steepness, row = jax.random.split(key, 3)
     q = len(shape.seen)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from learn_rows import drive
 
-from experiments import paper2, paper2_choice, paper2_online, paper2_pedal, paper2_selection
+from experiments import paper2, paper2_choice, paper2_figures, paper2_online, paper2_pedal, paper2_selection
 from experiments.config import CONFIGS, resolve, typed
 from experiments.data import MissingDataError
 from experiments.engine import run_config
@@ -175,6 +175,21 @@ def test_what_the_tables_use_is_held_against_what_was_best(tmp_path):
     assert missed(0.2, 0.3, least=0.3) == ["the tables' NARXP is by the rule least, on trip 1 ensemble is better"]
 
 
+def test_the_edge_of_what_was_tried_is_told():
+    tried = {"a": {"units": 5, "rate": 0.1}, "b": {"units": 10, "rate": 0.1}, "c": {"units": 20, "rate": 0.1}}
+    assert paper2_choice._at_the_edge("b", tried) == []
+    assert paper2_choice._at_the_edge("c", tried) == ["units 20 is the largest"]
+    assert paper2_choice._at_the_edge("a", tried) == ["units 5 is the least"]
+
+
+def test_a_window_without_rows_is_one_line(trips, tmp_path, monkeypatch):
+    for name in ("kia_trips", "kia_fingerprint"):
+        monkeypatch.setattr(paper2_figures, name, getattr(paper2, name))
+    quick = ["models.NARXP.starts=1", "models.NARXP.steps=2", "models.NARXP.coarse_steps=2", "models.NARXP.units=1"]
+    with pytest.raises(InputError, match="key window: no row from 40 to 10 s; the trip ends at"):
+        run_config(CONFIGS / "paper2" / "fig13.toml", [*quick, "window=[40.0, 10.0]"], out=tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("name", "sets"),
     [("table8", 'order=["nope"]'), ("pedal", 'model="nope"'), ("selection", 'groups.NARXP.model="nope"')],
@@ -211,6 +226,18 @@ def test_a_value_out_of_range_is_one_line(name, sets, key, tmp_path):
 def test_trips_of_few_rows_are_one_line(name, rows, words, tmp_path, data_dir):
     with pytest.raises(InputError, match=f"{rows} rows.*{words}"):
         run_config(CONFIGS / "paper2" / f"{name}.toml", [f"rows={rows}"], out=tmp_path / "out")
+
+
+def test_a_number_that_not_every_row_has_decides_no_table(trips, tmp_path):
+    table = resolve(
+        CONFIGS / "paper2" / "table8.toml", ['show=["change_percent", "test_mean"]', 'order=["persistence"]']
+    )
+    config = typed(paper2.Config, table, "table8.toml")
+    with (
+        open_run(tmp_path / "run", {"a": 1}) as run,
+        pytest.raises(InputError, match="'change_percent' decides no table"),
+    ):
+        paper2.collect(config, [(t, paper2.run(t)) for t in paper2.tasks(config)], run)
 
 
 def test_a_trip_that_is_not_there_is_one_line(tmp_path, monkeypatch):
