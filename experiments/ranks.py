@@ -22,7 +22,7 @@ from experiments.paper1_halves import coefficient, paper_table
 from experiments.tables import write_tables
 from hdev_jax.diagnosis.problem import Problem, prepare
 from hdev_jax.fleet import synthetic_log
-from hdev_jax.inference import Rows, linear_fit, padded, predict
+from hdev_jax.inference import Coefficient, Rows, linear_fit, padded, predict
 from hdev_jax.inference.design import GROUP, tabular
 from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.hierarchy import fleet_draws
@@ -32,7 +32,7 @@ from hdev_jax.inference.nuts import compiled, coordinates
 from hdev_jax.inference.parameters import ParameterTable, insert_by
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.report.canvas import GREY, MEASURED, figure, tidy
+from hdev_jax.report.canvas import AFTER, GREY, figure, tidy
 from hdev_jax.rundir import Run
 from hdev_jax.segments import Segments
 
@@ -41,6 +41,7 @@ __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 SOURCES = ("ranks.py", "paper1_halves.py")
 C_RR, CDA, EFFICIENCY = (0.0060, 0.0008), (5.6, 0.5), (0.91, 0.02)
 NOISE_WH = 20.0  # believed of a row: about what the two coefficients' sds come to
+SHORT = {"road.c_rr": "c_rr", "road.cda_m2": "C_d·A", "driveline.efficiency": "efficiency"}
 DRAWS, APART = 19, 50  # ranks 0 … 19; draws of a chain are so many apart
 LEAST_P = 0.01  # of all histograms together
 
@@ -125,7 +126,11 @@ def _predicted(table: ParameterTable, theta: np.ndarray, fit: Any) -> np.ndarray
 
 
 def _named(table: ParameterTable, values: Any) -> World:
-    return dict(zip((c.path for c in table.free), np.asarray(values), strict=True))
+    return dict(zip((_short(c) for c in table.free), np.asarray(values), strict=True))
+
+
+def _short(c: Coefficient) -> str:
+    return SHORT.get(c.path, c.path)
 
 
 def _alone(s: Segments) -> np.ndarray:
@@ -164,8 +169,8 @@ def _fleet(task: dict[str, Any], rng: np.random.Generator, key: Any) -> tuple[Wo
     found: dict[str, Any] = {"noise": np.sqrt(_thin(draws, "variance"))}
     for k, c in enumerate(table.free):
         for name, true in (("mean", mean), ("spread", spread)):
-            truth[f"{name} of {c.path}"], found[f"{name} of {c.path}"] = true[k], _thin(draws, name)[:, k]
-        truth[f"{c.path} of one"], found[f"{c.path} of one"] = theta[0, k], _thin(draws, "theta")[:, 0, k]
+            truth[f"{name} of {_short(c)}"], found[f"{name} of {_short(c)}"] = true[k], _thin(draws, name)[:, k]
+        truth[f"{_short(c)} of one"], found[f"{_short(c)} of one"] = theta[0, k], _thin(draws, "theta")[:, 0, k]
     return truth, found
 
 
@@ -242,13 +247,13 @@ def _figure(run: Run, config: Config, ranks: dict[tuple[str, str], list[int]]) -
     """A histogram each, with the band that 99 % of counts fall into where ranks are uniform."""
     across = 4
     down = -(-len(ranks) // across)
-    fig = figure(9.0, 1.7 * down + 0.4)
+    fig = figure(9.0, 1.9 * down + 0.4)
     for k, ((kind, name), values) in enumerate(ranks.items()):
         ax = fig.add_subplot(down, across, k + 1)
         low, high = stats.binom.ppf([0.005, 0.995], len(values), 1.0 / (DRAWS + 1))
+        ax.hist(values, bins=np.arange(DRAWS + 2) - 0.5, color=AFTER)
         ax.axhspan(low, high, color=GREY, alpha=0.25)
-        ax.hist(values, bins=np.arange(DRAWS + 2) - 0.5, color=MEASURED)
-        ax.set_title(f"{kind}: {name}", fontsize=7)
+        ax.set_title(f"{kind}\n{name}", fontsize=7)
         if k // across == down - 1 or k + across >= len(ranks):
             ax.set_xlabel("rank of the truth")
         tidy(ax)

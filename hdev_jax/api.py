@@ -91,7 +91,7 @@ def simulate(config: str | Path, *, out: str | Path) -> str:
         if run.done:
             return (run.work / "answer.txt").read_text()
         progress.step(f"{wanted.routes} routes of {len(wanted.chosen)} vehicles")
-        fleet = write_fleet(wanted, run.work, progress.step)
+        fleet = write_fleet(wanted, run, progress.step)
         progress.step("writing the report")
         summary = fleet_summary(fleet, wanted)
         run.path("fleet.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")

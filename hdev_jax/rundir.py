@@ -54,6 +54,17 @@ class Run:
             path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
+    def kept(self, *parts: str) -> Path:
+        """A file, or a folder, that a killed run leaves for the next; `place` puts it where the result has it."""
+        path = self.path(_CHECKPOINTS, *parts)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def place(self, kept: Path) -> None:
+        """The files under the folder `kept` as the run's own. They stay there too until the run is complete, so that
+        one that is killed in between has them still."""
+        shutil.copytree(kept, self.work, copy_function=_linked, dirs_exist_ok=True)
+
     def checkpoint(self, name: str, compute: Callable[[], Any]) -> Any:
         """`compute()`, or what it gave before the run was killed.
 
@@ -328,6 +339,13 @@ def _load(path: Path) -> Any:
         return tuple(decode(v) for v in content) if tag == "t" else {k: decode(v) for k, v in content.items()}
 
     return decode(json.loads(arrays.pop("tree").tobytes()))
+
+
+def _linked(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # a file system without links
+        shutil.copy2(source, target)
 
 
 def _environment(seed: int | None, command: list[str], started: float) -> dict[str, Any]:

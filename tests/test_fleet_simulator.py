@@ -13,7 +13,7 @@ from map_reference import map_by_scipy
 
 from hdev_jax import cli
 from hdev_jax.errors import InputError
-from hdev_jax.fleet import VARIANTS, FleetConfig, efficiency_map, load_config, simulate
+from hdev_jax.fleet import VARIANTS, FleetConfig, efficiency_map, files, load_config, simulate
 from hdev_jax.fleet.config import parse_config
 from hdev_jax.fleet.driver import STEP_M, Car, Roads, drive
 from hdev_jax.fleet.hidden import shift_program
@@ -398,9 +398,25 @@ def test_the_sheet_predicts_what_the_truth_says_it_does(folder):
         assert {c.name for c in built.table.free} == {"road.c_rr", "road.cda_m2"}
 
 
-def test_the_same_bytes_and_done_is_done(folder, capsys):
-    config = folder / "fleet.toml"
+def test_a_killed_run_goes_on_to_the_same_bytes_and_done_is_done(folder, capsys, monkeypatch):
+    config, write, written = folder / "fleet.toml", files._write_vehicle, []
+
+    def killed(config, part, kept):
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(part.variant.id)
+        return write(config, part, kept)
+
+    monkeypatch.setattr(files, "_WORKERS", 1)
+    monkeypatch.setattr(files, "_write_vehicle", killed)
+    assert cli.main(["simulate", str(config), "--out", str(folder / "b")]) == 130
+    assert not (folder / "b").exists()
+    first = list(written)
+    monkeypatch.setattr(files, "_write_vehicle", lambda c, p, k: (written.append(p.variant.id), write(c, p, k))[1])
+    capsys.readouterr()
     assert cli.main(["simulate", str(config), "--out", str(folder / "b")]) == 0
+    assert sorted(written) == sorted(CHOSEN), "what was finished is not simulated again"
+    assert len(first) == 2
     first = capsys.readouterr().out
     for path in sorted((folder / "a").rglob("*")):
         if path.is_file() and path.name not in ("environment.json", "report.html", "answer.txt"):

@@ -16,6 +16,7 @@ from hdev_jax.fleet.sheets import write_sheet
 from hdev_jax.fleet.simulated import trip_name
 from hdev_jax.fleet.simulator import Batch, VehiclePart, batches, shares
 from hdev_jax.fleet.tally import Tally
+from hdev_jax.rundir import Run
 
 __all__ = ["LOG_COLUMNS", "write_fleet"]
 
@@ -27,20 +28,28 @@ LOG_COLUMNS = (
 _WORKERS = 2
 
 
-def write_fleet(config: FleetConfig, folder: Path, tell: Callable[[str], None] = lambda _: None) -> list[Tally]:
-    """Simulate and write everything but the report. **Returns** what the report needs of each vehicle, in order."""
+def write_fleet(config: FleetConfig, run: Run, tell: Callable[[str], None] = lambda _: None) -> list[Tally]:
+    """Simulate and write everything but the report. **Returns** what the report needs of each vehicle, in order.
+
+    Vehicles that a killed run had finished are there already.
+    """
+    folder = run.kept("fleet")
     for name in ("log.parquet", "truth.parquet", "sheets"):
         (folder / name).mkdir(parents=True, exist_ok=True)
+
+    def one(part: VehiclePart) -> Tally:
+        made = run.checkpoint(f"fleet-{part.variant.id}", lambda: _write_vehicle(config, part, folder).state())
+        return Tally.of(part.variant, part.effects, made)
+
     parts = [p for p in shares(config) if p.routes]
-    if not parts:
-        return []
     # the first vehicle alone: it compiles what all of them use
-    done = [_write_vehicle(config, parts[0], folder)]
+    done = [one(p) for p in parts[:1]]
     with ThreadPoolExecutor(_WORKERS) as pool:
-        for tally in pool.map(lambda p: _write_vehicle(config, p, folder), parts[1:]):
+        for tally in pool.map(one, parts[1:]):
             done.append(tally)
             if len(done) % 7 == 0:
                 tell(f"{len(done)} of {len(parts)} vehicles, {sum(t.rows for t in done):,} rows")
+    run.place(folder)
     return done
 
 

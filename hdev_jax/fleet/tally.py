@@ -32,6 +32,17 @@ class Tally:
         self.points: dict[str, np.ndarray] = {}
         self.route: dict[str, np.ndarray] = {}
 
+    def state(self) -> dict[str, Any]:
+        """Everything that was counted, plain values and arrays: what `of` makes the same tally from."""
+        return {k: v for k, v in vars(self).items() if k not in ("variant", "effects")}
+
+    @staticmethod
+    def of(variant: Variant, effects: dict[str, dict[str, Any]], state: dict[str, Any]) -> "Tally":
+        """A tally as it was when its `state` was taken."""
+        tally = Tally(variant, effects)
+        vars(tally).update(state)
+        return tally
+
     def _plus(self, name: str, value: Any) -> None:
         self.sums[name] = self.sums.get(name, 0.0) + float(value)
 
