@@ -7,6 +7,8 @@ import pytest
 from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, driving, tabular, truck
 from scipy import stats
 
+from experiments import ranks
+from experiments.config import CONFIGS, resolve, typed
 from hdev_jax.inference import Rows, linear_fit, padded
 from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal
@@ -14,6 +16,7 @@ from hdev_jax.inference.mass import loads, mass_posterior, with_sd
 from hdev_jax.inference.models import Model
 from hdev_jax.inference.nuts import sampled
 from hdev_jax.physics import Grouped
+from hdev_jax.rundir import open_run
 
 
 def world(rng: np.random.Generator, vehicles: int, rows: int, k: int = 2) -> tuple[Sums, dict, list]:
@@ -135,3 +138,17 @@ def test_mass_by_trip_is_the_one_that_was_driven():
     assert np.all(np.abs(by_stop.mass_kg - np.repeat(true, 2)) < 4 * by_stop.sd_kg)
     known = with_sd(tabular(), [C_RR, CDA], [1e-5, 1e-2])
     assert np.all(mass_posterior(truck(), known, s, y, "battery_power_kw", **options).sd_kg < found.sd_kg)
+
+
+def test_ranks_that_are_not_uniform_are_told(tmp_path):
+    """The study's verdict on made-up ranks: even ones pass, those of intervals that are too narrow do not."""
+    raw = resolve(CONFIGS / "studies" / "ranks.toml")
+    config = typed(ranks.Config, raw, "ranks.toml")
+    task = {"kind": "NUTS"}
+    even = [int(k) for k in np.random.default_rng(0).integers(0, 20, 300)]
+    narrow = [0 if k < 7 else 19 if k > 12 else k for k in even]
+    for values, met in ((even, True), (narrow, False)):
+        with open_run(tmp_path / str(met), {"a": 1}) as run:
+            found = ranks.collect(config, [(task, {"c_rr": values})], run)
+        assert (not found["missed"]) is met
+        assert found["rows"][0]["ours"]["worlds"] == 300
