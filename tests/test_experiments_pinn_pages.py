@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import pinn, pinn_pages
+from experiments import pinn, pinn_figures, pinn_pages
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn_data import Data, Member
 from experiments.pinn_scores import pooled, scores
@@ -53,7 +53,7 @@ def run(tmp_path):
 
 @pytest.fixture
 def no_figures(monkeypatch):
-    monkeypatch.setattr(pinn_pages, "save_figure", lambda *_: None)
+    monkeypatch.setattr(pinn_figures, "save_figure", lambda *_: None)
 
 
 def written(run, name):
