@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 
+from hdev_jax.checkpoints import load, packed
 from hdev_jax.errors import InputError
 
 try:
@@ -77,15 +78,13 @@ class Run:
         path = self.path(_CHECKPOINTS, name + ".npz")
         if path.exists():
             with contextlib.suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):
-                return _load(path)
+                return load(path)
         if self.done:
             raise ValueError(f"{self.out} is complete: its checkpoints are gone, read its files instead")
-        arrays: list[np.ndarray] = []
-        tree = json.dumps(_encode(compute(), arrays))
+        arrays = packed(compute())
         with atomic_file(path) as temporary, open(temporary, "wb") as file:
-            columns = {f"a{i}": a for i, a in enumerate(arrays)}
-            np.savez(file, allow_pickle=False, tree=np.frombuffer(tree.encode(), dtype=np.uint8), **columns)
-        return _load(path)
+            np.savez(file, allow_pickle=False, **arrays)
+        return load(path)
 
 
 @contextlib.contextmanager
@@ -300,45 +299,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bool | int | float | str):
         return value
     raise TypeError(f"a configuration holds numbers, strings, lists and tables, not {type(value).__name__}: {value!r}")
-
-
-def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
-    """JSON for everything but arrays, which are moved to `arrays`; an object with the one key "a" or "t" is a tag."""
-    if isinstance(value, Mapping):
-        if any(not isinstance(k, str) for k in value):
-            raise TypeError("a checkpoint's dicts have strings for keys")
-        return {"d": {k: _encode(v, arrays) for k, v in value.items()}}
-    if isinstance(value, tuple):
-        return {"t": [_encode(v, arrays) for v in value]}
-    if isinstance(value, list):
-        return [_encode(v, arrays) for v in value]
-    if value is None or type(value) in (bool, int, float, str):
-        return value
-    if isinstance(value, np.generic):
-        return _encode(value.item(), arrays)
-    if hasattr(value, "__array__"):
-        array = np.asarray(value)
-        if array.dtype.kind in "biufcUS":
-            arrays.append(array)
-            return {"a": len(arrays) - 1}
-    raise TypeError(f"a checkpoint holds dicts, lists, strings, numbers and arrays, not {type(value).__name__}")
-
-
-def _load(path: Path) -> Any:
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {k: file[k] for k in file.files}
-
-    def decode(value: Any) -> Any:
-        if isinstance(value, list):
-            return [decode(v) for v in value]
-        if not isinstance(value, dict):
-            return value
-        ((tag, content),) = value.items()
-        if tag == "a":
-            return arrays[f"a{content}"]
-        return tuple(decode(v) for v in content) if tag == "t" else {k: decode(v) for k, v in content.items()}
-
-    return decode(json.loads(arrays.pop("tree").tobytes()))
 
 
 def _linked(source: str, target: str) -> None:

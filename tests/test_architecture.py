@@ -17,7 +17,7 @@ PACKAGE = ROOT / "hdev_jax"
 
 # From the bottom up. A module imports from lines above its own, and from its own package.
 LAYERS = [
-    {"errors", "segments", "progress"},
+    {"checkpoints", "errors", "segments", "progress"},
     {"compiling", "textfiles", "units", "rundir"},
     {"logs", "physics"},
     {"inference", "learn", "fleet"},
