@@ -13,7 +13,6 @@ from experiments import store
 from experiments.log import Log
 from experiments.workers import Job, Outcome, in_turn, on_cluster, on_cores
 from hdev_jax import progress
-from hdev_jax.errors import InputError
 
 __all__ = ["Asked", "Where", "compute"]
 
@@ -66,8 +65,7 @@ def compute(
 
     **Returns** the exception of each run (by its name) that a task of stopped; without `keep_going` the first ends it.
 
-    **Raises:** `ClusterError` where the cluster is at fault, `InputError` for programs compiled quickly where a task
-    measures time.
+    **Raises:** `ClusterError` where the cluster is at fault.
     """
     every: dict[Path, Todo] = {}
     count = done = 0
@@ -90,8 +88,6 @@ def compute(
 
     if not every:
         return failed
-    if where.quickly and (timed := [t.names[0] for t in every.values() if t.says("alone")]):
-        raise InputError(f"--compile-quickly: {timed[0]} measures time, which it would change; run it without")
     groups = _groups(every.values())
     with contextlib.closing(_outcomes(where, groups)) as outcomes:
         for group, outcome in progress.track(outcomes, "running", total=len(groups)):

@@ -253,7 +253,11 @@ def typed(model: type[C], table: Mapping[str, Any], where: str | Path, sets: Seq
         return model.model_validate(table)
     except ValidationError as e:
         first = e.errors()[0]
-        key = ".".join(str(k) for k in first["loc"]) or "config"
+        loc, words, found = [str(k) for k in first["loc"]], first["msg"], f", found {first['input']!r:.60}"
+        if first["type"] == "value_error":  # a config's own check: "key: why"
+            own, _, words = words.removeprefix("Value error, ").partition(": ")
+            loc, found = [*loc, own], ""
+        key = ".".join(loc) or "config"
         more = f" ({e.error_count() - 1} more)" if e.error_count() > 1 else ""
         hint = ""
         if first["type"] == "extra_forbidden":
@@ -262,7 +266,7 @@ def typed(model: type[C], table: Mapping[str, Any], where: str | Path, sets: Seq
             hint = f"; did you mean {near[0]}?" if near else ""
             hint += f"; known keys: {', '.join(known)}" if known else ""
         place = _place(key, where, sets)
-        raise InputError(f"{place}, key {key}: {first['msg']}, found {first['input']!r:.60}{hint}{more}") from e
+        raise InputError(f"{place}, key {key}: {words}{found}{hint}{more}") from e
 
 
 def _place(key: str, where: str | Path, sets: Sequence[str]) -> str:

@@ -88,6 +88,7 @@ def run_config(
     where = Where(workers, scheduler, quickly)
     shared = Path(kept) if kept is not None else None
     plans = plan(path, sets, tiny=tiny, kept=None if fresh else shared or Path(out) / "tasks")
+    refuse_hurry(plans, where)
     if not plans:
         raise InputError(f"{path}: none of its tasks has been run yet; run it without --kept")
     if not plans[0].delta:
@@ -163,6 +164,14 @@ def plan(path: str | Path, sets: Sequence[str] = (), *, tiny: bool = False, kept
     return plans
 
 
+def refuse_hurry(plans: Iterable[Plan], where: Where) -> None:
+    """**Raises:** `InputError` for programs that are compiled quickly where a task measures time."""
+    for p in plans if where.quickly else ():
+        ask = getattr(p.module, "alone", None)
+        if ask is not None and any(ask(t) for t in p.tasks):
+            raise InputError(f"--compile-quickly: {p.name} measures time, which it would change; run it without")
+
+
 def finish(plan: Plan, out: Path, where: Where, kept: Path | None, *, replace: bool = False) -> dict[str, Any]:
     """The run in its folder `out`, complete: what tasks are left, its tables and figures. **Returns** its metrics.
 
@@ -174,11 +183,11 @@ def finish(plan: Plan, out: Path, where: Where, kept: Path | None, *, replace: b
     seed = getattr(plan.config, "seed", None)
     with open_run(out, plan.resolved, seed=seed, environment=_environment(where), replace=replace) as run:
         if not run.done:
-            log = Log(run.path(".checkpoints", "log.txt"))  # what stays there when the run is killed
+            log = Log(run.kept("log.txt"))  # what stays there when the run is killed
             log.say(
                 f"{plan.name}: {len(plan.tasks)} tasks of {plan.module.__name__}, sources {plan.resolved['sources']}"
             )
-            kept = kept or run.path(".checkpoints", "tasks")
+            kept = kept or run.kept("tasks")
             if failed := compute([plan.asked], where, kept, log):
                 raise next(iter(failed.values()))
             log.say("tables and figures")

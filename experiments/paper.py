@@ -10,7 +10,7 @@ from typing import Any
 from experiments.compare import DECIDES, comparison, headlines
 from experiments.compute import Where, compute
 from experiments.config import artefact, changes, shown, shown_point
-from experiments.engine import Plan, claim_folder, plan, run_config, unfinished
+from experiments.engine import Plan, claim_folder, plan, refuse_hurry, run_config, unfinished
 from experiments.log import Log
 from experiments.page import Section, of_run, write_html
 from experiments.tables import cells
@@ -57,6 +57,7 @@ def run_list(
             plans = plan(path, tiny=tiny, kept=None if fresh else store)
             if not plans:
                 raise InputError("none of its tasks has been run yet")
+            refuse_hurry(plans, where)
             planned += unfinished(plans, home / artefact(path))
             of[artefact(path)] = path
     log.say(f"{len(configs)} configs, {len({p.name for p in planned})} of them to run")

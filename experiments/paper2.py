@@ -14,7 +14,7 @@ from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
 from experiments.paper2_diagnosed import of_settings
 from experiments.paper2_fits import Mean, evaluated, fitted, step_seconds
 from experiments.paper2_models import Settings
-from experiments.paper2_tables import collect
+from experiments.paper2_tables import OF_SOME, collect
 
 __all__ = ["SOURCES", "Config", "alone", "collect", "run", "tasks"]
 
@@ -44,6 +44,8 @@ class Config(Strict):
     def _test_trips_are_others(self) -> Self:
         if self.train in self.test:
             raise ValueError(f"test: trip {self.train} is the training trip")
+        if self.show[0] in OF_SOME:
+            raise ValueError(f"show: {self.show[0]!r} decides no table; name another number first")
         return self
 
 

@@ -63,7 +63,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "The paper chose its orders on the trips that it validates with; here rows of trip 1 are left out instead, "
             "and nothing of another trip enters",
             "The best setting is that of the least mean of MSE over starts",
-            "Where nothing else is said, the ridge is 1e-3 and the loss is Huber's with its corner at 0.4 kW",
+            "Where nothing else is said, the ridge is 1e-3 and the loss is Huber's with its corner at 0.4 kW; "
+            "orders are tried with NARXP's own units and ridge",
             *_recurrent_notes(config),
             *([f"At the edge of what was tried: {'; '.join(edges)}"] if edges else []),
             "Networks and NARX are chosen from these grids; the classical models search theirs on trip 1 by Optuna",
@@ -89,5 +90,5 @@ def _recurrent_notes(config: Any) -> list[str]:
     steps = " and ".join(f"{config.models[n].steps} ({n})" for n in own)
     return [
         f"{' and '.join(own)} are judged by blocks of time alone, by {config.recurrent_starts} starts of "
-        f"{config.recurrent_steps} steps; the tables' train for more: {steps}"
+        f"{config.recurrent_steps} steps; the tables' train for {steps}"
     ]

@@ -1,10 +1,10 @@
 """Figures 12 and 13 of paper 2: measured beside predicted power, and the fit of the prediction."""
 
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
@@ -34,6 +34,12 @@ class Config(Strict):
     rows: int = Field(0, ge=0)
     train: TripName = "1"
     seed: int = Field(0, ge=0)
+
+    @model_validator(mode="after")
+    def _window_has_a_length(self) -> Self:
+        if self.window and self.window[1] <= self.window[0]:
+            raise ValueError(f"window: ends at {self.window[1]:g} s, before it begins at {self.window[0]:g} s")
+        return self
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:

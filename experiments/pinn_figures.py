@@ -78,6 +78,7 @@ def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]
 
 @styled
 def learning_curves(run: Run, curves: Mapping[tuple[str, str], list[tuple[float, list[float]]]]) -> None:
+    """Error by the share of training routes: median over seeds, and a band of all."""
     uses = [u for u in ("test", "unseen") if any(k[1] == u for k in curves)]
     fig = figure(4.6 * len(uses), 3.6)
     for i, use in enumerate(uses):
@@ -106,6 +107,7 @@ def learning_curves(run: Run, curves: Mapping[tuple[str, str], list[tuple[float,
 
 @styled
 def weight_maps(run: Run, found: Mapping[tuple[float, ...], float]) -> None:
+    """RMSE over pairs of loss weights, the third as the paper printed it."""
     pairs = [(i, j) for i, j in ((1, 2), (0, 1), (0, 2))
              if len({(w[i], w[j]) for w in found if _held(w, i, j)}) > 3]  # fmt: skip
     fig = figure(3.6 * max(len(pairs), 1), 3.2)

@@ -4,6 +4,7 @@ A job is a module and the tasks that it runs together. Each way yields `(index, 
 end; an outcome is the tasks' results and the seconds that they took, or the exception that stopped them.
 """
 
+import contextlib
 import importlib
 import itertools
 import json
@@ -72,12 +73,10 @@ def on_cores(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
     with tempfile.TemporaryDirectory(prefix="hdev-compiled-") as compiled:
         threads = max(1, (os.cpu_count() or 1) // workers)
         spawn = multiprocessing.get_context("spawn")
-        # before they start: NumPy is loaded, with as many threads as there are cores, before anything of ours runs
-        before = {name: os.environ.get(name) for name in _THREADS}
-        os.environ.update(dict.fromkeys(_THREADS, str(threads)))
         pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled, threads))
         try:
-            futures = {pool.submit(call, job): i for i, job in enumerate(jobs)}
+            with _threads(threads):  # they start with the first jobs, and load NumPy before anything of ours runs
+                futures = {pool.submit(call, job): i for i, job in enumerate(jobs)}
             for future in as_completed(futures):
                 yield futures[future], _outcome(future)
             pool.shutdown()
@@ -89,9 +88,18 @@ def on_cores(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
             for process in processes:
                 process.join()
             raise
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """So many threads for the linear algebra of processes that start inside."""
+    before = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, str(count)))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _outcome(future: Any) -> Outcome:

@@ -57,9 +57,7 @@ class Run:
 
     def kept(self, *parts: str) -> Path:
         """A file, or a folder, that a killed run leaves for the next; `place` puts it where the result has it."""
-        path = self.path(_CHECKPOINTS, *parts)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path
+        return self.path(_CHECKPOINTS, *parts)
 
     def place(self, kept: Path) -> None:
         """The files under the folder `kept` as the run's own. They stay there too until the run is complete, so that

@@ -97,6 +97,11 @@ def test_what_measures_time_is_not_compiled_quickly(tmp_path, config):
         run_config(config, ["alone=[2]"], out=tmp_path / "run", quickly=True)
     assert ran(tmp_path) == []
     assert len(run_config(config, out=tmp_path / "run", quickly=True)) == 1
+    (tmp_path / "timed.toml").write_text('extends = "toy.toml"\nalone = [0]\n')
+    (tmp_path / "list.toml").write_text('configs = ["timed.toml", "toy.toml"]\n')
+    assert main([str(tmp_path / "list.toml"), "--out", str(tmp_path / "out"), "--compile-quickly"]) == 2
+    assert (tmp_path / "out" / "toy" / "metrics.json").exists()
+    assert not (tmp_path / "out" / "timed").exists()
 
 
 def test_two_sweeps_share_what_they_share_and_each_is_a_table(tmp_path, config):

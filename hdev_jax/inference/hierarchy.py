@@ -191,7 +191,7 @@ def fleet_draws(fit: LinearFit, *, key: Array, chains: int = 4, draws: int = 100
     """
     own, scale = fit.table.free, fit.scale
     value = np.array([c.value for c in own])
-    noise = float(np.median(np.asarray(fit.posterior.sigma)))
+    noise = float(np.median(np.asarray(fit.prior.noise)))  # as believed, which the prior of σ² is of
     told = fit.statistics.about((value[None, :] - fit.at) / scale)  # of all from one point
     gram, moment = np.asarray(told.gram) / noise**2, np.asarray(told.moment) / noise**2
     rows = float(np.sum(np.asarray(told.rows)))
@@ -199,7 +199,8 @@ def fleet_draws(fit: LinearFit, *, key: Array, chains: int = 4, draws: int = 100
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     k = len(own)
     seen = np.asarray(fit.posterior.mean) + (fit.at - value) / scale
-    start = np.r_[np.log(np.clip(np.std(seen, axis=0), 0.1, 10.0)), 0.0]
+    left = float(np.median(np.asarray(fit.posterior.sigma)))
+    start = np.r_[np.log(np.clip(np.std(seen, axis=0), 0.1, 10.0)), 2.0 * np.log(left / noise)]
     sites = drawn(data, start, rng, chains=chains, draws=draws)
     kept = float(sites.pop("kept"))
     sites["theta"], sites["mean"] = value + scale * sites["theta"], value + scale * sites["mean"]

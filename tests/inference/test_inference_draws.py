@@ -10,8 +10,10 @@ from scipy import stats
 from experiments import ranks
 from experiments.config import CONFIGS, resolve, typed
 from hdev_jax.inference import Rows, linear_fit, padded
+from hdev_jax.inference.design import tabular as tabular_of
 from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal
+from hdev_jax.inference.linear import Prior, Statistics, posterior
 from hdev_jax.inference.mass import loads, mass_posterior, with_sd
 from hdev_jax.inference.models import Model
 from hdev_jax.inference.nuts import sampled
@@ -83,7 +85,7 @@ def test_nuts_through_the_kernel_agrees_with_the_statistics():
     """The same model, drawn on every row and on sums: means apart by no more than Monte-Carlo error."""
     fit, own, _ = fleet(4, 60)
     line = linear_fit(truck(), tabular(), lambda: [Rows(fit, own, own)], "battery_power_kw", groups=4)
-    noise = float(np.median(np.asarray(line.posterior.sigma)))
+    noise = float(np.median(np.asarray(line.prior.noise)))
     model = Model.of(
         truck(), tabular(), fit, "battery_power_kw", noise=noise, group=own, groups=4, student=False, grows=False
     )
@@ -152,3 +154,17 @@ def test_ranks_that_are_not_uniform_are_told(tmp_path):
             found = ranks.collect(config, [(task, {"c_rr": values})], run)
         assert (not found["missed"]) is met
         assert found["rows"][0]["ours"]["worlds"] == 300
+
+
+def test_worlds_are_drawn_from_the_closed_forms_prior():
+    """The generator's noise and coefficients against draws of the posterior of no rows."""
+    table = ranks.paper_table(ranks.C_RR, ranks.CDA)
+    rng = np.random.default_rng(0)
+    worlds = [ranks._world(rng, table, conjugate=True) for _ in range(4000)]
+    value, sd = tabular_of(table)
+    nothing = posterior(Prior.of_table(np.zeros(2), np.ones(2), ranks.NOISE_WH), Statistics.zero(2))
+    theta, sigma = nothing.draws(jax.random.key(0), 4000)
+    made = np.array([(w - value) / sd for w, _ in worlds])
+    assert stats.ks_2samp(np.sqrt([v for _, v in worlds]), np.asarray(sigma)).pvalue > 0.001
+    for k in range(2):
+        assert stats.ks_2samp(made[:, k], np.asarray(theta)[:, k]).pvalue > 0.001
