@@ -163,7 +163,7 @@ def through_kernel(draws: int, plain_draws: int) -> list[list[str]]:
          f"{speed[1]:.3g} /s cpu, R-hat {b['r_hat']:.3f}", "–"],
         ["ours over NumPyro's", "–", f"{speed[0] / speed[1]:.3g}", "processor seconds; theirs has not converged"
          if b["r_hat"] > 1.1 else "processor seconds", "10"],
-        ["the same, were every step of theirs an independent draw", "–", f"{speed[0] / most:.3g}", "a lower bound", "10"],
+        ["the same, were each step of theirs an independent draw", "–", f"{speed[0] / most:.3g}", "at the least", "10"],
         ["largest distance of two means", "–", f"{max(apart):.2g} Monte-Carlo sds", "of 48 quantities", "about 4"],
     ]  # fmt: skip
 
