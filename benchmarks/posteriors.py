@@ -12,6 +12,7 @@ the table is kept in docs/posteriors.md.
 import argparse
 import os
 import resource
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -205,7 +206,7 @@ def many_rows(rows: int) -> list[list[str]]:
 def main(argv: list[str] | None = None) -> int:
     """Measure, print, and with `--write` keep the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="*", default=list(WHAT), choices=[*WHAT, []])
+    parser.add_argument("what", nargs="*", default=[], choices=[*WHAT, []], help="all, where none is named")
     parser.add_argument("--rows", type=int, default=10_000_000)
     parser.add_argument("--draws", type=int, default=500, help="of each chain, ours")
     parser.add_argument(
@@ -222,11 +223,11 @@ def main(argv: list[str] | None = None) -> int:
         "recursive": recursive, "fleet": linear_fleet, "rows": lambda: many_rows(options.rows),
         "kernel": lambda: through_kernel(options.draws, options.plain_draws),
     }  # fmt: skip
-    for name in options.what:
+    for name in options.what or WHAT:
         for row in calls[name]():
             lines.append(f"| {' | '.join(row)} |")
             print(lines[-1], flush=True)
-    head = ["# Posteriors: speed", "", "Made by `python benchmarks/posteriors.py --write`.",
+    head = ["# Posteriors: speed", "", f"Made by `python benchmarks/posteriors.py {shlex.join(sys.argv[1:])}`.",
             f"{cores} cores, float64; load of the machine {os.getloadavg()[0]:.1f}.", ""]  # fmt: skip
     if options.write:
         DOC.write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
