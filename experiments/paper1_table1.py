@@ -185,6 +185,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         for k, x in result.items():
             into.setdefault(k, []).extend(x)
     kinds = {task["model"]: task["kind"] for task, _ in results}
+    without = {n: c for n, f in gathered.items() if (c := len(f["pe_tabular"]) - len(_told(f["pe_tabular"])))}
     rows, lines, better, of = [], [], 0, 0
     for name, found in gathered.items():
         fleet, paper = kinds[name] == "fleet", config.paper.get(name)
@@ -213,6 +214,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             "medians over tracks",
             "at least as good: Bayesian beats tabular in RMSE and in the median |PE|, as it does in the paper for most",
             "rows of buses and the car are measured: traction force, sums weighed by distance",
+            *(f"{n}: {c} of {len(gathered[n]['pe_tabular'])} totals are near 0 and have no PE" for n, c in without.items()),
         ],
     }  # fmt: skip
 
@@ -223,7 +225,7 @@ def _numbers(found: dict[str, list[Any]]) -> tuple[dict[str, Any], dict[str, Any
     spread: dict[str, Any] = {}
     for way in WAYS:
         for q in ("rmse", "pe"):
-            values = [x for x in found[f"{q}_{way}"] if x is not None]
+            values = _told(found[f"{q}_{way}"])
             if 2 * len(values) < len(found["km"]) or not values:
                 continue
             mine[f"{q}_{way}"] = float(np.median(values))
@@ -234,11 +236,16 @@ def _numbers(found: dict[str, list[Any]]) -> tuple[dict[str, Any], dict[str, Any
     return mine | {"not_converged": int(np.sum(~np.asarray(found["converged"])))}, spread
 
 
+def _told(values: Sequence[float | None]) -> list[float]:
+    """Those that there are: a total near 0 has no error in per cent."""
+    return [x for x in values if x is not None]
+
+
 def _missed(found: dict[str, dict[str, list[Any]]]) -> list[str]:
     """What the table should show and does not."""
     out = []
     for name, f in found.items():
-        pe = {w: float(np.median(np.abs(f[f"pe_{w}"]))) for w in WAYS}
+        pe = {w: float(np.median(np.abs(_told(f[f"pe_{w}"])))) for w in WAYS}
         if pe["bayesian"] >= pe["tabular"]:
             out.append(f"{name}: Bayesian |PE| {pe['bayesian']:.2f} %, tabular {pe['tabular']:.2f} %")
         if pe["ours"] > 1.0:
@@ -253,9 +260,7 @@ def _figure(run: Run, found: dict[str, dict[str, list[Any]]]) -> None:
     fig = figure(8.0, 3.2)
     ax = fig.add_subplot()
     for j, (way, colour) in enumerate(zip(WAYS, (GREY, BEFORE, AFTER), strict=True)):
-        data = [
-            np.maximum(np.abs([x for x in f[f"pe_{way}"] if x is not None] or [np.nan]), 1e-3) for f in found.values()
-        ]
+        data = [np.maximum(np.abs(_told(f[f"pe_{way}"]) or [np.nan]), 1e-3) for f in found.values()]
         at = np.arange(len(data)) + 0.25 * (j - 1)
         boxes = ax.boxplot(data, positions=at, widths=0.2, sym="", patch_artist=True, manage_ticks=False)
         for b in boxes["boxes"]:
