@@ -268,6 +268,7 @@ def _figure(run: Run, found: dict[str, dict[str, list[Any]]]) -> None:
             b.set_alpha(0.6)
         ax.plot([], [], color=colour, linewidth=5, alpha=0.6, label=way)
     ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(lambda x, _: f"{x:g}")  # plain numbers: the look does not set powers of ten
     ax.axhline(1.0, color=GREY, linewidth=0.8)
     ax.set_xticks(range(len(found)), [f"{k}" for k in found])
     ax.set_ylabel("|error of the total| [%]")
