@@ -20,6 +20,7 @@ __all__ = [
 
 FEW_TRIPS = 8  # below this many training trips a trip is too coarse a unit (design, step 5)
 MOST_CLUSTERS = 256  # tell a variance to 9 %; each more costs a Gram matrix of all candidates
+LEAST_RATIO = 0.1  # of a clustered to the naive variance: less is too few clusters, or rounding where rows tell nothing
 BLOCK_S = 300.0  # the shortest block, longer than what correlates errors on the road
 
 
@@ -95,9 +96,23 @@ def clustered(
     ratio = np.diag(robust)[told] / np.maximum(np.diag(naive)[told], 1e-300)
     inflation = max(1.0, float(np.mean(ratio))) if told.any() else 1.0
     # the clustered likelihood, as a normal around its own maximum, times the prior
-    precision = np.linalg.inv(robust + 1e-12 * np.diag(np.diag(naive)) + 1e-300 * np.eye(len(d)))
+    precision = np.linalg.inv(_no_surer(robust, naive) + 1e-300 * np.eye(len(d)))
     prior = np.diag(1.0 / (prior_sd * d) ** 2)
     return np.linalg.inv(precision + prior) / np.outer(d, d), inflation
+
+
+def _no_surer(robust: Float[np.ndarray, "k k"], naive: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """`robust` with at least `LEAST_RATIO` of the naive variance in every direction.
+
+    Where rows tell nothing the naive variance is without bound and clusters have nothing to disagree about: their
+    agreement is no knowledge, and the prior has the word.
+    """
+    values, vectors = np.linalg.eigh(naive)
+    root = vectors * np.sqrt(np.maximum(values, 1e-300))
+    inverse = vectors / np.sqrt(np.maximum(values, 1e-300))
+    ratios, axes = np.linalg.eigh(inverse.T @ robust @ inverse)
+    axes = root @ axes
+    return (axes * np.maximum(ratios, LEAST_RATIO)) @ axes.T
 
 
 def sum_inflation(residual: Float[np.ndarray, " row"], clusters: Clusters) -> float:

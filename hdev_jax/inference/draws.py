@@ -35,7 +35,7 @@ class Draws:
     """Posterior draws `[chain, draw, …]` by name, and the names of their further axes.
 
     `how` says in a sentence how they were made: from which statistics, or by which sampler on the full likelihood.
-    `energies` of the sampler where it has any, `divergent` the number of its divergent transitions.
+    `steps`, the leapfrog steps of each draw where a sampler took any, `divergent` how many of its transitions diverged.
     """
 
     values: dict[str, Float[np.ndarray, "chain draw ..."]]
@@ -61,7 +61,7 @@ class Draws:
     def quality(self) -> dict[str, float]:
         """`r_hat` (largest), `ess` (smallest, of bulk and tail), `divergent` and `draws`, over all coefficients.
 
-        NumPy only, as in Vehtari et al. (2021): rank-normalised and split.
+        As in Vehtari et al. (2021): rank-normalised and split.
         """
         az = needs("arviz")
         r_hats, bulk, tail = [1.0], [], []

@@ -12,6 +12,7 @@ from hdev_jax.inference.linear import Statistics, least_squares
 __all__ = ["OUTLIER", "caveats"]
 
 WEAK_INFORMATION = 0.25  # what the log says of a direction, over what the table says of it: less is as good as nothing
+NOTHING = 1e-4  # of the best told direction of columns of one size: less is one column twice
 TAKES_PART = 0.3  # of a direction of length 1, from which on a coefficient is named
 CONTRADICTS = 3.0  # standard deviations of table and log together
 OUTLIER = 10.0  # times the noise of all other rows
@@ -37,6 +38,15 @@ def _leaves(s: Statistics) -> tuple:
     return s.gram, s.moment, s.square, s.rows, s.driving, s.largest
 
 
+def _untold(gram: Float[np.ndarray, "k k"]) -> set[int]:
+    """Coefficients that take part in a direction of which the log, whatever the tables say, tells nothing."""
+    d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    values, vectors = np.linalg.eigh(gram / np.outer(d, d))
+    empty = {k for k in range(len(d)) if gram[k, k] <= 0}
+    null = vectors[:, values < NOTHING * max(float(values[-1]), 1e-300)]
+    return empty | {k for v in null.T for k in range(len(d)) if abs(v[k]) > TAKES_PART}
+
+
 def _of_one(
     names: Sequence[str], fit: LinearFit, data: Statistics, at: Float[np.ndarray, " k"], table: Float[np.ndarray, " k"]
 ) -> list[str]:
@@ -52,19 +62,20 @@ def _of_one(
     sd = fit.tabular_sd / fit.scale
     noise = float(np.mean(np.asarray(fit.posterior.sigma)))
     values, vectors = np.linalg.eigh(gram * np.outer(sd, sd) / noise**2)
-    open_ones: set[int] = set()
+    untold = _untold(gram)
     for value, v in zip(values, vectors.T, strict=True):
         members = [k for k in range(len(v)) if abs(v[k]) > TAKES_PART]
         if value >= WEAK_INFORMATION:
             continue
-        open_ones |= set(members)
-        if len(members) == 1:
+        which = " and ".join(names[k] for k in members)
+        if not untold & set(members):
+            out.append(f"{which}: the tables are far surer than this log is, and theirs is the word")
+        elif len(members) == 1:
             out.append(f"{names[members[0]]} is not identified by this log: its value is the table's")
         else:
-            which = " and ".join(names[k] for k in members)
             out.append(f"{which} cannot be told apart by this log: how they share what is known is the tables' word")
     step, covariance, _ = least_squares(data)
-    told = [k for k in range(len(step)) if k not in open_ones]
+    told = [k for k in range(len(step)) if k not in untold]
     for k in told:
         spread = float(np.sqrt(sd[k] ** 2 + np.asarray(covariance)[k, k]))
         if abs(float(step[k]) - table[k]) > CONTRADICTS * spread and fit.table.free[k].sd is not None:

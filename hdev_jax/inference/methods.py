@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, predict
+from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, inside, predict
 from hdev_jax.inference.clusters import Clusters
 from hdev_jax.inference.design import LinearFit, Rows, design, linear_fit
 from hdev_jax.inference.draws import Draws
@@ -66,15 +66,22 @@ def calibrated(
     line = linear_fit(
         vehicle, table, lambda: [Rows(fit, clusters.ids)], target, clusters=clusters.count, robust=noise == "student_t"
     )
-    at_mean = line.calibration(vehicle, np.zeros(0))
-    predicted = np.asarray(predict(at_mean.vehicle, fit.segments, target))[: fit.rows]
-    found = replace(at_mean, predicted=predicted)
+    values = _in_range(table, line.values)
+    outside = [c.name for v, w, c in zip(values, line.values, table.free, strict=True) if v != w]
+    car = table.insert(vehicle, values)
+    predicted = np.asarray(predict(car, fit.segments, target))[: fit.rows]
+    found = replace(line.calibration(vehicle, predicted), vehicle=car, values=values)
     notes = caveats(line)
+    if outside:
+        notes.append(
+            f"{', '.join(outside)}: the closed form, which knows no bounds, ends outside the range and is set to its "
+            "edge; compare with --method map, and look at the tables"
+        )
     if not line.converged:
         notes.append(f"the closed form is not exact here: {found.message}; compare with --method map")
     if method == "linear":
         how = f"closed form on sufficient statistics of {fit.rows:,} rows, linearised {line.passes} times"
-        return Outcome(found, [how, *notes], good=line.converged)
+        return Outcome(found, [how, *notes], good=line.converged and not outside)
     return _drawn(vehicle, table, fit, target, line, found, notes, noise, vehicles, seed, chains, draws)
 
 
@@ -91,7 +98,10 @@ def _drawn(
             *notes,
             "some free coefficients are per vehicle and some are not: each has its own table, none is pooled",
         ]
-    straight = noise == "normal" and is_linear(vehicle, table, fit, target, line)
+    reach = 3.0 * line.sd  # draws of the closed form know no bounds
+    free = all(c.lower < low and high < c.upper for c, low, high in
+               zip(table.free, line.values - reach, line.values + reach, strict=True))  # fmt: skip
+    straight = free and noise == "normal" and line.converged and is_linear(vehicle, table, fit, target, line)
     sigma = float(np.mean(np.asarray(line.posterior.sigma)))
     if pooled:
         assert single is not None
@@ -103,12 +113,15 @@ def _drawn(
         )
         if straight:
             made = fleet_draws(groups, key=key, chains=chains, draws=draws)
+            for more in (4, 16):  # of few vehicles the tails of their spread take more, which costs little
+                if made.faults():
+                    made = fleet_draws(groups, key=key, chains=chains, draws=more * draws)
         else:
             model = Model.of(one, one_table, fit, target, noise=sigma, size=found.predicted, group=own, groups=vehicles,
                              student=noise == "student_t", worth=1.0 / line.inflation)  # fmt: skip
             made = sampled(model, groups.values, key=key, chains=chains, draws=draws, noise=sigma)
         theta = made.values["theta"]  # [chain, draw, vehicle, coefficient], the table has vehicles inside coefficients
-        flat = np.swapaxes(theta, -1, -2).reshape(chains * draws, -1)
+        flat = np.swapaxes(theta, -1, -2).reshape(theta.shape[0] * theta.shape[1], -1)
         notes = [
             *notes,
             f"coefficients of {vehicles} vehicles are pooled in part: each is drawn towards the fleet's mean",
@@ -125,9 +138,9 @@ def _drawn(
     else:
         model = Model.of(vehicle, table, fit, target, noise=sigma, size=found.predicted, student=noise == "student_t",
                          worth=1.0 / line.inflation)  # fmt: skip
-        made = sampled(model, line.values, key=key, chains=chains, draws=draws, noise=sigma)
+        made = sampled(model, found.values, key=key, chains=chains, draws=draws, noise=sigma)
         flat = made.flat("theta")
-    values, covariance = np.mean(flat, axis=0), np.atleast_2d(np.cov(flat.T))
+    values, covariance = _in_range(table, np.mean(flat, axis=0)), np.atleast_2d(np.cov(flat.T))
     faults = made.faults()
     car = table.insert(vehicle, values)
     predicted = np.asarray(predict(car, fit.segments, target))[: fit.rows]
@@ -139,6 +152,11 @@ def _drawn(
     )  # fmt: skip
     bad = [f"these draws are no answer: {fault}" for fault in faults]
     return Outcome(fitted, [made.how, *bad, *notes], made, not faults)
+
+
+def _in_range(table: ParameterTable, values: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    """Values that a sheet may hold: what lies outside its range is put to the edge."""
+    return np.array([inside(float(v), c.lower, c.upper) for v, c in zip(values, table.free, strict=True)])
 
 
 def replace_weight(fit: Fit, inflation: float) -> Fit:

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from inference_rows import C_RR_SD, CDA_SD, PRIOR, PRIOR_SD, by_hand, driving, power_kw, tabular, truck
+from inference_rows import C_RR_SD, CDA, CDA_SD, PRIOR, PRIOR_SD, by_hand, driving, power_kw, tabular, truck
 from scipy import stats
 
 from hdev_jax.inference import (
+    Coefficient,
     LinearFit,
+    ParameterTable,
     Posterior,
     Prior,
     Rows,
@@ -29,6 +31,7 @@ from hdev_jax.inference import (
     statistics,
     update,
 )  # fmt: skip
+from hdev_jax.inference.methods import calibrated
 from hdev_jax.segments import Segments
 
 TRUTH = np.array([0.0068, 6.1])
@@ -240,6 +243,36 @@ def test_hard_logs_have_a_finite_answer_and_a_word(name, words, robust):
         assert all(w in said for w in words), said
     for a in least_squares(found.statistics):
         assert np.all(np.isfinite(a))
+
+
+@pytest.mark.parametrize("noise", [0.1, 4.0])
+def test_clusters_that_agree_about_nothing_are_no_knowledge(noise):
+    """At constant speed the default method leaves c_rr and C_d·A as the closed form does, and their sum known."""
+    s = constant_speed()
+    y = power_kw(s, TRUTH) + noise * np.random.default_rng(0).standard_normal(100)
+    rows, clusters = padded(s, y), cluster_rows(s)
+    found = calibrate(truck(), tabular(), rows, "battery_power_kw", clusters)
+    assert np.all(found.sd > 0.5 * np.array([C_RR_SD, CDA_SD]))
+    columns, _ = by_hand(s)
+    of_sum = float(np.sqrt(columns[0] @ found.covariance @ columns[0]))
+    assert of_sum < 2.0 * noise / np.sqrt(100) + 0.02
+
+
+@pytest.mark.parametrize("method", ["linear", "nuts"])
+def test_a_table_that_is_sure_and_wrong_is_no_good_fit(method):
+    """c_rr held at three times its value drives C_d·A below zero: told, kept in range, not called good."""
+    s, y = log(150, 140)
+    wrong = ParameterTable((Coefficient("road.c_rr", "1", 0.020, 0.0002, 0.0002, 0.0, 0.1),
+                            Coefficient("road.cda_m2", "m²", CDA, CDA_SD, CDA_SD, 0.0, 100.0)))  # fmt: skip
+    found = calibrated(truck(), wrong, padded(s, y), "battery_power_kw", cluster_rows(s), method, draws=200)
+    assert np.all(found.fit.values > 0)
+    said = " | ".join(found.notes)
+    assert "road.c_rr: the log says" in said
+    assert not found.good, "at the edge of the range, too, draws are held against what makes them an answer"
+    if method == "linear":
+        assert "road.cda_m2: the closed form, which knows no bounds" in said
+    else:
+        assert "full likelihood" in said, "draws of the closed form would lie outside the range"
 
 
 def test_collinear_coefficients_keep_what_is_known_of_their_sum():
