@@ -162,7 +162,8 @@ def through_kernel(draws: int, plain_draws: int) -> list[list[str]]:
          f"{a['ess_bulk'] / ours.wall:.3g} /s", f"{speed[0]:.3g} /s cpu, R-hat {a['r_hat']:.3f}", "–"],
         ["NumPyro's NUTS, all rows (compiling in its time)", "–", f"{b['ess_bulk'] / plain.wall:.3g} /s",
          f"{speed[1]:.3g} /s cpu, R-hat {b['r_hat']:.3f}", "–"],
-        ["ours over theirs, were each step of theirs an independent draw", "–", f"{speed[0] / most:.3g}", "at the least", "10"],
+        ["ours over theirs, were each step of theirs an independent draw", "–", f"{speed[0] / most:.3g}",
+         "at the least", "10"],
         *([] if b["r_hat"] > 1.1 else [
             ["ours over NumPyro's", "–", f"{speed[0] / speed[1]:.3g}", "processor seconds", "10"],
             ["largest distance of two means", "–", f"{max(apart):.2g} Monte-Carlo sds", "of 48 quantities", "about 4"],
