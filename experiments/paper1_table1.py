@@ -17,7 +17,7 @@ from experiments.data import MissingDataError, data_folder, fingerprint
 from experiments.figures import save_figure, styled
 from experiments.paper1_halves import errors, fitted, halves, laps, ours, paper_table
 from experiments.tables import write_tables
-from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
+from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, plain_log, tidy
 from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
@@ -268,7 +268,7 @@ def _figure(run: Run, found: dict[str, dict[str, list[Any]]]) -> None:
             b.set_alpha(0.6)
         ax.plot([], [], color=colour, linewidth=5, alpha=0.6, label=way)
     ax.set_yscale("log")
-    ax.yaxis.set_major_formatter(lambda x, _: f"{x:g}")  # plain numbers: the look does not set powers of ten
+    plain_log(ax.yaxis)
     ax.axhline(1.0, color=GREY, linewidth=0.8)
     ax.set_xticks(range(len(found)), [f"{k}" for k in found])
     ax.set_ylabel("|error of the total| [%]")

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
-from experiments.paper2_diagnosed import of_settings
+from experiments.paper2_diagnosed import diagnosis_key
 from experiments.paper2_fits import Mean, evaluated, fitted, step_seconds
 from experiments.paper2_models import Settings
 from experiments.paper2_tables import OF_SOME, collect
@@ -54,7 +54,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     common = {"rows": config.rows, "train": config.train, "data": kia_fingerprint()}
     for name in config.order:
         settings = config.models[name].task()
-        task = {"name": name, "settings": settings, **of_settings(settings), **common}
+        task = {"name": name, "settings": settings, **diagnosis_key(settings), **common}
         yield {**task, "test": config.test, "seed": config.seed}
         if config.timed and config.models[name].kind == "narx":
             yield {**task, "timed": True}

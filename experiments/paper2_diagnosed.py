@@ -18,14 +18,14 @@ from hdev_jax.learn import Trip
 from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle
 
-__all__ = ["Diagnosed", "of_settings"]
+__all__ = ["Diagnosed", "diagnosis_key"]
 
 SHEET = Path(__file__).parents[1] / "configs" / "vehicles" / "kia_niro.toml"
 TARGET = "battery_power_kw"
 LOOP = ("diagnosis", "inference", "physics")  # what the loop is made of
 
 
-def of_settings(settings: Mapping[str, Any]) -> dict[str, str]:
+def diagnosis_key(settings: Mapping[str, Any]) -> dict[str, str]:
     """What a task has among its values besides: the fingerprint of the sheet and of the loop, where it diagnoses."""
     return {"diagnosis": _fingerprint()} if settings["kind"] == "diagnosed" else {}
 

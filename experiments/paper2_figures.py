@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from experiments.config import Strict
 from experiments.paper2_data import TripName, kia_fingerprint, kia_trips
-from experiments.paper2_diagnosed import of_settings
+from experiments.paper2_diagnosed import diagnosis_key
 from experiments.paper2_drawings import prediction_figure
 from experiments.paper2_fits import Mean, evaluated, fitted
 from experiments.paper2_models import Settings
@@ -46,7 +46,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """The one model."""
     settings = config.models[config.model].task()
     task = {"settings": settings, "rows": config.rows, "train": config.train, "seed": config.seed}
-    yield {**task, **of_settings(settings), "data": kia_fingerprint()}
+    yield {**task, **diagnosis_key(settings), "data": kia_fingerprint()}
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:

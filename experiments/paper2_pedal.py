@@ -11,7 +11,7 @@ from pydantic import Field
 
 from experiments.config import Strict
 from experiments.paper2_data import kia_fingerprint, kia_trips
-from experiments.paper2_diagnosed import of_settings
+from experiments.paper2_diagnosed import diagnosis_key
 from experiments.paper2_fits import evaluated, fitted
 from experiments.paper2_models import Settings
 from experiments.tables import write_tables
@@ -41,7 +41,13 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
     settings = config.models[config.model].task()
     for inputs in (settings["inputs"], [*settings["inputs"], "accelerator_pct"]):
         task = {"settings": {**settings, "inputs": inputs}, "share": config.share}
-        yield {**task, **of_settings(settings), "rows": config.rows, "seed": config.seed, "data": kia_fingerprint("1")}
+        yield {
+            **task,
+            **diagnosis_key(settings),
+            "rows": config.rows,
+            "seed": config.seed,
+            "data": kia_fingerprint("1"),
+        }
 
 
 def alone(task: dict[str, Any]) -> bool:

@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import NullFormatter
 
 from experiments.figures import save_figure, styled
 from experiments.pinn_scores import pooled
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
-from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
+from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, plain_log, tidy
 from hdev_jax.rundir import Run
 
 __all__ = ["MODELS", "OURS", "PAPER_MODEL", "coefficient_boxes", "learning_curves", "model_bars", "weight_maps"]
@@ -93,11 +92,9 @@ def learning_curves(run: Run, curves: Mapping[tuple[str, str], list[tuple[float,
         ax.set_yscale("log")
         ax.set_xlabel("training routes used [%]")
         ax.set_ylabel("RMSE [Wh]")
-        # plain numbers: the project's look does not set powers of ten
         ax.set_xticks(sorted({100 * s for k, points in curves.items() if k[1] == use for s, _ in points}))
         for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_formatter(lambda x, _: f"{x:g}")
-            axis.set_minor_formatter(NullFormatter())
+            plain_log(axis)
         ax.set_yticks([y for y in (5, 10, 20, 50, 100, 200) if ax.get_ylim()[0] <= y <= ax.get_ylim()[1]])
         ax.set_title({"test": "Test routes", "unseen": "Never trained on"}[use] + " (synthetic)")
         ax.legend(fontsize=7)

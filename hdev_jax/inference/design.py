@@ -18,7 +18,7 @@ from hdev_jax.physics import Vehicle
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["GROUP", "LinearFit", "Rows", "design", "linear_fit", "tabular"]
+__all__ = ["GROUP", "LinearFit", "Rows", "design", "linear_fit", "supported", "tabular"]
 
 GROUP = "coefficient_group"  # the channel that says which group's coefficients hold for a row
 PASSES = 8  # a kernel that is linear needs two, the second to see that it is
@@ -164,7 +164,7 @@ def linear_fit(
     value, scale = tabular(table)
     k, shape = len(value), (groups, len(value)) if groups else (len(value),)
     mean, sd = (np.broadcast_to(a, shape) for a in (prior or (value, scale)))
-    at = _supported(table, np.array(mean))
+    at = supported(table, np.array(mean))
     first, believed, inflation, moved, sweep = None, noise, 1.0, np.inf, 0
     most = passes or (ROBUST_PASSES if robust else PASSES)
     for sweep in range(1, most + 1):
@@ -197,7 +197,7 @@ def linear_fit(
         settled = not robust or (sweep > 2 and abs(np.log(believed / last)) < SETTLED)
         if (moved <= ENOUGH and settled) or sweep == most:
             break
-        at = _supported(table, at + scale * np.asarray(step))
+        at = supported(table, at + scale * np.asarray(step))
     return LinearFit(table, at, scale, before, counted, result, inflation, 0.0 if most == 1 else moved, sweep)
 
 
@@ -238,8 +238,11 @@ def _inflation(summed: Statistics, step: Array, sigma: float) -> float:
     )
 
 
-def _supported(table: ParameterTable, theta: np.ndarray) -> np.ndarray:
-    """The point moved inside the support, where the kernel is finite; the posterior itself is not cut."""
+def supported(table: ParameterTable, theta: np.ndarray) -> np.ndarray:
+    """The point `[*group k]` moved inside the support, where the kernel is finite and which a sheet may hold.
+
+    The posterior itself is not cut.
+    """
     out = np.array(theta, dtype=float)
     for k, c in enumerate(table.free):
         out[..., k] = np.vectorize(lambda v, c=c: inside(float(v), c.lower, c.upper))(out[..., k])

@@ -7,9 +7,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, inside, predict
+from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, predict
 from hdev_jax.inference.clusters import Clusters
-from hdev_jax.inference.design import LinearFit, Rows, design, linear_fit
+from hdev_jax.inference.design import LinearFit, Rows, design, linear_fit, supported
 from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.hierarchy import fleet_draws
 from hdev_jax.inference.identified import caveats
@@ -66,7 +66,7 @@ def calibrated(
     line = linear_fit(
         vehicle, table, lambda: [Rows(fit, clusters.ids)], target, clusters=clusters.count, robust=noise == "student_t"
     )
-    values = _in_range(table, line.values)
+    values = supported(table, line.values)
     outside = [c.name for v, w, c in zip(values, line.values, table.free, strict=True) if v != w]
     car = table.insert(vehicle, values)
     predicted = np.asarray(predict(car, fit.segments, target))[: fit.rows]
@@ -140,7 +140,7 @@ def _drawn(
                          worth=1.0 / line.inflation)  # fmt: skip
         made = sampled(model, found.values, key=key, chains=chains, draws=draws, noise=sigma)
         flat = made.flat("theta")
-    values, covariance = _in_range(table, np.mean(flat, axis=0)), np.atleast_2d(np.cov(flat.T))
+    values, covariance = supported(table, np.mean(flat, axis=0)), np.atleast_2d(np.cov(flat.T))
     faults = made.faults()
     car = table.insert(vehicle, values)
     predicted = np.asarray(predict(car, fit.segments, target))[: fit.rows]
@@ -152,11 +152,6 @@ def _drawn(
     )  # fmt: skip
     bad = [f"these draws are no answer: {fault}" for fault in faults]
     return Outcome(fitted, [made.how, *bad, *notes], made, not faults)
-
-
-def _in_range(table: ParameterTable, values: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-    """Values that a sheet may hold: what lies outside its range is put to the edge."""
-    return np.array([inside(float(v), c.lower, c.upper) for v, c in zip(values, table.free, strict=True)])
 
 
 def replace_weight(fit: Fit, inflation: float) -> Fit:

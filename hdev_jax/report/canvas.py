@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["AFTER", "BEFORE", "GREY", "INK", "MEASURED", "axis_label", "figure", "png", "style", "tidy"]
+__all__ = ["AFTER", "BEFORE", "GREY", "INK", "MEASURED", "axis_label", "figure", "plain_log", "png", "style", "tidy"]
 
 # Okabe and Ito (2008): told apart with any colour vision, and by lightness in print
 MEASURED, BEFORE, AFTER = "#1a1a1a", "#D55E00", "#0072B2"
@@ -77,6 +77,14 @@ def tidy(ax: Any, *, grid: str = "y", zero: bool = False) -> None:
     ax.tick_params(length=2.5)
     if zero:
         ax.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+
+
+def plain_log(axis: Any) -> None:
+    """Plain numbers on a logarithmic axis: powers of ten need the mathematical text that `style` turns off."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def axis_label(words: str, unit: str) -> str:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hdev_jax.report import names
-from hdev_jax.report.canvas import GREY, axis_label, figure, tidy
+from hdev_jax.report.canvas import GREY, axis_label, figure, plain_log, tidy
 from hdev_jax.report.data import ReportData, test_rows
 from hdev_jax.report.figures import WIDTH, legend, models, short
 from hdev_jax.report.statistics import (
@@ -140,11 +140,8 @@ def residual_in_time(data: ReportData) -> Any | None:
     right.set_xlabel("length of a cycle [s]" if even else "length of a cycle [rows]")
     right.set_ylabel(f"variance per octave [{data.unit}²]")
     if right.lines:
-        from matplotlib.ticker import FuncFormatter, NullFormatter
-
         right.set_xscale("log")
-        right.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:,g}"))
-        right.xaxis.set_minor_formatter(NullFormatter())
+        plain_log(right.xaxis)
         right.set_ylim(bottom=0)
         tidy(right)
     else:
