@@ -30,7 +30,7 @@ h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made
 {% if sections | length > 1 and s.title %}<h2 id="{{ s.anchor }}">{{ s.title }}</h2>{% endif %}
 {% if s.synthetic %}<p><span class="tag">synthetic</span></p>{% endif %}
 {% for line in s.made %}<p class="made">{{ line }}</p>{% endfor %}
-{% if s.told %}<p>{{ s.told | join(" ") }}</p>{% endif %}
+{% if s.told %}<ul>{% for line in s.told %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
 {% if s.links %}<p>{% for name, to in s.links %}<a href="{{ to }}">{{ name }}</a> {% endfor %}</p>{% endif %}
 {% for caption, lines in s.tables %}<div class="scroll"><table><caption>{{ caption }}</caption><thead><tr>
 {% for h in lines[0] %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
