@@ -24,6 +24,7 @@ from hdev_jax.rundir import Run
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
 SOURCES = ("linearity.py", "paper1_halves.py")
+NEAR_ZERO = 0.1  # of the median segment's energy
 TABLE = ((0.0060, 0.0008), (5.6, 0.5))
 
 
@@ -84,13 +85,15 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     often = linear_fit(car, table, lambda: [piece], problem.target, noise=made.noise_rms)
     out: dict[str, Any] = {"changes_sign": float(np.mean(np.sign(clean) != np.sign(before))), "passes": often.passes,
                            "noise": made.noise_rms}  # fmt: skip
+    # segments whose energy is small beside the others': those that may change sign
+    flat = np.abs(clean) < NEAR_ZERO * np.median(np.abs(clean))
+    out["near_zero"] = float(np.mean(flat))
     for name, fit in (("once", once), ("often", often)):
         error = energy(fit.values) - clean
+        out[f"near_{name}"] = float(np.sqrt(np.mean(error[flat] ** 2))) if flat.any() else 0.0
         out[f"rmse_{name}"] = float(np.sqrt(np.mean(error**2)))
         out[f"pe_{name}"] = 100.0 * float(np.sum(error) / np.sum(clean))
         out[f"off_{name}"] = float(np.max(np.abs(fit.values - truth) / fit.sd))
-    flat = np.abs(clean) < 0.1 * np.median(np.abs(clean))
-    out["near_zero"] = float(np.mean(flat))
     return out
 
 
@@ -104,9 +107,11 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             name = f"efficiency {'free' if free else 'known'}, {distance:g} sds"
             rows.append({"name": name, "paper": None, "ours": mine})
             line = {"efficiency": "free" if free else "known", "truth off by [sds]": distance, "logs": len(found)}
-            line |= {"rows that change sign": mine["changes_sign"], "noise [Wh]": mine["noise"]}
+            line |= {"rows that change sign": mine["changes_sign"], "rows near 0": mine["near_zero"]}
+            line |= {"noise [Wh]": mine["noise"]}
             for way, word in (("once", "once"), ("often", "iterated")):
                 line |= {f"RMSE {word} [Wh]": mine[f"rmse_{way}"], f"|PE| {word} [%]": mine[f"pe_{way}"]}
+                line |= {f"RMSE near 0 {word} [Wh]": mine[f"near_{way}"]}
                 line |= {f"farthest {word} [posterior sds]": mine[f"off_{way}"]}
             lines.append(line | {"passes": mine["passes"]})
     write_tables(run, "linearity", lines, config.caption)

@@ -19,7 +19,8 @@ from hdev_jax.inference.sheet_text import augmented_sheet
 from hdev_jax.logs import read_log, write_adapter_skeleton
 from hdev_jax.opening import Paths, chosen_effects, command_line, known_effects, opened
 from hdev_jax.physics import LIBRARY
-from hdev_jax.posterior import calibrate, predict
+from hdev_jax.posterior import calibrate
+from hdev_jax.prediction import predict, write_predictive
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.report.page import write_report
 from hdev_jax.rundir import open_run
@@ -67,7 +68,9 @@ def diagnose(
         data = of_diagnosis(result, command_line("diagnose", run), started)
         text = _augmented(result, start.sheet)
         run.path("diagnosis.json").write_text(json.dumps(result.summary, indent=1, allow_nan=False) + "\n")
-        run.path("augmented_vehicle.toml").write_text(text)
+        sheet = run.path("augmented_vehicle.toml")
+        sheet.write_text(text)
+        write_predictive(run, sheet, problem, split, result.fit, "normal")
         write_report(data, run.work)
         answer = answer_text(data, Path(out))
         run.path("answer.txt").write_text(answer)

@@ -130,7 +130,8 @@ def parser() -> argparse.ArgumentParser:
         "predict",
         help="what a vehicle sheet predicts for each row of a log, with an interval",
         description="Predict the target for each row of the logs, which need not have measured it, and the total of "
-        "each trip, with intervals. A sheet that hdev calibrate wrote, in its folder, brings its posterior with it.",
+        "each trip, with intervals. A sheet that hdev calibrate or diagnose wrote, in its folder, brings with it what "
+        "they need.",
         epilog="example:\n  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out predicted.csv",
     )
     _logs(predict)

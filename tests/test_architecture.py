@@ -24,6 +24,7 @@ LAYERS = [
     {"diagnosis"},
     {"report"},
     {"opening"},
+    {"prediction"},
     {"posterior"},
     {"api"},
     {"demo", "cli", "experiments"},

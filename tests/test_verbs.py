@@ -21,7 +21,7 @@ CHECKER = Path(__file__).parents[2] / "shared" / "check_diagnosis.py"
 ONLY = ["--only", "headwind,auxiliary_power"]  # two candidates: quick
 FILES = {
     "diagnosis.json", "report.html", "augmented_vehicle.toml", "answer.txt", "config.toml", "environment.json",
-    "figures",
+    "figures", "predictive.json",
 }  # fmt: skip
 
 # A user's own effect: what it adds is linear in the time since the start, which nothing in the library is.

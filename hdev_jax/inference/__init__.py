@@ -1,7 +1,7 @@
 """Estimators on top of the kernel: one parameter table, calibration, clusters, the closed form."""
 
 from hdev_jax.inference.calibrate import Calibration, Fit, calibrate, jacobian, padded, padded_rows, predict
-from hdev_jax.inference.clusters import Clusters, cluster_rows, clusters_of, sum_inflation
+from hdev_jax.inference.clusters import Clusters, cluster_rows, clusters_of
 from hdev_jax.inference.design import LinearFit, Rows, design, linear_fit
 from hdev_jax.inference.identified import caveats
 from hdev_jax.inference.linear import (
@@ -15,6 +15,7 @@ from hdev_jax.inference.linear import (
     update,
 )
 from hdev_jax.inference.parameters import Coefficient, ParameterTable, effect_coefficients, insert, insert_by
+from hdev_jax.inference.predictive import Spread, covariance_root, left_out, spread_of, sums_of
 
 __all__ = [
     "Calibration",
@@ -26,11 +27,13 @@ __all__ = [
     "Posterior",
     "Prior",
     "Rows",
+    "Spread",
     "Statistics",
     "calibrate",
     "caveats",
     "cluster_rows",
     "clusters_of",
+    "covariance_root",
     "design",
     "effect_coefficients",
     "follow",
@@ -38,12 +41,14 @@ __all__ = [
     "insert_by",
     "jacobian",
     "least_squares",
+    "left_out",
     "linear_fit",
     "padded",
     "padded_rows",
     "posterior",
     "predict",
+    "spread_of",
     "statistics",
-    "sum_inflation",
+    "sums_of",
     "update",
 ]

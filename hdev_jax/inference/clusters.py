@@ -15,7 +15,6 @@ __all__ = [
     "cluster_rows",
     "clustered",
     "clusters_of",
-    "sum_inflation",
 ]
 
 FEW_TRIPS = 8  # below this many training trips a trip is too coarse a unit (design, step 5)
@@ -47,14 +46,16 @@ def cluster_rows(segments: Segments) -> Clusters:
     return clusters_of(np.asarray(segments.trip), np.asarray(segments.duration_s))
 
 
-def clusters_of(trip: Int[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"]) -> Clusters:
-    """Trips where there are at least `FEW_TRIPS`, else contiguous blocks of each trip of at least `BLOCK_S` [s].
+def clusters_of(
+    trip: Int[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"], *, few: int = FEW_TRIPS
+) -> Clusters:
+    """Trips where there are at least `few`, else contiguous blocks of each trip of at least `BLOCK_S` [s].
 
     Where there are more than `MOST_CLUSTERS` trips, neighbours share a cluster.
     """
     slices = list(trip_slices(trip))
     ids = np.zeros(len(trip), dtype=np.int64)
-    if len(slices) >= FEW_TRIPS:
+    if len(slices) >= few:
         most = min(len(slices), MOST_CLUSTERS)
         for k, (_, s) in enumerate(slices):
             ids[s] = k * most // len(slices)
@@ -113,12 +114,3 @@ def _no_surer(robust: Float[np.ndarray, "k k"], naive: Float[np.ndarray, "k k"])
     ratios, axes = np.linalg.eigh(inverse.T @ robust @ inverse)
     axes = root @ axes
     return (axes * np.maximum(ratios, LEAST_RATIO)) @ axes.T
-
-
-def sum_inflation(residual: Float[np.ndarray, " row"], clusters: Clusters) -> float:
-    """How much wider the error of a cluster's sum is, as a variance, than independent rows would make it; at least 1.
-
-    `residual` weighed as it is summed.
-    """
-    alone = float(np.sum(residual**2))
-    return max(1.0, float(np.sum(clusters.sums(residual) ** 2)) / alone) if alone > 0 else 1.0

@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hdev_jax.errors import InputError
 
@@ -35,15 +35,20 @@ class Draws:
     """Posterior draws `[chain, draw, …]` by name, and the names of their further axes.
 
     `how` says in a sentence how they were made: from which statistics, or by which sampler on the full likelihood.
-    `steps`, the leapfrog steps of each draw where a sampler took any, `divergent` how many of its transitions diverged.
+    `steps`, the leapfrog steps of each draw where a sampler took any, and `diverging`, whether it diverged.
     """
 
     values: dict[str, Float[np.ndarray, "chain draw ..."]]
     how: str
     axes: dict[str, tuple[str, ...]] = field(default_factory=dict)
     labels: dict[str, list[str]] = field(default_factory=dict)
-    divergent: int = 0
+    diverging: Bool[np.ndarray, "chain draw"] | None = None
     steps: Float[np.ndarray, "chain draw"] | None = None
+
+    @property
+    def divergent(self) -> int:
+        """How many transitions diverged."""
+        return 0 if self.diverging is None else int(np.sum(self.diverging))
 
     def flat(self, name: str) -> Float[np.ndarray, "draw ..."]:
         """All chains behind each other."""
@@ -53,10 +58,11 @@ class Draws:
     def idata(self) -> Any:
         """The same as ArviZ's `InferenceData`."""
         az = needs("arviz")
-        extra = {} if self.steps is None else {"sample_stats": {"n_steps": self.steps}}
+        stats = {k: v for k, v in {"n_steps": self.steps, "diverging": self.diverging}.items() if v is not None}
         return az.from_dict(
-            posterior=self.values, dims={k: list(v) for k, v in self.axes.items()}, coords=self.labels, **extra
-        )
+            posterior=self.values, dims={k: list(v) for k, v in self.axes.items()}, coords=self.labels,
+            **({"sample_stats": stats} if stats else {}),
+        )  # fmt: skip
 
     def quality(self) -> dict[str, float]:
         """`r_hat` (largest), `ess` (smallest, of bulk and tail), `divergent` and `draws`, over all coefficients.

@@ -208,7 +208,7 @@ def fleet_draws(fit: LinearFit, *, key: Array, chains: int = 4, draws: int = 100
     axes = {"theta": ("vehicle", "coefficient"), "mean": ("coefficient",), "spread": ("coefficient",)}
     labels = {"coefficient": [c.name for c in own], "vehicle": [str(g) for g in range(len(fit.at))]}
     how = (
-        f"sufficient statistics of {rows:,.0f} rows (linear, normal noise): exact draws given the spread of {k} "
-        f"coefficients and the noise, whose draws were accepted {100 * kept:.0f} % of the time"
+        f"sufficient statistics, worth {rows:,.0f} independent rows (linear, normal noise): exact draws given the "
+        f"spread of {k} coefficients and the noise, whose draws were accepted {100 * kept:.0f} % of the time"
     )
     return Draws(sites, how, axes, labels)

@@ -61,11 +61,12 @@ def calibrated(
     are correlated: with every method a row counts for 1/`inflation` of one. Coefficients that the sheet has per vehicle
     resemble each other (partial pooling) where all free ones are per vehicle.
     """
-    if method == "map":
-        return Outcome(calibrate(vehicle, table, fit, target, clusters, noise=noise), [])
     line = linear_fit(
         vehicle, table, lambda: [Rows(fit, clusters.ids)], target, clusters=clusters.count, robust=noise == "student_t"
     )
+    if method == "map":
+        found = calibrate(vehicle, table, fit, target, clusters, noise=noise)
+        return Outcome(found, caveats(line), good=found.converged)
     values = supported(table, line.values)
     outside = [c.name for v, w, c in zip(values, line.values, table.free, strict=True) if v != w]
     car = table.insert(vehicle, values)
@@ -123,7 +124,7 @@ def _drawn(
         theta = made.values["theta"]  # [chain, draw, vehicle, coefficient], the table has vehicles inside coefficients
         flat = np.swapaxes(theta, -1, -2).reshape(theta.shape[0] * theta.shape[1], -1)
         notes = [
-            *notes,
+            *(f"each vehicle by itself, before pooling: {note}" for note in notes),
             f"coefficients of {vehicles} vehicles are pooled in part: each is drawn towards the fleet's mean",
         ]
     elif straight:

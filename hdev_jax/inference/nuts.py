@@ -183,12 +183,14 @@ def compiled(m: Model, *, chains: int, draws: int, warm_up: int) -> Callable[[Mo
     def go(m: Model, c: Coordinates, key: Array) -> Draws:
         with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
             sites, divergent, steps = jax.block_until_ready(run(m, c, key))
-        return _named(m, {k: np.asarray(v) for k, v in sites.items()}, int(np.sum(divergent)), np.asarray(steps))
+        return _named(m, {k: np.asarray(v) for k, v in sites.items()}, np.asarray(divergent), np.asarray(steps))
 
     return go
 
 
-def _named(m: Model, sites: dict[str, np.ndarray], divergent: int, steps: Any, by: str = "BlackJAX NUTS") -> Draws:
+def _named(
+    m: Model, sites: dict[str, np.ndarray], diverging: np.ndarray, steps: Any, by: str = "BlackJAX NUTS"
+) -> Draws:
     axes = {"theta": ("vehicle", "coefficient") if m.groups else ("coefficient",)}
     axes |= {k: ("coefficient",) for k in ("mean", "spread") if k in sites}
     labels = {"coefficient": [c.name for c in m.table.free]}
@@ -197,7 +199,7 @@ def _named(m: Model, sites: dict[str, np.ndarray], divergent: int, steps: Any, b
     noise = "Student t" if m.student else "normal"
     grown = ", growing with energy" if m.grows else ""
     how = f"{by} on the full likelihood through the kernel ({noise} noise{grown})"
-    return Draws(sites, how, axes, labels, divergent, None if steps is None else np.asarray(steps, dtype=float))
+    return Draws(sites, how, axes, labels, diverging, np.asarray(steps, dtype=float))
 
 
 def numpyro_nuts(
@@ -231,4 +233,4 @@ def numpyro_nuts(
         sites = {k: np.asarray(v) for k, v in sampler.get_samples(group_by_chain=True).items()}
         extra = sampler.get_extra_fields(group_by_chain=True)
     sites = {k: v for k, v in sites.items() if not k.startswith("theta_")}
-    return _named(m, sites, int(np.sum(extra["diverging"])), extra["num_steps"], "NumPyro NUTS")
+    return _named(m, sites, np.asarray(extra["diverging"]), extra["num_steps"], "NumPyro NUTS")

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, driving, tabular, truck
+from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, PRIOR, PRIOR_SD, driving, tabular, truck
 from scipy import stats
 
 from experiments import ranks
@@ -114,9 +114,35 @@ def test_a_bad_fit_is_not_called_good():
     assert faults(good) == ""
     assert "chains disagree" in faults(good + np.arange(4)[:, None, None])
     assert "too few effective draws" in faults(np.cumsum(good, axis=1) * 0.02 + good * 1e-3)
-    assert "diverged" in faults(good, divergent=100)
+    assert "diverged" in faults(good, diverging=np.arange(4000).reshape(4, 1000) < 100)
     assert "one chain" in faults(good[:1])
     assert "finite" in faults(np.where(good > 3, np.nan, good))
+
+
+@pytest.mark.slow
+def test_nuts_agrees_with_the_closed_form_of_one_vehicle(tmp_path):
+    """Means and spreads of coefficients and noise, apart by no more than Monte-Carlo error.
+
+    The closed form's table is as wide as the noise turns out; its draws are weighed to the model's, which is not.
+    """
+    fit, _, _ = fleet(1, 400)
+    line = linear_fit(truck(), tabular(), lambda: [Rows(fit, np.zeros(fit.rows, dtype=int))], "battery_power_kw")
+    noise = float(line.prior.noise)
+    model = Model.of(truck(), tabular(), fit, "battery_power_kw", noise=noise, student=False, grows=False)
+    long = sampled(model, line.values, key=jax.random.key(0), chains=4, draws=1000, noise=noise)
+    assert long.faults() == []
+    theta, sigma = line.draws(jax.random.key(1), 100_000)
+    away = np.sum(((theta - PRIOR) / PRIOR_SD) ** 2, axis=1)
+    log_weight = -0.5 * away * (1.0 - (noise / sigma) ** 2) + theta.shape[1] * np.log(sigma / noise)
+    weight = np.exp(log_weight - np.max(log_weight))
+    pairs = [*zip(long.flat("theta").T, theta.T, strict=True), (np.sqrt(long.flat("variance")), sigma)]
+    for ours, exact in pairs:
+        mean = np.average(exact, weights=weight)
+        sd = np.sqrt(np.average((exact - mean) ** 2, weights=weight))
+        assert abs(np.mean(ours) - mean) < 4.0 * sd / np.sqrt(long.quality()["ess"])
+        assert np.std(ours) == pytest.approx(sd, rel=0.1)
+    long.write(tmp_path / "posterior.nc")
+    assert long.idata().sample_stats["diverging"].shape == (4, 1000)
 
 
 @pytest.mark.slow

@@ -1,0 +1,125 @@
+"""What new rows and new trips may be off by: leaving trips out, the shape of a row's noise, how errors add up."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from inference_rows import driving, tabular, truck
+
+from hdev_jax.inference import calibrate, cluster_rows, clusters_of, left_out, padded, spread_of, sums_of
+from hdev_jax.inference.predictive import errors_left_out
+
+TRIPS, ROWS = 6, 80
+
+
+def trips(count: int, rows: int = ROWS):
+    return clusters_of(np.repeat(np.arange(count), rows), np.full(count * rows, 5.0), few=2)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000), st.integers(2, 8))
+def test_a_trip_left_out_is_a_fit_without_it(seed, count):
+    """By another way: ridge regression again, without the trip."""
+    rng = np.random.default_rng(seed)
+    clusters, prior_sd, counted = trips(count), np.array([2.0, 0.5, 30.0]), rng.uniform(0.5, 2.0, count * ROWS)
+    x = rng.standard_normal((count * ROWS, 3))
+    y = x @ (prior_sd * rng.standard_normal(3)) + rng.standard_normal(len(x))
+
+    def ridge(rows: np.ndarray) -> np.ndarray:
+        weighed = counted[rows, None] * x[rows]
+        return np.linalg.solve(weighed.T @ x[rows] + np.diag(prior_sd**-2.0), weighed.T @ y[rows])
+
+    every = np.ones(len(x), dtype=bool)
+    found = errors_left_out(x, y - x @ ridge(every), counted, clusters, prior_sd)
+    for k in range(count):
+        own = clusters.ids == k
+        np.testing.assert_allclose(found[own], (y - x @ ridge(~own))[own], rtol=1e-7, atol=1e-9)
+
+
+def autocorrelated(rng: np.random.Generator, count: int, rows: int, rho: float) -> np.ndarray:
+    e = rng.standard_normal((count, rows)) * np.sqrt(1 - rho**2)
+    e[:, 0] /= np.sqrt(1 - rho**2)
+    for t in range(1, rows):
+        e[:, t] += rho * e[:, t - 1]
+    return e
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.5, 0.9])
+def test_sums_are_as_wide_as_their_correlation_makes_them(rho):
+    """(1 + ρ)/(1 − ρ) for long trips, less what a trip's ends lack."""
+    count, rows = 240, 400
+    e = autocorrelated(np.random.default_rng(1), count, rows, rho).ravel()
+    found = spread_of(e, np.zeros(len(e)), np.ones(len(e)), trips(count, rows), np.zeros(count))
+    wanted = (1 + rho) / (1 - rho) - 2 * rho * (1 - rho**rows) / (rows * (1 - rho) ** 2)
+    assert found.together * found.scale**2 == pytest.approx(wanted, rel=0.15)
+    assert found.units == count
+
+
+def test_the_noise_of_a_row_has_its_size_growth_and_tails():
+    rng = np.random.default_rng(2)
+    size = rng.uniform(0.0, 200.0, 40_000)
+    e = np.sqrt(3.0**2 + (0.05 * size) ** 2) * rng.standard_t(4.0, len(size))
+    found = spread_of(e, size, np.ones(len(e)), trips(40, 1000), np.zeros(40))
+    assert found.scale == pytest.approx(3.0, rel=0.1)
+    assert found.growth == pytest.approx(0.05, rel=0.1)
+    assert found.freedom == pytest.approx(4.0, rel=0.2)
+    for level in (0.5, 0.9, 0.99):
+        assert np.mean(np.abs(e) < found.row(level, size)) == pytest.approx(level, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [3, 6, 12])
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_totals_of_new_trips_are_held(count, rho):
+    """Worlds of one unknown coefficient: 90 % of totals that no fit has seen, however few trips there were."""
+    rng = np.random.default_rng(3)
+    held, worlds, rows = 0, 600, 60
+    prior_sd = np.array([1.0])
+    for _ in range(worlds):
+        x = 1.0 + 0.5 * rng.standard_normal((count + 1, rows)) + 0.5 * rng.standard_normal((count + 1, 1))
+        y = x * rng.standard_normal() + autocorrelated(rng, count + 1, rows, rho)
+        old, ys = x[:-1].reshape(-1, 1), y[:-1].ravel()
+        worth = (1 - rho) / (1 + rho)
+        information = worth * float(np.sum(old**2)) + 1.0
+        theta = worth * float(old[:, 0] @ ys) / information
+        clusters = trips(count, rows)
+        error = errors_left_out(old, ys - old[:, 0] * theta, np.full(len(ys), worth), clusters, prior_sd)
+        root = 1.0 / np.sqrt(information)
+        open_sd = np.abs(clusters.sums(old[:, 0])) * root
+        found = spread_of(error, np.zeros(len(ys)), np.ones(len(ys)), clusters, open_sd)
+        half = found.total(0.9, abs(float(np.sum(x[-1]))) * root, np.ones(rows), np.zeros(rows))
+        held += abs(float(np.sum(y[-1] - theta * x[-1]))) <= half
+    assert 0.865 <= held / worlds <= (0.935 if count > 3 else 0.95)  # of three trips a little on the safe side
+
+
+def test_one_trip_is_judged_by_its_blocks_and_two_by_themselves():
+    assert (sums_of(driving(400)).kind, sums_of(driving(400)).count > 1) == ("block", True)
+    assert (sums_of(driving(60, 60)).kind, sums_of(driving(60, 60)).count) == ("trip", 2)
+
+
+def test_an_instruments_fault_is_no_energy():
+    """A row of 100 kWh in one trip: with heavy tails it does not make every total uncertain by 100 kWh."""
+    e = np.random.default_rng(4).standard_normal(8 * ROWS)
+    e[17] = 1e5
+    of = (np.zeros(len(e)), np.ones(len(e)), trips(8), np.zeros(8))
+    plain, robust = (spread_of(e, *of, robust=r).total(0.9, 0.0, np.ones(ROWS), np.zeros(ROWS)) for r in (False, True))
+    assert plain > 1e4
+    assert robust < 100.0
+
+
+def test_a_log_without_any_error_has_an_interval_of_nothing():
+    found = spread_of(np.zeros(4 * ROWS), np.full(4 * ROWS, 50.0), np.ones(4 * ROWS), trips(4), np.zeros(4))
+    assert np.all(np.isfinite(found.row(0.9, np.full(3, 50.0))))
+    assert 0.0 <= found.total(0.9, 0.0, np.ones(ROWS), np.full(ROWS, 50.0)) < 1e-3
+
+
+def test_a_calibrations_own_spread():
+    """Of the kernel: as many sums as trips, a row's noise as it was drawn; with nothing free there is nothing open."""
+    s = driving(*[60] * TRIPS, seed=3)
+    rng = np.random.default_rng(0)
+    clean = np.asarray(truck().predict(padded(s, np.zeros(len(s))).segments, "battery_power_kw"))[: len(s)]
+    rows = padded(s, clean + 2.0 * rng.standard_normal(len(s)))
+    for table in (tabular(), tabular().with_free(**{c.name: False for c in tabular().rows})):
+        fit = calibrate(truck(), table, rows, "battery_power_kw", cluster_rows(s))
+        found, clusters = left_out(fit, rows, "battery_power_kw", np.full(len(s), 5.0))
+        assert (found.units, clusters.kind) == (TRIPS, "trip")
+        assert found.scale == pytest.approx(2.0, rel=0.15)
