@@ -130,7 +130,7 @@ def spread_of(
         return float(np.mean(sums / (open_sd**2 + together * alone))) - 1.0
 
     low, high = LEAST_RATIO, max(2.0 * float(np.max(sums / alone)), 1.0)
-    together = low if excess(low) <= 0 else float(optimize.brentq(excess, low, high))
+    together = low if excess(low) <= 0 else optimize.root_scalar(excess, bracket=(low, high), method="brentq").root
     return Spread(scale, growth, freedom, together, clusters.count)
 
 
