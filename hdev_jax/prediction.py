@@ -62,8 +62,8 @@ def predict(
     The interval holds what the coefficients leave open (their covariance from the `predictive.json` beside a fitted
     sheet, else their sds in the sheet) and the noise of a row: as seen where that fit left trips out, else as in this
     log where it measures the target. A trip's total has the interval that errors of whole trips ask for, by a Student t
-    of as many degrees of freedom as there were trips. **Returns:** the total of each trip with its interval, as
-    text. Raises `InputError`.
+    of as many degrees of freedom as there were trips; of a single trip, its autocorrelation. **Returns:** the total of
+    each trip with its interval, as text. Raises `InputError`.
     """
     import pandas as pd
     from scipy import stats
@@ -102,7 +102,10 @@ def predict(
             compression: Any = "gzip" if str(out).endswith(".gz") else None
             frame.to_csv(temporary, index=False, float_format="%.8g", compression=compression)
     what = f"trip totals, {100 * level:g} % intervals"
-    what += ", without the noise of the rows: not known" if spread is None else f", from {spread.units} training sums"
+    if spread is None:
+        what += ", without the noise of the rows: not known"
+    else:
+        what += f", Student t of {spread.total_freedom:.3g} degrees of freedom"
     lines = _totals(problem, predicted, x, spread, level)
     return "\n".join([what, *lines, f"{len(frame)} rows of {problem.target} -> {out}"])
 

@@ -19,6 +19,8 @@ FEW = 2  # trips from which on a total is judged by trips; of a single one by it
 
 ENOUGH_ROWS = 20_000  # tell the shape of a row's noise; every so many of more
 MOST_FREEDOM = 200.0  # of a Student t that is a normal
+MOST_LAG = 20  # rows: enough to tell what is left of a correlation from a row's own noise
+DECAYS = np.linspace(0.3, 0.99, 70)  # of the correlation, from a row to the next
 FAULT = 6.0  # scales: where outliers are weighed down, a row beyond this is an instrument's fault and no trip's energy
 
 
@@ -28,14 +30,14 @@ class Spread:
 
     A row is off by a Student t of `freedom` degrees whose scale is √(`scale`² + (`growth`·predicted)²), in the target's
     unit. The weighed sum of a trip's rows has `together` times the sum of the squares of those scales as its variance,
-    as seen in `units` sums of training rows, each predicted by a fit without it.
+    which is known to `total_freedom` degrees of freedom: one for each training trip, predicted by a fit without it.
     """
 
     scale: float
     growth: float
     freedom: float
     together: float
-    units: int
+    total_freedom: float
 
     def row(self, level: float, predicted: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
         """Half the interval of each row, the coefficients known."""
@@ -45,12 +47,9 @@ class Spread:
     def total(
         self, level: float, open_sd: float, weight: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
     ) -> float:
-        """Half the interval of the weighed sum of these rows, of which the coefficients leave `open_sd` open.
-
-        A Student t of as many degrees of freedom as sums were squared to find its width.
-        """
+        """Half the interval of the weighed sum of these rows, of which the coefficients leave `open_sd` open."""
         own = self.together * float(np.sum(weight**2 * _square(self.scale, self.growth, predicted)))
-        return float(stats.t.ppf(0.5 + level / 2, self.units) * np.sqrt(open_sd**2 + own))
+        return float(stats.t.ppf(0.5 + level / 2, self.total_freedom) * np.sqrt(open_sd**2 + own))
 
 
 def _square(scale: float, growth: float, predicted: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
@@ -124,14 +123,45 @@ def spread_of(
     square = _square(scale, growth, predicted)
     if robust:
         error = np.clip(error, -FAULT * np.sqrt(square), FAULT * np.sqrt(square))
+    # a scale that few trips have told is itself uncertain: tails of its own (Satterthwaite 1946, over trips)
+    told = clusters.sums(error**2 / square)
+    known = 2.0 * np.sum(told) ** 2 / max(len(told) * float(np.var(told, ddof=1)), 1e-12) if len(told) > 1 else 2.1
+    freedom = 1.0 / (1.0 / freedom + 1.0 / max(float(known), 2.1))
+    if clusters.kind == "block":
+        together, total_freedom = _of_one_trip(error / np.sqrt(square), clusters.count)
+        return Spread(scale, growth, freedom, together, total_freedom)
     sums, alone = clusters.sums(weight * error) ** 2, clusters.sums(weight**2 * square)
 
     def excess(together: float) -> float:
         return float(np.mean(sums / (open_sd**2 + together * alone))) - 1.0
 
-    low, high = LEAST_RATIO, max(2.0 * float(np.max(sums / alone)), 1.0)
+    low, high = LEAST_RATIO, max(2.0 * float(np.max(sums / np.maximum(alone, 1e-300))), 1.0)
     together = low if excess(low) <= 0 else optimize.root_scalar(excess, bracket=(low, high), method="brentq").root
-    return Spread(scale, growth, freedom, together, clusters.count)
+    return Spread(scale, growth, freedom, float(together), float(clusters.count))
+
+
+def _of_one_trip(z: Float[np.ndarray, " row"], blocks: int) -> tuple[float, float]:
+    """How a trip's errors add up, from the one trip that there is: its autocorrelation, which no block of it is long
+    enough to show. An AR(1) with white noise on it, correlations A·ρᵏ, makes sums 1 − A + A·(1 + ρ)/(1 − ρ) times as
+    wide, as a variance, as independent rows; the trip is worth so many rows fewer.
+
+    Correlations of a short series come out too small, by what its mean is uncertain (Kendall 1954): added again.
+    """
+    n, square = len(z), float(np.mean(z**2))
+    lags = np.arange(1, min(MOST_LAG, n // 5) + 1)
+    if not len(lags) or not square > 0:
+        return 1.0, 1.0
+    seen = np.array([np.mean(z[:-k] * z[k:]) for k in lags]) / square
+    powers = DECAYS[:, None] ** lags
+    times = 1.0
+    for _ in range(4):
+        r = (seen + times / n) / (1.0 + times / n)
+        if r[0] < 2.0 / np.sqrt(n):  # as white as can be told
+            return square, float(blocks)
+        share = np.clip(powers @ r / np.sum(powers**2, axis=1), 0.0, 1.0)
+        best = int(np.argmin(np.sum((r - share[:, None] * powers) ** 2, axis=1)))
+        times = 1.0 + share[best] * 2.0 * DECAYS[best] / (1.0 - DECAYS[best])
+    return square * float(times), float(np.clip(n / times, 1.0, blocks))
 
 
 def _of_rows(error: np.ndarray, predicted: np.ndarray) -> tuple[float, float, float]:

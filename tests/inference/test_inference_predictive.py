@@ -52,7 +52,7 @@ def test_sums_are_as_wide_as_their_correlation_makes_them(rho):
     found = spread_of(e, np.zeros(len(e)), np.ones(len(e)), trips(count, rows), np.zeros(count))
     wanted = (1 + rho) / (1 - rho) - 2 * rho * (1 - rho**rows) / (rows * (1 - rho) ** 2)
     assert found.together * found.scale**2 == pytest.approx(wanted, rel=0.15)
-    assert found.units == count
+    assert found.total_freedom == count
 
 
 def test_the_noise_of_a_row_has_its_size_growth_and_tails():
@@ -96,6 +96,20 @@ def test_one_trip_is_judged_by_its_blocks_and_two_by_themselves():
     assert (sums_of(driving(60, 60)).kind, sums_of(driving(60, 60)).count) == ("trip", 2)
 
 
+@pytest.mark.parametrize("white", [0.0, 1.0])
+def test_the_second_half_of_a_single_drive_is_held(white):
+    """Errors that last as long as a tenth of the drive, alone and under as much noise of single rows."""
+    rng = np.random.default_rng(5)
+    held, worlds, rows = 0, 500, 250
+    clusters = clusters_of(np.zeros(rows, dtype=int), np.full(rows, 12.0), few=2)
+    assert clusters.kind == "block"
+    for _ in range(worlds):
+        e = autocorrelated(rng, 1, 2 * rows, 0.92)[0] + white * rng.standard_normal(2 * rows)
+        found = spread_of(e[:rows], np.zeros(rows), np.ones(rows), clusters, np.zeros(clusters.count))
+        held += abs(float(np.sum(e[rows:]))) <= found.total(0.9, 0.0, np.ones(rows), np.zeros(rows))
+    assert 0.865 <= held / worlds <= 0.935
+
+
 def test_an_instruments_fault_is_no_energy():
     """A row of 100 kWh in one trip: with heavy tails it does not make every total uncertain by 100 kWh."""
     e = np.random.default_rng(4).standard_normal(8 * ROWS)
@@ -121,5 +135,5 @@ def test_a_calibrations_own_spread():
     for table in (tabular(), tabular().with_free(**{c.name: False for c in tabular().rows})):
         fit = calibrate(truck(), table, rows, "battery_power_kw", cluster_rows(s))
         found, clusters = left_out(fit, rows, "battery_power_kw", np.full(len(s), 5.0))
-        assert (found.units, clusters.kind) == (TRIPS, "trip")
+        assert (found.total_freedom, clusters.kind) == (TRIPS, "trip")
         assert found.scale == pytest.approx(2.0, rel=0.15)
