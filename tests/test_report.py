@@ -119,7 +119,9 @@ def fake(verdict="effects_found", trips=6, rows=120, names=None, synthetic=True,
         "subsets": {"above 2 m/s": {"before": before_block["test"], "after": after_block["test"]}},
         "excluded": [{"id": "road_surface", "why": "--exclude"}],
     }
-    columns = {"time_s": time_s, "duration_s": duration, "distance_m": speed * duration, "measured": measured}
+    distance = speed * duration
+    columns = {"time_s": time_s, "duration_s": duration, "distance_m": distance, "measured": measured}
+    columns["distance_since_start_m"] = (np.cumsum(distance.reshape(trips, rows), axis=1)).ravel() - 0.5 * distance
     return ReportData(
         summary=summary,
         vehicle="truck, 34 t",

@@ -38,8 +38,8 @@ class Problem:
         return UNITS[self.target]
 
     def rows(self, trips: Sequence[int]) -> np.ndarray:
-        """Mask of these trips' rows."""
-        return np.isin(self.segments.trip, trips)
+        """Mask of these trips' rows, by their places among the log's names."""
+        return np.isin(self.log.trip, trips)
 
     def weight(self) -> np.ndarray:
         """What each row weighs in a sum."""

@@ -22,9 +22,9 @@ class ReportData:
     `parameters_fitted`, `subsets` (name -> `before`, `after` metrics), `excluded` (`id`, `why`). For a calibration:
     `target`, `baseline`, `before`, and optionally `method`.
 
-    `rows`: `trip` (index into `trip_names`), `time_s`, `duration_s`, `distance_m`, `measured`, `before`, `after` (in
-    `unit`), `test` and `used` (bool; a row that is used and no test row was trained on). Only `trip`, `time_s`,
-    `duration_s`, `distance_m`, `measured` and `before` are needed for a calibration.
+    `rows`: `trip` (index into `trip_names`), `time_s`, `duration_s`, `distance_m`, `distance_since_start_m` (to the
+    middle of the row), `measured`, `before`, `after` (in `unit`), `test` and `used` (bool; a row that is used and no
+    test row was trained on). `after`, `test` and `used` are not needed for a calibration.
     `channels`: columns of the log by their contract names, as long as the rows.
     `breakdown`: `before` and `after` -> effect id -> kWh over the test trips; may be empty.
     `ledger`: `kind`, `where` (or `file` and `trip`), `column`, `count`, `reason`.

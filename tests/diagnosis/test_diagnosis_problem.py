@@ -1,0 +1,72 @@
+"""What a log, a sheet and a target come to: what the target would leak, and a trip that is trained on and tested."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hdev_jax.diagnosis.diagnose import Diagnosis
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.split import split_trips
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import calibrate, cluster_rows, padded, predict
+from hdev_jax.inference.sheet import Sheet, read_sheet
+from hdev_jax.logs import Log, read_log
+from hdev_jax.physics import LIBRARY
+from hdev_jax.report.build import of_diagnosis
+
+
+def read(folder: Path, change: Callable[[pd.DataFrame], None] = lambda _: None, **options) -> tuple[Log, Sheet]:
+    """A synthetic log and its sheet as they are read from files, the table changed before it is written."""
+    made = synthetic_log(seed=3, rows_per_trip=90, **options)
+    change(made.frame)
+    files = made.write(folder, truth=False)
+    return read_log([files["log"]]), read_sheet(files["sheet"])
+
+
+# --- one trip --------------------------------------------------------------------------------------------------------
+
+ACROSS_ROWS = (
+    LIBRARY["tyre_warmup"](excess=0.4, distance_m=1e4),  # the distance since the start
+    LIBRARY["brake_drag"](force_n=300.0, tau_s=60.0),  # the time since the brake was released
+    LIBRARY["sampling_filter"](tap_1=0.1, tap_2=0.0, tau_s=30.0),  # neighbours, and a lag from the first row on
+)
+
+
+def test_one_trip_goes_on_where_its_test_part_begins(tmp_path):
+    """Tyres do not cool down there, nor do filters begin again: every row is predicted as in the trip undivided."""
+    log, sheet = read(tmp_path, trips=1)
+    split, whole = split_trips(log), prepare(log, sheet)
+    parts = prepare(split.log, sheet)
+    car = whole.vehicle.plus(*ACROSS_ROWS)
+    expected = whole.predict(car)
+    np.testing.assert_array_equal(parts.predict(car), expected)
+    train, test = parts.rows(split.train), parts.rows(split.test)
+    assert train.sum() > test.sum() > 0
+    np.testing.assert_array_equal(train, ~test)
+    # what is fitted sees the first part alone
+    rows = padded(parts.segments.take(train), parts.measured[train])
+    alone = np.asarray(predict(car, rows.segments, parts.target))[: rows.rows]
+    np.testing.assert_allclose(alone[:-1], expected[train][:-1], rtol=1e-12)
+
+
+def test_the_page_shows_the_test_part_as_a_part_of_its_trip(tmp_path):
+    """Its breakdown adds up to its prediction, and the distance since the start is the trip's."""
+    log, sheet = read(tmp_path, trips=1)
+    split = split_trips(log)
+    problem = prepare(split.log, sheet)
+    train, test = problem.rows(split.train), problem.rows(split.test)
+    segments = problem.segments.take(train)
+    rows = padded(segments, problem.measured[train])
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, cluster_rows(segments))
+    car = fit.vehicle.plus(*ACROSS_ROWS)
+    predicted = problem.predict(car)
+    result = Diagnosis(problem, split, {"target": problem.target}, car, car, fit, predicted, predicted, {})
+    data = of_diagnosis(result, "", 0.0)
+    assert sum(data.breakdown["after"].values()) == pytest.approx(np.sum(predicted[test]) / 1e3, rel=1e-9)
+    since = data.row("distance_since_start_m")
+    assert np.all(np.diff(since) >= 0)
+    assert since[-1] == pytest.approx(np.sum(log.segments.distance_m) - 0.5 * log.segments.distance_m[-1])
+    assert {data.trip_names[i] for i in data.row("trip")[test]} == set(split.names(split.test))
