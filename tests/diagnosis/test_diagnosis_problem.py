@@ -1,6 +1,7 @@
 """What a log, a sheet and a target come to: what the target would leak, and a trip that is trained on and tested."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,41 @@ def read(folder: Path, change: Callable[[pd.DataFrame], None] = lambda _: None, 
     change(made.frame)
     files = made.write(folder, truth=False)
     return read_log([files["log"]]), read_sheet(files["sheet"])
+
+
+# --- what the target would leak --------------------------------------------------------------------------------------
+
+
+def with_current(frame: pd.DataFrame) -> None:
+    frame["current_a"] = frame.energy_wh * 3600.0 / frame.duration_s / frame.voltage_v
+
+
+@pytest.mark.parametrize("target", ["energy_wh", "battery_power_kw"])
+def test_the_batterys_current_is_no_input(target, tmp_path):
+    """It is the measured power over the voltage, noise and all: whatever may read it explains everything."""
+    log, sheet = read(tmp_path, with_current, trips=2)
+    assert log.segments.has("current_a")
+    problem = prepare(log, sheet, target)
+    assert set(log.segments.channels) - set(problem.segments.channels) == {"current_a"}
+    assert [n for n in problem.notes if "current_a" in n and target in n]
+
+
+def test_a_log_without_current_is_as_it_was(tmp_path):
+    log, sheet = read(tmp_path, trips=2)
+    problem = prepare(log, sheet)
+    assert set(problem.segments.channels) == set(log.segments.channels)
+    assert not [n for n in problem.notes if "current_a" in n]
+
+
+def test_a_traction_force_is_where_the_chain_to_a_torque_begins(tmp_path):
+    """It lies before the torque: it is no leak but the model's input. The torque itself and the current are."""
+    log, sheet = read(tmp_path, trips=2)
+    n = len(log)
+    here = {"motor_torque_nm": np.ones(n), "traction_force_n": np.ones(n), "current_a": np.ones(n)}
+    sheet = replace(sheet, gear_ratios=(5.0,), wheel_radius_m=0.5)
+    problem = prepare(replace(log, segments=log.segments.with_channels(**here)), sheet, "motor_torque_nm")
+    assert problem.vehicle.entry == "wheel"
+    assert {k for k in here if problem.segments.has(k)} == {"traction_force_n"}
 
 
 # --- one trip --------------------------------------------------------------------------------------------------------
