@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax.diagnosis.facts import GROUPS
 from hdev_jax.diagnosis.metrics import sum_weight
 from hdev_jax.inference import ParameterTable, padded, predict
 from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
@@ -77,6 +78,9 @@ def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured:
         notes.append("traction_force_n is not logged: it is motor torque · ratio / wheel radius · η^sign(torque)")
     if log.segments.has("current_a"):
         notes.append(f"current_a is left aside: it follows from {name} and explains nothing of it")
+    for group in (g for g in GROUPS if segments.has(g)):
+        if below := int(np.sum(np.asarray(segments.channels[group]) <= -1)):
+            notes.append(f"{group} is below 0 in {below} rows: a coefficient by {group} takes them for 0")
     if not segments.has("grade_rad") and built.vehicle.entry == "road":
         notes.append("the log has no slope: the declared model takes the road as flat")
     return Problem(log, sheet, name, segments, measured, built.vehicle, built.table, tuple(notes))

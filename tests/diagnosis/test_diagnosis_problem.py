@@ -8,7 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hdev_jax.diagnosis.candidates import columns
 from hdev_jax.diagnosis.diagnose import Diagnosis
+from hdev_jax.diagnosis.facts import facts_of
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
@@ -60,6 +62,26 @@ def test_a_traction_force_is_where_the_chain_to_a_torque_begins(tmp_path):
     problem = prepare(replace(log, segments=log.segments.with_channels(**here)), sheet, "motor_torque_nm")
     assert problem.vehicle.entry == "wheel"
     assert {k for k in here if problem.segments.has(k)} == {"traction_force_n"}
+
+
+# --- ids below 0 -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channel", ["gear", "road_surface"])
+def test_a_group_below_0_is_told_and_counts_as_0(channel, tmp_path):
+    """A reverse gear of −1, a surface that is not known: no group of its own, and no column for one."""
+    kinds = np.where(np.arange(180) % 3 == 0, -1.0, np.where(np.arange(180) % 3 == 1, 1.0, 2.0))
+    log, sheet = read(tmp_path, lambda f: f.__setitem__(channel, kinds), trips=2)
+    problem = prepare(log, sheet)
+    assert [n for n in problem.notes if n.startswith(f"{channel} is below 0 in 60 rows")]
+    facts = facts_of(problem.segments)
+    assert facts.seen(channel) == [0, 1, 2]
+    effect = {"gear": "gear_efficiency", "road_surface": "road_surface"}[channel]
+    rows = padded(problem.segments, problem.measured)
+    candidates, made, _ = columns(problem.vehicle, [LIBRARY[effect]], rows.segments, rows.rows, problem.target)
+    at = {g: k for c in candidates for g, k in zip(c.groups, c.columns, strict=True)}
+    assert set(at) == {1, 2}  # against 0, the first of the commonest
+    assert not np.any(made[kinds < 0][:, list(at.values())])
 
 
 # --- one trip --------------------------------------------------------------------------------------------------------
