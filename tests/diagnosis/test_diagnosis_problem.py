@@ -18,6 +18,9 @@ from hdev_jax.inference import calibrate, cluster_rows, padded, predict
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.logs import Log, read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.physics.brakes import BrakeDrag
+from hdev_jax.physics.sensors import SamplingFilter
+from hdev_jax.physics.tyres import TyreWarmup
 from hdev_jax.report.build import of_diagnosis
 
 
@@ -87,9 +90,9 @@ def test_a_group_below_0_is_told_and_counts_as_0(channel, tmp_path):
 # --- one trip --------------------------------------------------------------------------------------------------------
 
 ACROSS_ROWS = (
-    LIBRARY["tyre_warmup"](excess=0.4, distance_m=1e4),  # the distance since the start
-    LIBRARY["brake_drag"](force_n=300.0, tau_s=60.0),  # the time since the brake was released
-    LIBRARY["sampling_filter"](tap_1=0.1, tap_2=0.0, tau_s=30.0),  # neighbours, and a lag from the first row on
+    TyreWarmup(excess=0.4, distance_m=1e4),  # the distance since the start
+    BrakeDrag(force_n=300.0, tau_s=60.0),  # the time since the brake was released
+    SamplingFilter(tap_1=0.1, tap_2=0.0, tau_s=30.0),  # neighbours, and a lag from the first row on
 )
 
 
