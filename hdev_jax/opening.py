@@ -4,23 +4,29 @@ import difflib
 import hashlib
 import importlib.util
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates import FIXED, plan_of
+from hdev_jax.diagnosis.facts import facts_of
 from hdev_jax.diagnosis.problem import Problem, prepare
+from hdev_jax.diagnosis.programs import computed
 from hdev_jax.diagnosis.split import Split, split_trips
 from hdev_jax.errors import InputError
+from hdev_jax.inference import padded
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.physics import LIBRARY, Effect, library
+from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
+from hdev_jax.physics.effect import STAGES
 from hdev_jax.rundir import Run
 
-__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "known_effects", "opened"]
+__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "known_effects", "opened", "tried"]
 
 Paths = Sequence[str | Path]
 
@@ -44,10 +50,62 @@ def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
     ]  # fmt: skip
     if not own:
         raise InputError(f"--effects {file}: defines no subclass of hdev_jax.physics.Effect with an id")
+    for c in own:
+        if why := _malformed(c):
+            raise InputError(f"--effects {file}: class {c.__name__}: {why}")
     try:
         return library(own)
     except ValueError as e:
         raise InputError(f"--effects {file}: {e}") from e
+
+
+def _malformed(effect: type[Effect]) -> str | None:
+    """Why a user's class is no effect, in one phrase; None where it is one."""
+    stage, parameters = getattr(effect, "stage", None), effect.parameters
+    if not (isinstance(effect.id, str) and effect.id.isascii() and effect.id.isidentifier()):
+        return f"id is {effect.id!r}; letters, digits and underscores are expected"
+    if stage not in STAGES:
+        return f"stage is {stage!r}; one of {', '.join(STAGES)} is expected"
+    if not isinstance(getattr(effect, "equation", None), str):
+        return "equation is missing; a line of text is expected"
+    if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
+        return "parameters is something else than a tuple of hdev_jax.physics.Parameter"
+    if all(p.kind in FIXED for p in parameters):
+        return "parameters holds no size and no limit, so nothing of it could be found"
+    try:
+        at_null(effect)
+    except Exception as e:
+        return f"cannot be made with its parameters ({', '.join(p.name for p in parameters)}): {type(e).__name__}: {e}"
+    return None
+
+
+def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None) -> None:
+    """Work out the columns of a user's own effects on every row of the log, before anything is fitted.
+
+    Raises `InputError` that names the class, for one that fails there or does not give a number in every row.
+    """
+    own = [c for k, c in known.items() if k not in LIBRARY]
+    if not own:
+        return
+    car = problem.vehicle.minus(*(c.id for c in own if problem.vehicle.has(c.id)))
+    rows, facts = padded(problem.segments, problem.measured), facts_of(problem.segments)
+    for c in own:
+        where = f"--effects {file}: class {c.__name__}"
+        bad = np.zeros(rows.rows, dtype=bool)
+        try:
+            plan = plan_of(car, [c], facts, problem.target, searched=True)
+            for column in computed(plan.recipes, rows.segments, problem.target):
+                bad |= ~np.isfinite(column[: rows.rows])
+        except Exception as e:
+            hint = "; every channel that it reads belongs in its needs" if isinstance(e, KeyError) else ""
+            raise InputError(f"{where}: fails on this log: {type(e).__name__}: {e}{hint}") from e
+        if bad.any():
+            first = int(np.argmax(bad))
+            trip, at = problem.log.trip_names[problem.log.trip[first]], problem.segments.time_s[first]
+            raise InputError(
+                f"{where}: it or its slope is no finite number in {bad.sum()} of {rows.rows} rows, the first in trip "
+                f"{trip} at {at:g} s; a number is expected in every row, also of a branch that is not taken"
+            )
 
 
 def chosen_effects(
@@ -96,11 +154,13 @@ def opened(
     seed: int,
 ) -> Opening:
     """Read the logs and the sheet, bring them together and split the trips. Raises `InputError`."""
-    sheet = read_sheet(vehicle, library=known_effects(effects))
+    known = known_effects(effects)
+    sheet = read_sheet(vehicle, library=known)
     with progress.busy("reading the logs"):
         log = read_log(list(logs), adapter)
         split = split_trips(log, train_trips, test_trips)
         problem = prepare(split.log, sheet, target)
+    tried(problem, known, effects)
     config = {
         "verb": verb,
         "logs": [str(p) for p in logs],

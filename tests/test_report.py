@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hdev_jax import report
+from hdev_jax.diagnosis.metrics import metrics as errors
 from hdev_jax.report import ReportData, answer, statistics, words, write_calibration_report, write_report
 from hdev_jax.report import data as report_data
 from hdev_jax.report.residuals import panels
@@ -118,7 +119,9 @@ def fake(verdict="effects_found", trips=6, rows=120, names=None, synthetic=True,
         "subsets": {"above 2 m/s": {"before": before_block["test"], "after": after_block["test"]}},
         "excluded": [{"id": "road_surface", "why": "--exclude"}],
     }
-    columns = {"time_s": time_s, "duration_s": duration, "distance_m": speed * duration, "measured": measured}
+    distance = speed * duration
+    columns = {"time_s": time_s, "duration_s": duration, "distance_m": distance, "measured": measured}
+    columns["distance_since_start_m"] = (np.cumsum(distance.reshape(trips, rows), axis=1)).ravel() - 0.5 * distance
     return ReportData(
         summary=summary,
         vehicle="truck, 34 t",
@@ -337,6 +340,18 @@ def test_trips_of_a_diagnosis_are_those_of_its_json():
         expected = metrics(data.rows["after"][rows], data.rows["measured"][rows])
         assert lines[name].after["pe_percent"] == pytest.approx(expected["pe_percent"])
         assert lines[name].total == pytest.approx(data.rows["measured"][rows].sum() / 1000)
+
+
+def test_a_mean_torque_is_one_by_distance_on_the_page_as_in_the_diagnosis():
+    """One weight for sums everywhere: a trip's share of error is the diagnosis's own, and standing still adds none."""
+    data = replace(fake(), unit="Nm")
+    data.summary["target"] = "motor_torque_nm"
+    data.rows["distance_m"] = np.where(data.rows["time_s"] < 300.0, 0.0, data.rows["distance_m"])
+    rows = np.flatnonzero(data.rows["trip"] == 0)
+    measured, predicted, distance = (data.rows[k][rows] for k in ("measured", "before", "distance_m"))
+    expected = errors(measured, predicted, distance)["pe_percent"]
+    assert report_data.metrics(data, rows, "before")["pe_percent"] == pytest.approx(expected)
+    assert report_data.total(data, rows) == pytest.approx(np.sum(measured * distance) / np.sum(distance))
 
 
 def test_channels_that_matter_come_first_and_constant_ones_not_at_all():

@@ -15,6 +15,7 @@ import pytest
 
 from hdev_jax import cli
 from hdev_jax.fleet import SyntheticLog, synthetic_log
+from hdev_jax.opening import opened
 from hdev_jax.rundir import Run
 
 CHECKER = Path(__file__).parents[2] / "shared" / "check_diagnosis.py"
@@ -427,6 +428,16 @@ def test_effects_that_do_not_exist(options, words, given, out, capsys):
         ("import no_such_module_at_all\n", ["no_such_module_at_all"]),
         ("x = 1\n", ["no subclass"]),
         (USER_EFFECT.replace("slow_drift", "headwind"), ["headwind", "in the library already"]),
+        (USER_EFFECT.replace("slow_drift", "slow.drift"), ["SlowDrift", "'slow.drift'", "letters"]),
+        (USER_EFFECT.replace('"battery"', '"gearbox"'), ["SlowDrift", "'gearbox'", "driveline"]),
+        (USER_EFFECT.replace("    equation", "    formula"), ["SlowDrift", "equation"]),
+        (USER_EFFECT.replace('(Parameter("w_per_s", "W/s", 0.0, 1.0, 0.0, 100.0),)', "()"), ["SlowDrift", "no size"]),
+        (USER_EFFECT.replace('(Parameter("w_per_s", "W/s", 0.0, 1.0, 0.0, 100.0),)', '("k",)'), ["tuple", "Parameter"]),
+        (USER_EFFECT.replace("    w_per_s: Any\n", ""), ["SlowDrift", "w_per_s"]),
+        # what only shows on the log itself
+        (USER_EFFECT.replace("row.time_s", 'row.channels["oil_temp_c"]'), ["SlowDrift", "'oil_temp_c'", "needs"]),
+        (USER_EFFECT.replace("* row.time_s", "/ row.time_s"), ["SlowDrift", "9 of 720 rows", "trip T01 at 0 s"]),
+        (USER_EFFECT.replace("row.time_s", "(1, 2)"), ["SlowDrift", "fails on this log"]),
     ],
 )
 def test_a_file_of_effects_that_is_none(text, words, given, tmp_path, out, capsys):
@@ -435,6 +446,15 @@ def test_a_file_of_effects_that_is_none(text, words, given, tmp_path, out, capsy
     line = refused(capsys, "diagnose", *given, "--effects", effect, "--out", out)
     assert all(w in line for w in ("mine.py", *words)), line
     assert not out.exists()
+
+
+def test_an_effect_whose_channel_is_not_logged_is_left_out(given, tmp_path):
+    """It says so in its needs: nothing of it is worked out, and the log is not to blame."""
+    reads = USER_EFFECT.replace("row.time_s", 'row.channels["oil_temp_c"]')
+    effect = tmp_path / "mine.py"
+    effect.write_text(reads.replace("    equation", '    needs: ClassVar = ("oil_temp_c",)\n    equation'))
+    start = opened("diagnose", [given[0]], given[2], None, None, None, None, effect, 0)
+    assert "slow_drift" in start.sheet.library
 
 
 @pytest.mark.parametrize(

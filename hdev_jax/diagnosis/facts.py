@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from hdev_jax.physics import most_group
 from hdev_jax.segments import Segments
 
-__all__ = ["Facts", "facts_of", "merged", "thinned"]
+__all__ = ["GROUPS", "Facts", "facts_of", "merged", "thinned"]
 
 GROUPS = ("gear", "road_surface")  # channels that a coefficient may be grouped by
 MOST_STEPS = 24  # places for a change that stays: beyond, every few trips, and refined about the best
@@ -71,7 +71,8 @@ def facts_of(segments: Segments, rows: int | None = None) -> Facts:
     for name in GROUPS:
         if part.has(name):
             x = np.asarray(part.channels[name], dtype=float)
-            ids, counts = np.unique(x[np.isfinite(x)].astype(int), return_counts=True)
+            # an id below 0 (reverse, unknown) takes what 0 has: `Grouped.at`
+            ids, counts = np.unique(np.maximum(x[np.isfinite(x)].astype(int), 0), return_counts=True)
             groups[name] = {int(k): int(c) for k, c in zip(ids, counts, strict=True)}
     row_s = float(np.median(np.asarray(part.duration_s)))
     return Facts(segments.take(np.arange(1)), np.unique(np.asarray(part.trip)), n, row_s, groups, most_group(part))

@@ -9,7 +9,10 @@ __all__ = ["metrics", "sum_weight"]
 
 
 def sum_weight(target: str, duration_s: np.ndarray, distance_m: np.ndarray) -> Float[np.ndarray, " row"]:
-    """What a row weighs in a sum: power by duration, force and torque by distance, energy as it is."""
+    """What a row weighs in a sum: power by duration, force and torque by distance, energy as it is.
+
+    A torque turns with the wheels: by distance its sum is work, of one gear, and standing still adds nothing.
+    """
     if target == "energy_wh":
         return np.ones(len(duration_s))
     return np.asarray(duration_s if target == "battery_power_kw" else distance_m, dtype=float)

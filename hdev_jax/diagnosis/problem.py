@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax.diagnosis.facts import GROUPS
 from hdev_jax.diagnosis.metrics import sum_weight
 from hdev_jax.inference import ParameterTable, padded, predict
 from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
@@ -16,6 +17,14 @@ from hdev_jax.segments import Segments
 
 __all__ = ["UNITS", "Problem", "prepare"]
 
+# The target itself and what follows from it: as an input it would tell the target, of the battery with its noise, for
+# the current is the measured power over the voltage.
+_FOLLOWS = {
+    "energy_wh": ("current_a",),
+    "battery_power_kw": ("current_a",),
+    "motor_torque_nm": ("motor_torque_nm", "current_a"),
+    "traction_force_n": ("traction_force_n", "motor_torque_nm", "current_a"),
+}
 UNITS = {"energy_wh": "Wh", "battery_power_kw": "kW", "motor_torque_nm": "Nm", "traction_force_n": "N"}
 
 
@@ -38,8 +47,8 @@ class Problem:
         return UNITS[self.target]
 
     def rows(self, trips: Sequence[int]) -> np.ndarray:
-        """Mask of these trips' rows."""
-        return np.isin(self.segments.trip, trips)
+        """Mask of these trips' rows, by their places among the log's names."""
+        return np.isin(self.log.trip, trips)
 
     def weight(self) -> np.ndarray:
         """What each row weighs in a sum."""
@@ -62,15 +71,16 @@ def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured:
         measured = np.asarray(traction_force_from_torque(log.segments, sheet))
     else:
         measured = log.target(name) if need_measured else np.zeros(len(log))
-    segments = log.segments
-    if name == "traction_force_n":
-        segments = segments.without("traction_force_n", "motor_torque_nm")
-    elif name == "motor_torque_nm":
-        segments = segments.without("motor_torque_nm")
+    segments = log.segments.without(*_FOLLOWS[name])
     built = sheet.build(segments, choose_entry(segments, name), name, vehicle_names=log.vehicle_names)
     notes = list(built.notes)
     if derived:
         notes.append("traction_force_n is not logged: it is motor torque · ratio / wheel radius · η^sign(torque)")
+    if log.segments.has("current_a"):
+        notes.append(f"current_a is left aside: it follows from {name} and explains nothing of it")
+    for group in (g for g in GROUPS if segments.has(g)):
+        if below := int(np.sum(np.asarray(segments.channels[group]) <= -1)):
+            notes.append(f"{group} is below 0 in {below} rows: a coefficient by {group} takes them for 0")
     if not segments.has("grade_rad") and built.vehicle.entry == "road":
         notes.append("the log has no slope: the declared model takes the road as flat")
     return Problem(log, sheet, name, segments, measured, built.vehicle, built.table, tuple(notes))

@@ -1,6 +1,6 @@
 """How a candidate's column is computed: a vehicle with effects at their null, and a derivative or difference of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from hdev_jax.physics import Effect, Grouped, Vehicle
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["Program", "Recipe", "written"]
+__all__ = ["Program", "Recipe", "computed", "written"]
 
 Structure = tuple[tuple[str, int | None, float, float], ...]
 
@@ -73,18 +73,23 @@ class Recipe:
     tangent: Float[np.ndarray, " parameter"] | None
 
 
-def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: Target) -> None:
-    """Write the recipes' columns of padded segments into `out` [row, column]; what is no number counts as 0."""
+def computed(recipes: Sequence[Recipe], segments: Segments, target: Target) -> Iterator[Float[np.ndarray, " row"]]:
+    """The recipes' columns of padded segments, one after the other, as they are: not all need be numbers."""
     segments = jax.tree.map(jnp.asarray, segments)
     base: dict[int, np.ndarray] = {}
-    for k, r in enumerate(recipes):
+    for r in recipes:
         p = r.program
         if r.tangent is not None:
-            column = np.asarray(_slope(p.car, p.structure, target, segments, r.values, r.tangent))
+            yield np.asarray(_slope(p.car, p.structure, target, segments, r.values, r.tangent))
         else:
             if id(p) not in base:
                 base[id(p)] = np.asarray(_predict(p.car, p.structure, target, segments, p.null))
-            column = np.asarray(_predict(p.car, p.structure, target, segments, r.values)) - base[id(p)]
+            yield np.asarray(_predict(p.car, p.structure, target, segments, r.values)) - base[id(p)]
+
+
+def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: Target) -> None:
+    """Write the recipes' columns of padded segments into `out` [row, column]; what is no number counts as 0."""
+    for k, column in enumerate(computed(recipes, segments, target)):
         out[:, k] = np.nan_to_num(column, posinf=0.0, neginf=0.0)
 
 

@@ -15,7 +15,7 @@ LAST_THIRD = " (last third)"  # what the test part of a single trip is called af
 
 @dataclass(frozen=True)
 class Split:
-    """Trip ids by use; they index `log.trip_names`. `log` is the log they belong to: one trip alone becomes two."""
+    """Trip ids by use; they index `log.trip_names`. `log` is the log they belong to: one trip alone has two parts."""
 
     log: Log
     train: tuple[int, ...]
@@ -68,11 +68,13 @@ def _ids(log: Log, names: Sequence[str] | None, option: str) -> tuple[int, ...]:
 
 
 def _halves(log: Log) -> Log:
-    """One trip as two: its first two thirds and its last third by time."""
+    """One trip in two parts: its first two thirds and its last third by time.
+
+    It stays one trip in the segments: what builds up since its start goes on in the second part.
+    """
     seconds = np.cumsum(log.segments.duration_s)
     late = seconds > seconds[-1] * 2.0 / 3.0
     if late.all() or not late.any():
         raise InputError(f"trip {log.trip_names[0]!r} is too short to be split into training and test; add trips")
     name = log.trip_names[0]
-    segments = replace(log.segments, trip=np.where(late, 1, 0).astype(np.int32))
-    return replace(log, segments=segments, trip_names=(f"{name} (first two thirds)", f"{name}{LAST_THIRD}"))
+    return replace(log, part=late.astype(np.int32), trip_names=(f"{name} (first two thirds)", f"{name}{LAST_THIRD}"))

@@ -232,7 +232,7 @@ def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
     size = np.sort(np.abs(problem.measured))
     if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) <= 3.0 * size[-2]:
         return []
-    trip = problem.log.trip_names[int(np.asarray(problem.segments.trip)[worst])]
+    trip = problem.log.trip_names[int(problem.log.trip[worst])]
     at = float(np.asarray(problem.segments.time_s)[worst])
     return [
         f"one row alone holds {100 * share:.0f} % of the declared model's squared error: trip {trip} at {at:.6g} s, "

@@ -24,8 +24,9 @@ class Log:
     """A log in memory, SI, float64 on the host.
 
     **Fields:** `segments`; `measured`, what is positive out of the battery and kept out of the channels
-    (`battery_power_w`, `energy_wh`); `trip_names[segments.trip[i]]` and `vehicle_names[segments.vehicle[i]]` name
-    row i; `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from.
+    (`battery_power_w`, `energy_wh`); `trip_names[trip[i]]` and `vehicle_names[segments.vehicle[i]]` name row i;
+    `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from; `part`,
+    where one trip is told apart into several: the part that each row is in, in the place of its trip among the names.
     """
 
     segments: Segments
@@ -36,9 +37,15 @@ class Log:
     columns: tuple[ColumnInfo, ...] = ()
     sampled: bool = False
     files: tuple[str, ...] = ()
+    part: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.segments)
+
+    @property
+    def trip(self) -> np.ndarray:
+        """What each row is called, as an index of `trip_names`: its trip, or the part of it."""
+        return np.asarray(self.segments.trip if self.part is None else self.part)
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -91,12 +98,13 @@ class Log:
 
     def select(self, trips: Sequence[int]) -> "Log":
         """The rows of these trips (by id); ids and names stay as they are."""
-        return self.take(np.isin(np.asarray(self.segments.trip), np.asarray(list(trips), dtype=np.int64)))
+        return self.take(np.isin(self.trip, np.asarray(list(trips), dtype=np.int64)))
 
     def take(self, rows: np.ndarray) -> "Log":
         """Rows by mask or index."""
         measured = {k: v[rows] for k, v in self.measured.items()}
-        return replace(self, segments=self.segments.take(rows), measured=measured)
+        part = None if self.part is None else self.part[rows]
+        return replace(self, segments=self.segments.take(rows), measured=measured, part=part)
 
     def trip_id(self, name: str) -> int:
         """The id of a trip by its name. Raises `InputError` with the near name."""
@@ -109,7 +117,8 @@ class Log:
         """SHA-256 of names and numbers: two logs with the same one give the same results."""
         s = self.segments
         columns: dict[str, object] = {
-            **{k: getattr(s, k) for k in ("trip", "vehicle", "time_s", "duration_s", "distance_m")},
+            "trip": self.trip,
+            **{k: getattr(s, k) for k in ("vehicle", "time_s", "duration_s", "distance_m")},
             **{k: getattr(s, k) for k in ("speed_start_mps", "speed_end_mps")},
             **{f"channel {k}": v for k, v in sorted(s.channels.items())},
             **{f"measured {k}": v for k, v in sorted(self.measured.items())},

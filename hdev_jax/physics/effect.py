@@ -64,7 +64,7 @@ class Grouped(eqx.Module):
     by: str = eqx.field(static=True)
 
     def at(self, row: Segments) -> Real:
-        """The value that holds for this row; ids past the end take the last."""
+        """The value that holds for this row; ids below 0 take the first, ids past the end the last."""
         key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.channels[self.by]
         return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, self.values.shape[0] - 1)]
 

@@ -10,6 +10,7 @@ from hdev_jax.diagnosis.diagnose import Diagnosis
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.inference import padded
+from hdev_jax.physics.across import distance_since_start
 from hdev_jax.report.data import ReportData
 from hdev_jax.report.words import answer, next_drives, plus_minus
 
@@ -28,10 +29,11 @@ def report_data(
         synthetic="synthetic" in f"{problem.sheet.name} {' '.join(problem.log.files)}".lower(),
         unit=problem.unit,
         rows={
-            "trip": np.asarray(s.trip),
+            "trip": problem.log.trip,
             "time_s": np.asarray(s.time_s),
             "duration_s": np.asarray(s.duration_s),
             "distance_m": np.asarray(s.distance_m),
+            "distance_since_start_m": np.asarray(distance_since_start(s)),
             "measured": problem.measured, "before": before, "after": after,
             "test": problem.rows(split.test), "used": used,
         },
@@ -48,11 +50,15 @@ def of_diagnosis(result: Diagnosis, command: str, started: float) -> ReportData:
     problem, split = result.problem, result.split
     breakdown = {}
     if problem.target in ("energy_wh", "battery_power_kw"):
-        test = padded(problem.segments.take(problem.rows(split.test)), problem.measured[problem.rows(split.test)])
-        n = test.rows
+        test = problem.rows(split.test)
+        trip = np.asarray(problem.segments.trip)
+        whole = np.isin(trip, trip[test])  # of a trip that is tested in part, what came before belongs to it
+        rows = padded(problem.segments.take(whole), problem.measured[whole])
         for when, car in (("before", result.before), ("after", result.after)):
-            parts = car.breakdown(test.segments)
-            breakdown[when] = {k: float(np.sum(np.asarray(v)[:n])) / 1e3 for k, v in parts.items()}
+            parts = car.breakdown(rows.segments)
+            breakdown[when] = {
+                k: float(np.sum(np.asarray(v)[: rows.rows][test[whole]])) / 1e3 for k, v in parts.items()
+            }
     return report_data(
         problem, split, result.summary, result.predicted_before, result.predicted_after, command, started, breakdown
     )

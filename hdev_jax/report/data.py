@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax.diagnosis.metrics import metrics as errors
+from hdev_jax.diagnosis.metrics import sum_weight
+
 __all__ = ["ReportData", "TripLine", "metrics", "same_model", "test_rows", "total", "total_name", "trip_lines"]
 
 _TOTALS = {"Wh": "energy", "kW": "energy", "N": "work", "Nm": "mean torque"}
@@ -19,9 +22,9 @@ class ReportData:
     `parameters_fitted`, `subsets` (name -> `before`, `after` metrics), `excluded` (`id`, `why`). For a calibration:
     `target`, `baseline`, `before`, and optionally `method`.
 
-    `rows`: `trip` (index into `trip_names`), `time_s`, `duration_s`, `distance_m`, `measured`, `before`, `after` (in
-    `unit`), `test` and `used` (bool; a row that is used and no test row was trained on). Only `trip`, `time_s`,
-    `duration_s`, `distance_m`, `measured` and `before` are needed for a calibration.
+    `rows`: `trip` (index into `trip_names`), `time_s`, `duration_s`, `distance_m`, `distance_since_start_m` (to the
+    middle of the row), `measured`, `before`, `after` (in `unit`), `test` and `used` (bool; a row that is used and no
+    test row was trained on). `after`, `test` and `used` are not needed for a calibration.
     `channels`: columns of the log by their contract names, as long as the rows.
     `breakdown`: `before` and `after` -> effect id -> kWh over the test trips; may be empty.
     `ledger`: `kind`, `where` (or `file` and `trip`), `column`, `count`, `reason`.
@@ -82,10 +85,8 @@ def test_rows(data: ReportData) -> np.ndarray:
 
 
 def _weight(data: ReportData, rows: np.ndarray) -> np.ndarray:
-    """What a sum weighs by (contract §4): power by duration, force by distance; torque by duration, energy by 1."""
-    if data.unit == "Wh":
-        return np.ones(len(rows))
-    return data.row("distance_m" if data.unit == "N" else "duration_s")[rows]
+    """What some rows (by index) weigh in a sum."""
+    return sum_weight(data.summary["target"], data.row("duration_s")[rows], data.row("distance_m")[rows])
 
 
 def total_name(data: ReportData) -> tuple[str, str]:
@@ -104,17 +105,11 @@ def total(data: ReportData, rows: np.ndarray) -> float:
 
 
 def metrics(data: ReportData, rows: np.ndarray, when: str) -> dict[str, Any]:
-    """METRICS of contract §4 (less `fit_percent`) over rows by index, for trips that diagnosis.json does not list."""
-    error = data.row(when)[rows] - data.row("measured")[rows]
-    good = np.isfinite(error)
-    rows, error = rows[good], error[good]
+    """METRICS of contract §4 over rows by index, for trips that diagnosis.json does not list."""
+    rows = rows[np.isfinite(data.residual(when)[rows])]
     if not len(rows):
-        return {"rmse": None, "mse": None, "bias": None, "pe_percent": None, "n": 0}
-    weight, measured = _weight(data, rows), data.row("measured")[rows]
-    net, gross = float(np.sum(weight * measured)), float(np.sum(weight * np.abs(measured)))
-    mse = float(np.mean(error**2))
-    pe = None if gross == 0 or abs(net) < 0.05 * gross else 100.0 * float(np.sum(weight * error)) / net
-    return {"rmse": mse**0.5, "mse": mse, "bias": float(np.mean(error)), "pe_percent": pe, "n": len(rows)}
+        return {"rmse": None, "mse": None, "bias": None, "pe_percent": None, "fit_percent": None, "n": 0}
+    return errors(data.row("measured")[rows], data.row(when)[rows], _weight(data, rows))
 
 
 def _parts(data: ReportData) -> Iterator[tuple[int, str, np.ndarray]]:

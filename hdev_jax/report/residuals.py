@@ -14,7 +14,6 @@ from hdev_jax.report.statistics import (
     binned,
     blocks,
     dependence,
-    distance_since_start,
     edges_of,
     row_seconds,
     variance_by_period,
@@ -39,7 +38,7 @@ class Panel(NamedTuple):
 def _columns(data: ReportData) -> dict[str, tuple[names.Shown, np.ndarray]]:
     standing = {
         "time_s": (names.channel("time_s"), data.row("time_s")),
-        "distance_since_start_m": (names.channel("distance_since_start_m"), distance_since_start(data)),
+        "distance_since_start_m": (names.channel("distance_since_start_m"), data.row("distance_since_start_m")),
         "\x00predicted": (
             names.Shown(f"predicted {names.target(data.summary['target'])[1]}", data.unit),
             data.row("after"),

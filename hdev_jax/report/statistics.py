@@ -12,7 +12,6 @@ __all__ = [
     "binned",
     "blocks",
     "dependence",
-    "distance_since_start",
     "edges_of",
     "row_seconds",
     "runs",
@@ -49,15 +48,6 @@ def blocks(data: ReportData, rows: np.ndarray) -> np.ndarray:
         return np.unique(trip, return_inverse=True)[1]
     part = np.floor(np.nan_to_num(data.row("time_s")[rows]) / BLOCK_S).astype(np.int64)
     return np.unique(trip * (part.max(initial=0) - part.min(initial=0) + 1) + part, return_inverse=True)[1]
-
-
-def distance_since_start(data: ReportData) -> np.ndarray:
-    """Distance from the start of each trip to the row's middle [m]."""
-    trip, step = data.row("trip"), np.nan_to_num(data.row("distance_m"))
-    out = np.empty(len(step))
-    for s in runs(trip):
-        out[s] = np.cumsum(step[s]) - 0.5 * step[s]
-    return out
 
 
 def edges_of(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:

@@ -124,10 +124,13 @@ def test_one_trip_gives_its_last_third_by_time():
     assert (split.train, split.test, split.unused) == ((0,), (1,), ())
     assert split.log.trip_names[0] != split.log.trip_names[1]
     assert all("only" in name for name in split.log.trip_names)
-    test = split.log.segments.trip == 1
+    test = split.log.trip == 1
     assert durations[test].sum() == pytest.approx(180 / 3)
-    assert np.all(np.diff(split.log.segments.trip) >= 0)  # the last third, not the first
-    np.testing.assert_array_equal(log.segments.trip, 0)  # the log that was given is as it was
+    assert np.all(np.diff(split.log.trip) >= 0)  # the last third, not the first
+    np.testing.assert_array_equal(log.trip, 0)  # the log that was given is as it was
+    np.testing.assert_array_equal(split.log.segments.trip, 0)  # and the trip stays one
+    assert len(split.log.select([1])) == test.sum()
+    assert log.fingerprint() != split.log.fingerprint()
     np.testing.assert_array_equal(split.log.segments.time_s, log.segments.time_s)
 
 
