@@ -47,6 +47,9 @@ class Config(Strict):
     caption: str
     noises: list[Noise]
     trips: list[int]  # that a log is calibrated on
+    of_lengths: list[Noise]  # whose new trips are `longer` times as long as those of the fit, too
+    longer: list[float]
+    of_halves: list[Noise]  # of which the second half of a drive is predicted from its first
     totals: int = Field(500, ge=4)  # new trips of each setting
     block: int = Field(25, ge=1)  # logs of a task
     models: list[str]
@@ -60,13 +63,14 @@ class Config(Strict):
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """Blocks of logs, each with its own seed; a fleet's model in each of its worlds."""
     seed = 100_000 + config.seed
-    settings = [(noise, trips, NEW) for noise in config.noises for trips in config.trips]
-    for noise, trips, new in [*settings, ("ar1", 1, 1)]:
+    settings = [(noise, trips, NEW, 1.0) for noise in config.noises for trips in config.trips]
+    settings += [(noise, max(config.trips), NEW, longer) for noise in config.of_lengths for longer in config.longer]
+    for noise, trips, new, longer in [*settings, *((noise, 1, 1, 1.0) for noise in config.of_halves)]:
         logs = -(-config.totals // new)
         for first in range(0, logs, config.block):
             count = min(config.block, logs - first)
             yield {"kind": "logs", "noise": noise, "trips": trips, "new": new, "count": count, "seed": seed,
-                   "ar_coefficient": config.ar_coefficient}  # fmt: skip
+                   "longer": longer, "ar_coefficient": config.ar_coefficient}  # fmt: skip
             seed += count
     for model in config.models:
         for world in range(config.worlds):
@@ -96,7 +100,15 @@ def _logs(task: dict[str, Any]) -> Iterator[Any]:
             problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
         trip = np.asarray(problem.segments.trip)
         learn = np.arange(len(trip)) < len(trip) // 2 if half else trip < task["trips"]
-        yield problem.vehicle, problem.table, problem.segments, problem.measured, learn
+        keep = _begun(trip, min(1.0 / task["longer"], 1.0)) | ~learn
+        keep &= _begun(trip, min(task["longer"], 1.0)) | learn
+        s, y = problem.segments.take(keep), problem.measured[keep]
+        yield problem.vehicle, problem.table, s, y, learn[keep]
+
+
+def _begun(trip: np.ndarray, share: float) -> np.ndarray:
+    """The first `share` of each trip's rows."""
+    return np.concatenate([np.arange(n) < share * n for n in np.bincount(trip)])
 
 
 def _fleet(task: dict[str, Any]) -> Iterator[Any]:
@@ -122,7 +134,7 @@ def _scored(
     predicted = np.asarray(predict(fit.vehicle, new.segments, target))[: new.rows]
     x = jacobian(fit.vehicle, fit.table, new.segments, target)[: new.rows] @ covariance_root(fit.covariance)
     error, trip = y[~learn] - predicted, np.asarray(s.trip)[~learn]
-    row = np.hypot(stats.norm.ppf(0.95) * np.linalg.norm(x, axis=1), spread.row(0.9, predicted))
+    row = spread.rows(0.9, np.linalg.norm(x, axis=1), predicted)
     plain = np.sqrt(np.mean((y[learn] - fit.predicted) ** 2))
     out: dict[str, list[float]] = {f"off_{level:g}": [] for level in LEVELS}
     out |= {"naive": [], "rows": [], "width": []}
@@ -142,7 +154,10 @@ def _scored(
 def _setting(task: dict[str, Any]) -> str:
     if task["kind"] == "fleet":
         return f"fleet, {task['routes'] // 2} routes"
-    return "second half of a drive, ar1" if task["trips"] == 1 else f"{task['noise']}, {task['trips']} trips"
+    if task["trips"] == 1:
+        return f"second half of a drive, {task['noise']}"
+    longer = "" if task["longer"] == 1.0 else f", new ones {task['longer']:g} times as long"
+    return f"{task['noise']}, {task['trips']} trips{longer}"
 
 
 def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:

@@ -1,26 +1,27 @@
 """The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips that no fit has seen."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.diagnosis.problem import Problem, prepare
+from hdev_jax.diagnosis.problem import UNITS, Problem, prepare
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, left_out, padded, spread_of, sums_of
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.opening import Paths, digest, known_effects
+from hdev_jax.opening import Paths, digest, known_effects, tried
 from hdev_jax.rundir import Run, atomic_file
 
 __all__ = ["predict", "write_predictive"]
 
 BESIDE = "predictive.json"  # what a fitted sheet has beside it
 Noise = Literal["normal", "student_t"]
+LIKE = 1.5  # times as long: rows of another log whose noise is still like
 KWH = {"energy_wh": 1e3, "battery_power_kw": 3600.0, "traction_force_n": 3.6e6}
 
 
@@ -70,21 +71,23 @@ def predict(
 
     if not 0 < level < 1:
         raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
+    library = known_effects(effects)
     log = read_log(list(logs), adapter)
-    sheet = read_sheet(vehicle, library=known_effects(effects))
+    sheet = read_sheet(vehicle, library=library)
+    beside = _beside(Path(vehicle))
     measures = target in log.targets if target else bool(log.targets)
-    name = target or (log.default_target if measures else "energy_wh")
+    name = target or (log.default_target if measures else beside.get("target", "energy_wh"))
     measures = measures or (name == "traction_force_n" and log.segments.has("motor_torque_nm"))
-    problem = prepare(log, sheet, name, need_measured=measures)
+    problem, reach = prepare(log, sheet, name, need_measured=measures), float(stats.norm.ppf(0.5 + level / 2))
+    tried(problem, library, effects)
     predicted = problem.predict(problem.vehicle)
     rows = padded(problem.segments, problem.measured)
     jac = jacobian(problem.vehicle, problem.table, rows.segments, problem.target)[: len(log)]
-    known = _known(Path(vehicle), problem)
+    known = beside if beside.get("target") == problem.target and not beside.get("stale") else {}
     x = jac @ _root(problem, known)
     spread = _spread(problem, predicted, x, known, measures)
-    half = float(stats.norm.ppf(0.5 + level / 2)) * np.sqrt(np.sum(x**2, axis=1))
-    if spread is not None:
-        half = np.hypot(half, spread.row(level, predicted))
+    half = np.linalg.norm(x, axis=1)
+    half = reach * half if spread is None else spread.rows(level, half, predicted)
     frame = pd.DataFrame(
         {
             "trip_id": np.asarray(log.trip_names, dtype=object)[log.segments.trip],
@@ -101,23 +104,66 @@ def predict(
         else:
             compression: Any = "gzip" if str(out).endswith(".gz") else None
             frame.to_csv(temporary, index=False, float_format="%.8g", compression=compression)
+    lines = [_whence(level, spread, bool(known)), *_totals(problem, predicted, x, spread, level)]
+    return "\n".join([*lines, *_warnings(problem, spread, beside, known), f"{len(frame)} rows of {name} -> {out}"])
+
+
+def _whence(level: float, spread: Spread | None, known: bool) -> str:
+    """What the intervals are made of."""
     what = f"trip totals, {100 * level:g} % intervals"
     if spread is None:
-        what += ", without the noise of the rows: not known"
-    else:
-        what += f", Student t of {spread.total_freedom:.3g} degrees of freedom"
-    lines = _totals(problem, predicted, x, spread, level)
-    return "\n".join([what, *lines, f"{len(frame)} rows of {problem.target} -> {out}"])
+        return f"{what} of the coefficients alone: the noise of the rows is not known"
+    whose = "the fit's training trips left out" if known else "this log's own errors"
+    return f"{what} from {whose}, Student t of {spread.total_freedom:.3g} degrees of freedom"
 
 
-def _known(sheet: Path, problem: Problem) -> dict[str, Any]:
-    """What lies beside a fitted sheet, if it is of that sheet as it is, and of this target."""
+def _warnings(problem: Problem, spread: Spread | None, beside: dict[str, Any], known: dict[str, Any]) -> list[str]:
+    """Where the intervals are not of this sheet, this target or rows like these."""
+    out = []
+    if beside and not known and not beside.get("stale"):
+        out.append(f"note: {BESIDE} beside the sheet is of {beside['target']} and is not used")
+    if beside.get("stale"):
+        out.append(f"note: the sheet was changed after {BESIDE} was written, which is not used")
+    row_s = float(np.median(np.asarray(problem.segments.duration_s)))
+    if spread is not None and max(row_s, spread.row_s) > LIKE * min(row_s, spread.row_s):
+        out.append(
+            f"note: rows of this log last {row_s:.3g} s, those that the noise is known of {spread.row_s:.3g} s: "
+            "intervals are not of such rows"
+        )
+    return out
+
+
+def _beside(sheet: Path) -> dict[str, Any]:
+    """What lies beside a fitted sheet; of one that was changed since, no more than that (`stale`).
+
+    Raises `InputError` where the file is there and cannot be used.
+    """
+    path = sheet.parent / BESIDE
     try:
-        found = json.loads((sheet.parent / BESIDE).read_text())
-    except (OSError, ValueError):
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
         return {}
-    same = isinstance(found, dict) and found.get("sheet_sha256") == digest(sheet)
-    return found if same and found.get("target") == problem.target else {}
+    except (OSError, ValueError) as e:
+        raise InputError(f"{path}: does not read as JSON: {e}; fit the sheet again, or delete the file") from e
+    try:
+        same = found["sheet_sha256"] == digest(sheet)
+        names, matrix = found["covariance"]["names"], np.asarray(found["covariance"]["matrix"], dtype=float)
+        spread = {k: float(v) for k, v in found["spread"].items()}
+        right = (
+            found["target"] in UNITS
+            and matrix.size == len(names) ** 2
+            and np.all(np.isfinite(matrix))
+            and {f.name for f in fields(Spread)} == set(spread)
+            and np.all(np.isfinite(list(spread.values())))
+            and min(spread["scale"], spread["freedom"], spread["total_freedom"], spread["row_s"]) > 0
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise InputError(f"{path}: {type(e).__name__}: {e}; fit the sheet again, or delete the file") from e
+    if not right:
+        raise InputError(
+            f"{path}: covariance or spread is not as hdev writes it; fit the sheet again, or delete the file"
+        )
+    return found if same else {"target": found["target"], "stale": True}
 
 
 def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free free"]:
@@ -128,7 +174,7 @@ def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free fr
     there = [k for k, c in enumerate(free) if c.name in names]
     if there:
         at = [names.index(free[k].name) for k in there]
-        matrix = np.atleast_2d(np.asarray(known["covariance"]["matrix"], dtype=float))
+        matrix = np.asarray(known["covariance"]["matrix"], dtype=float).reshape(len(names), len(names))
         covariance[np.ix_(there, there)] = matrix[np.ix_(at, at)]
     return covariance_root(covariance)
 
@@ -136,14 +182,16 @@ def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free fr
 def _spread(
     problem: Problem, predicted: np.ndarray, x: np.ndarray, known: dict[str, Any], measures: bool
 ) -> Spread | None:
-    """Of the fit that made the sheet; else of this log, which no fit has seen; None where it measures nothing."""
+    """Of the fit that made the sheet; else of this log itself; None where it measures nothing."""
     if known:
         return Spread(**known["spread"])
     if not measures:
         return None
     weight, clusters = problem.weight(), sums_of(problem.segments)
     open_sd = np.linalg.norm(clusters.sums(weight[:, None] * x), axis=1)
-    return spread_of(problem.measured - predicted, predicted, weight, clusters, open_sd)
+    row_s = float(np.median(np.asarray(problem.segments.duration_s)))
+    error, open_row = problem.measured - predicted, np.linalg.norm(x, axis=1)
+    return spread_of(error, predicted, weight, clusters, open_sd, open_row, row_s=row_s)
 
 
 def _totals(problem: Problem, predicted: np.ndarray, x: np.ndarray, spread: Spread | None, level: float) -> list[str]:
@@ -156,6 +204,9 @@ def _totals(problem: Problem, predicted: np.ndarray, x: np.ndarray, spread: Spre
     for i, trip in enumerate(problem.log.trip_names):
         rows = problem.rows([i])
         per = KWH.get(problem.target, float(np.sum(weight[rows])))
+        if not per > 0:
+            lines.append(f"{trip:40s} {'-':>10s} {unit}  stands all the time")
+            continue
         total = float(np.sum((weight * predicted)[rows])) / per
         open_sd = float(np.linalg.norm(weight[rows] @ x[rows]))
         if spread is None:

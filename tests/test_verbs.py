@@ -1,6 +1,7 @@
 """The verbs end to end, through the command line, on a small synthetic log in a temporary folder."""
 
 import contextlib
+import hashlib
 import importlib.util
 import io
 import json
@@ -204,6 +205,56 @@ def test_a_log_without_a_target_is_predicted_too(first, files, out, tmp_path):
         assert hdev("predict", name, "--vehicle", sheet, "--out", out / f"{Path(name).stem}.csv")[0] == 0
     with_target, bare = pd.read_csv(out / f"{files['log'].stem}.csv"), pd.read_csv(out / "bare.csv")
     np.testing.assert_allclose(bare.predicted, with_target.predicted, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda d: d.pop("spread"), "KeyError: 'spread'"),
+        (lambda d: d["spread"].update(total_freedom=0.0), "not as hdev writes it"),
+        (lambda d: d["covariance"].update(matrix=[[1.0]]), "not as hdev writes it"),
+        (None, "does not read as JSON"),
+    ],
+)
+def test_what_lies_beside_a_sheet_and_is_at_fault(edit, words, first, files, tmp_path, capsys):
+    """Edited or cut off: one line with the file, nothing written."""
+    for name in ("augmented_vehicle.toml", "predictive.json"):
+        (tmp_path / name).write_bytes((first[0] / name).read_bytes())
+    beside = tmp_path / "predictive.json"
+    known = json.loads(beside.read_text())
+    if edit is not None:
+        edit(known)
+    beside.write_text(json.dumps(known) if edit is not None else beside.read_text()[:200])
+    sheet, out = tmp_path / "augmented_vehicle.toml", tmp_path / "p.csv"
+    said = refused(capsys, "predict", files["log"], "--vehicle", sheet, "--out", out)
+    assert words in said
+    assert str(beside) in said
+    assert not out.exists()
+
+
+def test_intervals_say_where_they_are_from(first, files, tmp_path):
+    """Of the fit beside the sheet; of a sheet that was changed since, of the log's own errors, and that is said."""
+    log = pd.read_csv(files["log"])
+    log.drop(columns="energy_wh").to_csv(tmp_path / "bare.csv", index=False)
+    for name in ("augmented_vehicle.toml", "predictive.json"):
+        (tmp_path / name).write_bytes((first[0] / name).read_bytes())
+    sheet, out = tmp_path / "augmented_vehicle.toml", tmp_path / "p.csv"
+
+    def said(file: Path) -> str:
+        status, text = hdev("predict", file, "--vehicle", sheet, "--out", out)
+        assert status == 0
+        return text
+
+    assert "the fit's training trips left out" in said(tmp_path / "bare.csv")
+    sheet.write_text(sheet.read_text() + "\n# a note\n")
+    assert "was changed after" in said(tmp_path / "bare.csv")
+    assert "the noise of the rows is not known" in said(tmp_path / "bare.csv")
+    assert "this log's own errors" in said(files["log"])
+    known = json.loads((tmp_path / "predictive.json").read_text())
+    known["spread"]["row_s"] *= 3
+    known["sheet_sha256"] = hashlib.sha256(sheet.read_bytes()).hexdigest()
+    (tmp_path / "predictive.json").write_text(json.dumps(known))
+    assert "rows of this log last" in said(files["log"])
 
 
 def test_the_same_command_is_done_at_once(first, given, monkeypatch):

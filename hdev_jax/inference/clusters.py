@@ -66,7 +66,9 @@ def clusters_of(
         # no more than 60 blocks in all: beyond that they only get shorter, not more independent
         most = max(1, 60 // len(slices))
         blocks = int(np.clip(clock[-1] // BLOCK_S, 1, most))
-        ids[s] = count + np.minimum((clock - clock[0]) / (clock[-1] + 1e-9) * blocks, blocks - 1).astype(np.int64)
+        block = np.minimum((clock - clock[0]) / (clock[-1] + 1e-9) * blocks, blocks - 1).astype(np.int64)
+        local = np.unique(block, return_inverse=True)[1]  # a row longer than a block leaves one out
+        ids[s] = count + local
         count = ids[s][-1] + 1
     return Clusters(ids, int(count), "block")
 

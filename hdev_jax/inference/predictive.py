@@ -15,8 +15,7 @@ from hdev_jax.segments import Segments
 
 __all__ = ["Spread", "covariance_root", "errors_left_out", "left_out", "spread_of", "sums_of"]
 
-FEW = 2  # trips from which on a total is judged by trips; of a single one by its blocks
-
+FEW = 2  # trips from which on a total is judged by trips; a single one by its autocorrelation
 ENOUGH_ROWS = 20_000  # tell the shape of a row's noise; every so many of more
 MOST_FREEDOM = 200.0  # of a Student t that is a normal
 MOST_LAG = 20  # rows: enough to tell what is left of a correlation from a row's own noise
@@ -28,27 +27,33 @@ FAULT = 6.0  # scales: where outliers are weighed down, a row beyond this is an 
 class Spread:
     """Errors of new rows and of new trips, besides what the coefficients leave open.
 
-    A row is off by a Student t of `freedom` degrees whose scale is √(`scale`² + (`growth`·predicted)²), in the target's
-    unit. The weighed sum of a trip's rows has `together` times the sum of the squares of those scales as its variance,
-    which is known to `total_freedom` degrees of freedom: one for each training trip, predicted by a fit without it.
+    A row is off by a Student t of `freedom` degrees whose scale s is √(`scale`² + (`growth`·predicted)²), in the
+    target's unit. The sum of a trip's rows, each weighed by w, has the variance `together`·Σw²s² + (`level`·Σws)²: what
+    goes from row to row, and what all rows of a trip share. It is known to `total_freedom` degrees of freedom, one for
+    each training trip, predicted by a fit without it. Rows last about `row_s`.
     """
 
     scale: float
     growth: float
     freedom: float
     together: float
+    level: float
     total_freedom: float
+    row_s: float
 
-    def row(self, level: float, predicted: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
-        """Half the interval of each row, the coefficients known."""
-        reach = float(stats.t.ppf(0.5 + level / 2, self.freedom))
-        return reach * np.sqrt(_square(self.scale, self.growth, predicted))
+    def rows(
+        self, level: float, open_sd: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
+    ) -> Float[np.ndarray, " row"]:
+        """Half the interval of each row, of which the coefficients leave `open_sd` open."""
+        own = float(stats.t.ppf(0.5 + level / 2, self.freedom)) * np.sqrt(_square(self.scale, self.growth, predicted))
+        return np.hypot(float(stats.norm.ppf(0.5 + level / 2)) * open_sd, own)
 
     def total(
         self, level: float, open_sd: float, weight: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
     ) -> float:
         """Half the interval of the weighed sum of these rows, of which the coefficients leave `open_sd` open."""
-        own = self.together * float(np.sum(weight**2 * _square(self.scale, self.growth, predicted)))
+        each = weight * np.sqrt(_square(self.scale, self.growth, predicted))
+        own = self.together * float(np.sum(each**2)) + (self.level * float(np.sum(each))) ** 2
         return float(stats.t.ppf(0.5 + level / 2, self.total_freedom) * np.sqrt(open_sd**2 + own))
 
 
@@ -77,108 +82,127 @@ def left_out(
     **Arguments:** `rows` the padded rows of the fit; `weight` of a real row in a trip's total. **Returns:** the spread,
     and whose sums it was seen in.
     """
-    n = rows.rows
+    n, robust = rows.rows, noise == "student_t"
     segments = rows.segments.take(np.arange(len(rows.segments)) < n)
-    clusters = sums_of(segments)
-    left = np.asarray(rows.measured)[:n] - fit.predicted
-    tail = (STUDENT_DF + 1.0) / (STUDENT_DF + (left / fit.sigma) ** 2) if noise == "student_t" else np.ones(n)
-    x = jacobian(fit.vehicle, fit.table, rows.segments, target)[:n]
-    error = left
-    open_sd = np.zeros(clusters.count)
+    clusters, row_s = sums_of(segments), float(np.median(np.asarray(segments.duration_s)))
+    error = np.asarray(rows.measured)[:n] - fit.predicted
+    open_sd, open_row = np.zeros(clusters.count), np.zeros(n)
     if fit.table.free:
-        error = errors_left_out(x, left, tail / (fit.sigma**2 * fit.inflation), clusters, tabular(fit.table)[1])
-        open_sd = np.linalg.norm(clusters.sums(weight[:, None] * x) @ covariance_root(fit.covariance), axis=1)
-    return spread_of(error, fit.predicted, weight, clusters, open_sd, robust=noise == "student_t"), clusters
+        x = jacobian(fit.vehicle, fit.table, rows.segments, target)[:n]
+        tail = (STUDENT_DF + 1.0) / (STUDENT_DF + (error / fit.sigma) ** 2) if robust else np.ones(n)
+        counted = tail / (fit.sigma**2 * fit.inflation)
+        error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])
+        open_row = np.linalg.norm(x @ covariance_root(fit.covariance), axis=1)
+    spread = spread_of(error, fit.predicted, weight, clusters, open_sd, open_row, row_s=row_s, robust=robust)
+    return spread, clusters
 
 
 def errors_left_out(
     x: Float[np.ndarray, "row k"], r: Float[np.ndarray, " row"], counted: Float[np.ndarray, " row"],
-    clusters: Clusters, prior_sd: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, " row"]:  # fmt: skip
-    """Measured − predicted of each row by the fit without the row's cluster, in one step from the fit of all.
+    weight: Float[np.ndarray, " row"], clusters: Clusters, prior_sd: Float[np.ndarray, " k"],
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " cluster"]]:  # fmt: skip
+    """Measured − predicted of each row by the fit without the row's cluster, in one step from the fit of all; and what
+    that fit's coefficients leave open of the cluster's weighed sum, as a standard deviation.
 
     A fit bends towards the rows that it has seen, and towards the sums of few trips most of all.
 
     **Arguments:** `x` ∂ predicted / ∂θ and `r` measured − predicted at the fit; `counted`, the precision that each row
-    counted for in it; `prior_sd` of the coefficients' tables.
+    counted for in it; `weight` of a row in a sum; `prior_sd` of the coefficients' tables.
     """
     x = x * prior_sd
     root = np.sqrt(counted)[:, None]
     grams, scores = clusters.grams(root * x), clusters.sums(counted[:, None] * x * r[:, None])
     rest = np.eye(x.shape[1]) + grams.sum(axis=0) - grams
-    moved = np.linalg.solve(rest, scores[:, :, None])[:, :, 0]
-    return r + np.sum(x * moved[clusters.ids], axis=1)
+    sums = clusters.sums(weight[:, None] * x)
+    moved, along = np.moveaxis(np.linalg.solve(rest, np.stack([scores, sums], axis=-1)), -1, 0)
+    error = r + np.sum(x * moved[clusters.ids], axis=1)
+    return error, np.sqrt(np.maximum(np.sum(sums * along, axis=1), 0.0))
 
 
 def spread_of(
     error: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"], weight: Float[np.ndarray, " row"],
-    clusters: Clusters, open_sd: Float[np.ndarray, " cluster"], *, robust: bool = False,
+    clusters: Clusters, open_sd: Float[np.ndarray, " cluster"], open_row: Float[np.ndarray, " row"], *, row_s: float,
+    robust: bool = False,
 ) -> Spread:  # fmt: skip
     """The spread that these errors of rows, of which no fit has seen their cluster, are one sample of.
 
-    **Arguments:** `error` measured − predicted; `weight` of a row in a sum; `open_sd` of each cluster's weighed sum:
-    what the coefficients leave open of it is no noise. `robust`: a row beyond `FAULT` scales is no energy.
+    **Arguments:** `error` measured − predicted; `weight` of a row in a sum; `open_sd` of each cluster's weighed sum and
+    `open_row` of each row: what the coefficients leave open of them is no noise. `row_s`, what a row lasts. `robust`: a
+    row beyond `FAULT` scales is no energy.
     """
-    scale, growth, freedom = _of_rows(error, predicted)
+    scale, growth, freedom = _of_rows(error, predicted, open_row)
     square = _square(scale, growth, predicted)
     if robust:
         error = np.clip(error, -FAULT * np.sqrt(square), FAULT * np.sqrt(square))
+    z = error / np.sqrt(square)
     # a scale that few trips have told is itself uncertain: tails of its own (Satterthwaite 1946, over trips)
-    told = clusters.sums(error**2 / square)
+    told = clusters.sums(z**2)
     known = 2.0 * np.sum(told) ** 2 / max(len(told) * float(np.var(told, ddof=1)), 1e-12) if len(told) > 1 else 2.1
     freedom = 1.0 / (1.0 / freedom + 1.0 / max(float(known), 2.1))
+    times = _times(z, clusters)
     if clusters.kind == "block":
-        together, total_freedom = _of_one_trip(error / np.sqrt(square), clusters.count)
-        return Spread(scale, growth, freedom, together, total_freedom)
-    sums, alone = clusters.sums(weight * error) ** 2, clusters.sums(weight**2 * square)
+        worth = float(np.clip(len(z) / times, 1.0, clusters.count))
+        return Spread(scale, growth, freedom, float(np.mean(z**2)) * times, 0.0, worth, row_s)
+    each = weight * np.sqrt(square)
+    sums, alone, shared = clusters.sums(weight * error) ** 2, clusters.sums(each**2), clusters.sums(each) ** 2
+    seen = alone > 0  # a trip that stood all the time has no work
+    if not seen.any():
+        return Spread(scale, growth, freedom, 1.0, 0.0, 1.0, row_s)
+    sums, alone, shared, open_sd = (a[seen] for a in (sums, alone, shared, open_sd))
 
     def excess(together: float) -> float:
         return float(np.mean(sums / (open_sd**2 + together * alone))) - 1.0
 
-    low, high = LEAST_RATIO, max(2.0 * float(np.max(sums / np.maximum(alone, 1e-300))), 1.0)
-    together = low if excess(low) <= 0 else optimize.root_scalar(excess, bracket=(low, high), method="brentq").root
-    return Spread(scale, growth, freedom, float(together), float(clusters.count))
+    low, high = LEAST_RATIO, max(2.0 * float(np.max(sums / alone)), 1.0)
+    whole = low if excess(low) <= 0 else float(optimize.root_scalar(excess, bracket=(low, high), method="brentq").root)
+    # what rows of a trip have in common beyond their correlation from row to row grows with the trip
+    together = min(whole, float(np.mean(z**2)) * times)
+    level = np.sqrt((whole - together) * float(np.sum(alone)) / float(np.sum(shared)))
+    return Spread(scale, growth, freedom, together, float(level), float(np.sum(seen)), row_s)
 
 
-def _of_one_trip(z: Float[np.ndarray, " row"], blocks: int) -> tuple[float, float]:
-    """How a trip's errors add up, from the one trip that there is: its autocorrelation, which no block of it is long
-    enough to show. An AR(1) with white noise on it, correlations A·ρᵏ, makes sums 1 − A + A·(1 + ρ)/(1 − ρ) times as
-    wide, as a variance, as independent rows; the trip is worth so many rows fewer.
+def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> float:
+    """How much wider a sum is, as a variance, than of independent rows, by the correlation from row to row: no block of
+    a trip is long enough to show it. An AR(1) with white noise on it, correlations A·ρᵏ: 1 − A + A·(1 + ρ)/(1 − ρ).
 
-    Correlations of a short series come out too small, by what its mean is uncertain (Kendall 1954): added again.
+    Correlations of a short series come out too small, by what its mean is uncertain (Kendall 1954): added again. Of
+    several trips the mean of each, its level, is taken off.
     """
-    n, square = len(z), float(np.mean(z**2))
-    lags = np.arange(1, min(MOST_LAG, n // 5) + 1)
+    ids = clusters.ids if clusters.kind == "trip" else np.zeros(len(z), dtype=int)
+    if clusters.kind == "trip":
+        z = z - (clusters.sums(z) / np.bincount(ids))[ids]
+    n, square = len(z) / (ids[-1] + 1), float(np.mean(z**2))
+    lags = np.arange(1, min(MOST_LAG, int(n) // 5) + 1)
     if not len(lags) or not square > 0:
-        return 1.0, 1.0
-    seen = np.array([np.mean(z[:-k] * z[k:]) for k in lags]) / square
-    powers = DECAYS[:, None] ** lags
-    times = 1.0
+        return 1.0
+    seen = np.array([np.mean((z[:-k] * z[k:])[ids[:-k] == ids[k:]]) for k in lags]) / square
+    powers, times = DECAYS[:, None] ** lags, 1.0
     for _ in range(4):
         r = (seen + times / n) / (1.0 + times / n)
-        if r[0] < 2.0 / np.sqrt(n):  # as white as can be told
-            return square, float(blocks)
+        if r[0] < 2.0 / np.sqrt(len(z)):
+            return 1.0
         share = np.clip(powers @ r / np.sum(powers**2, axis=1), 0.0, 1.0)
         best = int(np.argmin(np.sum((r - share[:, None] * powers) ** 2, axis=1)))
-        times = 1.0 + share[best] * 2.0 * DECAYS[best] / (1.0 - DECAYS[best])
-    return square * float(times), float(np.clip(n / times, 1.0, blocks))
+        times = 1.0 + float(share[best]) * 2.0 * float(DECAYS[best] / (1.0 - DECAYS[best]))
+    return times
 
 
-def _of_rows(error: np.ndarray, predicted: np.ndarray) -> tuple[float, float, float]:
+def _of_rows(error: np.ndarray, predicted: np.ndarray, open_row: np.ndarray) -> tuple[float, float, float]:
     """Scale, growth and degrees of freedom of a row's Student t, by maximum likelihood."""
     every = max(len(error) // ENOUGH_ROWS, 1)
-    error, size = error[::every], np.abs(predicted[::every])
+    error, size, besides = error[::every], np.abs(predicted[::every]), open_row[::every] ** 2
     unit = max(float(np.sqrt(np.mean(error**2))), 1e-9 * max(float(np.max(size)), 1.0))
-    error, size = error / unit, size / unit
+    typical = max(float(np.sqrt(np.mean(size**2))), 1e-300)
+    error, size, besides = error / unit, size / typical, besides / unit**2
 
     def loss(z: np.ndarray) -> float:
-        half, square = 0.5 * np.exp(z[2]), np.exp(2.0 * z[0]) + (z[1] * size) ** 2
+        half, square = 0.5 * np.exp(z[2]), np.exp(2.0 * z[0]) + (z[1] * size) ** 2 + besides
         constant = special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(2.0 * np.pi * half)
         tail = (half + 0.5) * np.log1p(error**2 / square / (2.0 * half))
         return float(np.mean(0.5 * np.log(square) + tail)) - float(constant)
 
-    typical = max(float(np.median(size)), 1e-9)
-    bounds = [(np.log(1e-3), np.log(2.0)), (0.0, 2.0 / typical), (np.log(2.1), np.log(MOST_FREEDOM))]
-    start = np.array([np.log(0.7), 0.1 / typical, np.log(8.0)])
+    most = 2.0 if np.any(size > 0) else 0.0  # where nothing is predicted nothing grows
+    bounds = [(np.log(1e-3), np.log(2.0)), (0.0, most), (np.log(2.1), np.log(MOST_FREEDOM))]
+    start = np.array([np.log(0.7), min(0.3, most), np.log(8.0)])
     z = optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
-    return unit * float(np.exp(z[0])), float(z[1]), float(np.exp(z[2]))
+    return unit * float(np.exp(z[0])), float(z[1]) * unit / typical, float(np.exp(z[2]))

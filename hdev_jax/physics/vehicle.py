@@ -188,12 +188,19 @@ class Vehicle(eqx.Module):
         return self.power(segments) * (jnp.asarray(segments.duration_s) / JOULES_PER_WH)
 
     def force(self, segments: Segments) -> Float[Array, " row"]:
-        """Traction force at the wheels [N]: F_w of paper 1, equation 3. Entry must be `road`."""
-        return self._observed(self._rows(segments, lambda c, _: c.wheel_n), segments)
+        """Traction force at the wheels [N]: F_w of paper 1, equation 3; 0 at a standstill, where brakes hold.
+
+        Entry must be `road`.
+        """
+        return self._observed(self._rows(segments, lambda c, row: _in_motion(row, c.wheel_n)), segments)
 
     def torque(self, segments: Segments) -> Float[Array, " row"]:
-        """Torque at the motor shaft [Nm] (paper 2, equations 4 and 9). Entry must be `road` or `wheel`."""
-        return self._observed(self._rows(segments, lambda c, _: c.point.torque_nm), segments)
+        """Torque at the motor shaft [Nm] (paper 2, equations 4 and 9); 0 at a standstill where the force is computed.
+
+        Entry must be `road` or `wheel`.
+        """
+        held = _in_motion if self.entry == "road" else lambda _, torque: torque
+        return self._observed(self._rows(segments, lambda c, row: held(row, c.point.torque_nm)), segments)
 
     def predict(self, segments: Segments, target: Target) -> Float[Array, " row"]:
         """The target's column in the target's unit."""
@@ -225,6 +232,10 @@ class Vehicle(eqx.Module):
                 parts[e.id] = after - before
                 before = after
         return parts
+
+
+def _in_motion(row: Segments, x: Any) -> Any:
+    return jnp.where(jnp.asarray(row.speed_mps) > 0, x, 0.0)
 
 
 def _is_sensor(e: Effect) -> bool:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from inference_rows import driving
 
-from hdev_jax.inference import cluster_rows
+from hdev_jax.inference import cluster_rows, clusters_of
 from hdev_jax.inference.clusters import BLOCK_S, FEW_TRIPS
 
 
@@ -52,3 +52,11 @@ def test_sums():
     expected = np.stack([rows[clusters.ids == k].sum(axis=0) for k in range(clusters.count)])
     np.testing.assert_allclose(clusters.sums(rows), expected, atol=1e-12)
     np.testing.assert_allclose(clusters.sums(rows[:, 0]), expected[:, 0], atol=1e-12)
+
+
+def test_a_row_longer_than_a_block_leaves_no_gap():
+    """Ids are numbered from 0 without one left out, whatever a row lasts."""
+    duration = np.r_[np.full(40, 60.0), 1500.0, np.full(40, 60.0)]
+    clusters = clusters_of(np.zeros(81, dtype=int), duration)
+    assert sorted(set(clusters.ids)) == list(range(clusters.count))
+    assert len(clusters.sums(duration)) == clusters.count
