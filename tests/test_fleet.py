@@ -278,8 +278,15 @@ def test_a_sheet_that_knows_more_has_a_truth_nearer_to_it():
     usual, sure = (synthetic_log(**SMALL, entry="shaft", table_sd=sd) for sd in ({}, {"motoring_efficiency": 0.01}))
     sd = [tomllib.loads(x.sheet)["machine"]["motoring_efficiency"]["sd"] for x in (usual, sure)]
     assert sd == [0.05, 0.01]
-    assert abs(sure.vehicle.motoring_efficiency - 0.93) <= 0.015
+    assert abs(sure.vehicle.motoring_efficiency - 0.93) <= 0.015 + 1e-9
     np.testing.assert_allclose(sure.vehicle.regenerating_efficiency, usual.vehicle.regenerating_efficiency)
+
+
+def test_what_declared_coefficients_take_up_can_be_planted_and_has_no_size():
+    log = synthetic_log(**SMALL, entry="shaft", effects={"power_gain": {"gain": 0.05}})
+    assert log.ratio < 1e-9
+    np.testing.assert_allclose(log.truth["noise_free"], 1.05 * log.truth["baseline"], rtol=1e-12)
+    assert "power_gain" not in plantable("shaft")
 
 
 def test_what_stands_for_another_form_is_an_effect_of_the_library():

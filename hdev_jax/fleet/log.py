@@ -192,7 +192,7 @@ def _check(entry: str, mode: str, noise: str, adjust: str, trips: int, rows: int
         if effect not in PLANTABLE:
             raise ValueError(f"{effect!r} cannot be planted; known: {', '.join(PLANTABLE)}")
         plant = PLANTABLE[effect]
-        if entry not in plant.entries or mode not in plant.modes:
+        if entry not in plant.entries + plant.absorbed or mode not in plant.modes:
             raise ValueError(f"{effect} needs entry {'|'.join(plant.entries)} and mode {'|'.join(plant.modes)}")
         known = {*plant.parameters, *plant.size}
         if unknown := set(parameters) - known:

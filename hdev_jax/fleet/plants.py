@@ -14,7 +14,8 @@ class Plant:
 
     `null` is the value of `size` without the effect (infinite for a limit). `match` says which side gives way where a
     ratio of effect to noise is asked for: "noise" where another size would be implausible, or jumps. `like` is the
-    library's effect that comes nearest to one which the library does not hold in this form.
+    library's effect that comes nearest to one which the library does not hold in this form. `absorbed` are entries
+    where declared coefficients take all of it: it can be planted there, but has no size beyond them.
     """
 
     parameters: Mapping[str, float]
@@ -25,6 +26,7 @@ class Plant:
     match: str = "effect"
     in_library: bool = True
     like: str | None = None
+    absorbed: tuple[str, ...] = ()
 
 
 _ROAD = ("road",)
@@ -63,7 +65,7 @@ PLANTABLE: dict[str, Plant] = {
     "torque_offset": Plant({"offset_nm": 12.0, "gain": 0.0}, ("offset_nm", "gain"), _SHAFT),
     "battery_resistance": Plant({"resistance_ohm": 0.08}, ("resistance_ohm",)),
     "voltage_dependence": Plant({"per_v": 1.5e-3}, ("per_v",)),
-    "power_gain": Plant({"gain": 0.04, "offset_w": 0.0}, ("gain", "offset_w"), ("road", "shaft")),
+    "power_gain": Plant({"gain": 0.04, "offset_w": 0.0}, ("gain", "offset_w"), _ROAD, absorbed=_SHAFT),
     "time_skew": Plant({"skew_s": 0.4}, ("skew_s",), modes=("samples",)),
     "sampling_filter": Plant({"tau_s": 1.0}, ("tau_s",), modes=("samples",)),
     "step_change": Plant({"auxiliary_w": 5000.0, "trip": 10.0}, ("auxiliary_w", "c_rr", "cda_m2")),
