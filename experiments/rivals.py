@@ -1,8 +1,9 @@
 """What others would do with the same residual and the same columns: sparse regression, lasso, forward BIC, boosting.
 
-Each gets the help it needs: the declared model's coefficients are projected off, every effect comes in the way that
-fits it best (its sizes and the shapes they are at), columns have unit variance. None knows of trips but the lasso,
-whose folds are trips. Effects that the loop seeks elsewhere than in columns have no column here.
+Each gets the help it needs: the declared model's coefficients are projected off, what they take up whole is left out,
+every effect comes in the way that fits it best (its sizes and the shapes they are at), columns have unit variance.
+None knows of trips but the lasso, whose folds are trips. Effects that the loop seeks elsewhere than in columns have no
+column here.
 """
 
 import time
@@ -15,6 +16,7 @@ import numpy as np
 
 from experiments.oracle import fitted_with
 from hdev_jax.diagnosis.candidates import Candidate, columns
+from hdev_jax.diagnosis.evidence import ABSORBED
 from hdev_jax.diagnosis.look import Search, look
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.select import twins_of
@@ -86,7 +88,7 @@ def run_rivals(names: list[str], problem: Problem, split: Split) -> dict[str, di
     trip = np.asarray(problem.segments.trip)[train]
     beyond = _projected(jac[train], matrix[train])
     y = _projected(jac[train], residual[train][:, None])[:, 0]
-    seen = np.linalg.norm(beyond, axis=0) > 1e-6 * np.linalg.norm(matrix[train], axis=0)
+    seen = np.sum(beyond**2, axis=0) > ABSORBED * np.sum(matrix[train] ** 2, axis=0)
     best = _best_ways([c for c in candidates if seen[list(c.columns)].all()], beyond, y)
     at = [k for c in best.values() for k in c.columns]
     ids = [id_ for id_, c in best.items() for _ in c.columns]

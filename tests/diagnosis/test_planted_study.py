@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from experiments import planted_scores as scores
+from experiments import rivals
 from experiments.config import resolve, typed
 from experiments.oracle import noise_rmse, oracle_rmse
 from experiments.planted import Config, tasks
 from experiments.planted_rivals import outcome, rival_rows
 from experiments.planted_tables import collect
-from experiments.rivals import comparable, indistinguishable, run_rivals
+from experiments.rivals import comparable, indistinguishable
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
@@ -99,22 +100,22 @@ def test_not_decidable_holds_the_planted_effect_with_how_many_would_do():
 
 def test_a_rival_is_credited_by_the_same_classes_as_we_are():
     """auxiliary_power and a power sensor's offset are one column: for whoever names either."""
-    rivals = {
+    others = {
         "stlsq": {"named": ["power_gain"]}, "lasso_cv": {"named": ["auxiliary_power", "power_gain"]},
         "forward_bic": {"named": ["power_gain", "headwind"]},
     }  # fmt: skip
-    log = result(["power_gain", "auxiliary_power"], rivals=rivals)
+    log = result(["power_gain", "auxiliary_power"], rivals=others)
     planted = ["auxiliary_power"]
     assert outcome(planted, log, "ours") == (True, False)
     assert outcome(planted, log, "ours_first") == (False, True)
     assert outcome(planted, log, "stlsq") == (True, False)
     assert outcome(planted, log, "lasso_cv") == (True, False)
     assert outcome(planted, log, "forward_bic") == (False, True)
-    missed = result(rivals=rivals, alike={"auxiliary_power": ["power_gain"]})  # a class that we did not name
+    missed = result(rivals=others, alike={"auxiliary_power": ["power_gain"]})  # a class that we did not name
     assert outcome(planted, missed, "ours") == (False, False)
     assert outcome(planted, missed, "stlsq") == (True, False)
-    assert outcome(planted, result(rivals=rivals), "stlsq") == (False, True)
-    two = result(["power_gain", "auxiliary_power"], ["headwind"], rivals=rivals)
+    assert outcome(planted, result(rivals=others), "stlsq") == (False, True)
+    two = result(["power_gain", "auxiliary_power"], ["headwind"], rivals=others)
     assert outcome(["auxiliary_power", "headwind"], two, "forward_bic") == (True, False)
     assert outcome(["auxiliary_power", "headwind"], two, "stlsq") == (False, False)
 
@@ -217,10 +218,24 @@ def test_the_oracle_of_slow_noise_is_better_than_rows_of_equal_weight(tmp_path):
 
 
 @pytest.mark.slow
-def test_rivals_are_given_effects_of_two_sizes_and_classes_of_one_column(tmp_path):
+def test_what_one_column_cannot_tell_apart_is_one_class(tmp_path):
     effects = {"auxiliary_power": {"power_w": 8000.0}}
     synthetic, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
-    near = indistinguishable(["auxiliary_power"], synthetic, problem, split)["auxiliary_power"]
-    assert "power_gain" in near
-    named = run_rivals(["forward_bic"], problem, split)["forward_bic"]["named"]
-    assert set(named) & {"auxiliary_power", *near}
+    assert "power_gain" in indistinguishable(["auxiliary_power"], synthetic, problem, split)["auxiliary_power"]
+
+
+@pytest.mark.slow
+def test_rivals_are_given_every_size_and_nothing_that_is_absorbed(tmp_path, monkeypatch):
+    seen = []
+
+    def all_of_them(x, y, trip):
+        seen.append(x)
+        return np.arange(x.shape[1])
+
+    monkeypatch.setitem(rivals.SELECTORS, "forward_bic", all_of_them)
+    effects = {"hvac_power": {"below_w_per_k": 900.0, "above_w_per_k": 900.0}}
+    _, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
+    named = rivals.run_rivals(["forward_bic"], problem, split)["forward_bic"]["named"]
+    assert {"hvac_power", "headwind", "auxiliary_power", "power_gain"} <= set(named)
+    assert not {"grade_bias", "periodic_load", "mode_change"} & set(named)
+    assert seen[0].shape[1] > len(named), "heating and cooling are two columns of one effect"
