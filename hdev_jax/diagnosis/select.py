@@ -20,11 +20,11 @@ from hdev_jax.physics.vehicle import Target
 __all__ = ["choose", "prune", "search", "twins_of"]
 
 MOST_EFFECTS = 10
+MOST_TWINS = 2  # that are named beside an effect
 LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
 TRIES = 4  # rounds of refits in one step before the loop ends
-MOST_TWINS = 2  # that are named beside an effect
 STABLE = 0.25  # least share of resampled sets of clusters in which it comes first
 
 
