@@ -14,7 +14,6 @@ from hdev_jax.report.figures import WIDTH, short
 
 __all__ = ["errors", "sizes", "withheld"]
 
-NINETY = 1.645  # standard deviations to either side that hold 90 % of a normal distribution
 CONNECT, PALE = "#c4ccd3", "#7fb3d9"
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -46,7 +45,7 @@ def errors(blocks: Mapping[str, Sequence[tuple[str, float, float]]], title: str,
 
 
 def sizes(runs: Runs, title: str, head: str) -> bytes:
-    """One panel a size: the value of each training set with its 90 % bar, in the unit of diagnosis.json."""
+    """One panel a size: the value of each training set with its `interval_90`, in the unit of diagnosis.json."""
     rows = [row for row in size_rows(runs) if row.cells]
     columns = min(3, len(rows)) or 1
     deep = -(-len(rows) // columns) or 1
@@ -60,8 +59,10 @@ def sizes(runs: Runs, title: str, head: str) -> bytes:
             power = _power(row)
             for i, label in enumerate(labels):
                 if label in row.cells:
-                    value, sd = (x / 10.0**power for x in row.cells[label][1:])
-                    ax.errorbar(value, -i, xerr=NINETY * sd, fmt="o", color=AFTER, markersize=4.5, capsize=2.5)
+                    value = row.cells[label][1] / 10.0**power
+                    low, high = (x / 10.0**power for x in row.intervals[label])
+                    bar = [[value - low], [high - value]]
+                    ax.errorbar(value, -i, xerr=bar, fmt="o", color=AFTER, markersize=4.5, capsize=2.5)
                 else:
                     there = {p.partition(".")[0] for p in row.paths} & set(found_ids(runs[label]))
                     said = "found without this size" if there else "not found"
@@ -142,7 +143,7 @@ def _small(fig: Any) -> bytes:
 
 def _power(row: SizeRow) -> int:
     """The power of ten that an axis is drawn in: 0, or what brings very small or very large numbers to a few digits."""
-    largest = max(abs(value) + NINETY * sd for _, value, sd in row.cells.values())
+    largest = max(abs(x) for interval in row.intervals.values() for x in interval)
     exponent = math.floor(math.log10(largest)) if largest else 0
     return exponent if exponent < -2 or exponent > 4 else 0
 

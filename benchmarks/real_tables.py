@@ -32,11 +32,13 @@ IMPOSSIBLE = ("its best size has the wrong sign", "absorbed", "does nothing")
 
 @dataclass(frozen=True)
 class SizeRow:
-    """One size in one unit over the training sets: `cells[run]` is (path, value, sd), absent where not found."""
+    """One size in one unit over the training sets: `cells[run]` is (path, value, sd), absent where not found, and
+    `intervals[run]` its `interval_90`."""
 
     paths: tuple[str, ...]  # more than one where the log cannot tell the effects apart
     unit: str
     cells: dict[str, tuple[str, float, float]]
+    intervals: dict[str, tuple[float, float]]
 
     @property
     def label(self) -> str:
@@ -104,6 +106,7 @@ def size_rows(runs: Runs) -> list[SizeRow]:
     """Every fitted size of the effects found. Sizes of effects that a run calls one class share a row if their unit
     is the same and no run has two of them; what was chosen among a few (sd 0) is no size."""
     cells: dict[str, dict[str, tuple[str, float, float]]] = {}
+    intervals: dict[str, dict[str, tuple[float, float]]] = {}
     units: dict[str, str] = {}
     for run, result in runs.items():
         for e in result["effects"]:
@@ -111,16 +114,17 @@ def size_rows(runs: Runs) -> list[SizeRow]:
                 if p["sd"] > 0:
                     path = f"{e['id']}.{name}"
                     cells.setdefault(path, {})[run] = (path, p["value"], p["sd"])
+                    intervals.setdefault(path, {})[run] = tuple(p["interval_90"])
                     units[path] = p["unit"]
     groups: list[list[str]] = []
     for path in sorted(cells, key=lambda p: -len(cells[p])):
         home = next((g for g in groups if _one_class(path, g, runs, cells, units)), None)
         groups.append([path]) if home is None else home.append(path)
     order = all_found(runs)
-    rows = [
-        SizeRow(tuple(g), units[g[0]], {k: c for k in runs for p in g if (c := cells[p].get(k)) is not None})
-        for g in groups
-    ]
+    rows = []
+    for g in groups:
+        there = {k: c for k in runs for p in g if (c := cells[p].get(k)) is not None}
+        rows.append(SizeRow(tuple(g), units[g[0]], there, {k: intervals[c[0]][k] for k, c in there.items()}))
     return sorted(rows, key=lambda row: order.index(row.paths[0].partition(".")[0]))
 
 

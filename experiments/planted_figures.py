@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 
 from experiments.figures import save_figure, styled
+from experiments.planted_rivals import outcome
+from experiments.planted_scores import names
+from experiments.rivals import comparable
 from experiments.tables import wilson
 from hdev_jax.physics import LIBRARY
 from hdev_jax.report.canvas import figure, tidy
@@ -14,20 +17,25 @@ from hdev_jax.rundir import Run
 __all__ = ["confusion_figure", "false_figure", "power_figure"]
 
 Done = Sequence[tuple[dict[str, Any], dict[str, Any]]]
-COLOURS = {"ours": "#1b4f8a", "stlsq": "#c26a1f", "lasso_cv": "#3d8a5f", "forward_bic": "#8a3d6f"}
-LABELS = {"ours": "hdev_jax", "stlsq": "STLSQ (PySINDy)", "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}
-
-
-def _named(result: dict[str, Any], method: str, planted: list[str]) -> tuple[bool, bool]:
-    """Whether exactly what was planted was named, and whether anything else was."""
-    if method == "ours":
-        return result["exact"], any(not set(n["class"]) & set(planted) for n in result["named"])
-    named = set(result["rivals"][method]["named"])
-    return named == set(planted), bool(named - set(planted))
+COLOURS = {
+    "ours": "#1b4f8a",
+    "ours_first": "#7fb3d9",
+    "stlsq": "#c26a1f",
+    "lasso_cv": "#3d8a5f",
+    "forward_bic": "#8a3d6f",
+}
+LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, classes set aside", "stlsq": "STLSQ (PySINDy)",
+          "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}  # fmt: skip
 
 
 def _methods(rivals: Sequence[str]) -> list[str]:
-    return ["ours", *(r for r in rivals if r in COLOURS)]
+    known = [r for r in rivals if r in COLOURS]
+    return ["ours", *(["ours_first"] if known else []), *known]
+
+
+def _compared(done: Done, rivals: Sequence[str]) -> Done:
+    """All logs; those that rivals could name too, where there are any."""
+    return [(t, r) for t, r in done if not rivals or (r["rivals"] and comparable(t["effects"]))]
 
 
 @styled
@@ -36,6 +44,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
 
     Its caller leaves out what is planted to be called something else than by its name.
     """
+    done = _compared(done, rivals)
     single = [(t, r) for t, r in done if len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
     if not single:
         return
@@ -46,7 +55,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
             points = []
             for size in sorted({t["size"] for t, _ in single}):
                 hits = [
-                    _named(r, method, t["effects"])[0] for t, r in single if (t["size"], t["trips"]) == (size, trips)
+                    outcome(t["effects"], r, method)[0] for t, r in single if (t["size"], t["trips"]) == (size, trips)
                 ]
                 if hits:
                     points.append((size, np.mean(hits), *wilson(sum(hits), len(hits))))
@@ -69,16 +78,16 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
 @styled
 def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     """Share of logs with nothing planted in which something was named, by colour of the noise."""
-    empty = [(t, r) for t, r in done if not t["effects"]]
+    empty = [(t, r) for t, r in _compared(done, rivals) if not t["effects"]]
     if not empty:
         return
     noises = list(dict.fromkeys(t["noise"] for t, _ in empty))
-    methods = _methods(rivals)
+    methods = [m for m in _methods(rivals) if m != "ours_first"]  # no name is right here, with classes or without
     fig = figure(6.8, 3.6)
     axes = fig.add_subplot()
     for i, method in enumerate(methods):
         for k, noise in enumerate(noises):
-            hits = [_named(r, method, [])[1] for t, r in empty if t["noise"] == noise]
+            hits = [outcome([], r, method)[1] for t, r in empty if t["noise"] == noise]
             low, high = wilson(sum(hits), len(hits))
             x, y = k + 0.8 * (i + 0.5) / len(methods) - 0.4, float(np.mean(hits))
             axes.bar(x, 100 * y, 0.75 / len(methods), color=COLOURS[method], label=LABELS[method] if k == 0 else None)
@@ -99,12 +108,14 @@ def confusion_figure(run: Run, done: Done) -> None:
         return
     planted = list(dict.fromkeys(t["effects"][0] for t, _ in single))
     others = {n["id"] for t, r in single for n in r["named"]} - set(planted)
-    columns = [p for p in planted if p in LIBRARY] + sorted(others) + ["nothing"]
+    right = {p: names([p])[0] for p in planted}
+    columns = list(dict.fromkeys(r for r in right.values() if r in LIBRARY))
+    columns += [*sorted(others - set(columns)), "nothing"]
     share = np.zeros((len(planted), len(columns)))
     for i, p in enumerate(planted):
         logs = [r for t, r in single if t["effects"][0] == p]
         for r in logs:
-            for name in {p if p in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
+            for name in {right[p] if right[p] in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
     fig = figure(0.32 * len(columns) + 2.2, 0.3 * len(planted) + 1.8)
     axes = fig.add_subplot()

@@ -1,23 +1,31 @@
 """What others would do with the same residual and the same columns: sparse regression, lasso, forward BIC, boosting.
 
-Each gets the help it needs: the declared model's coefficients are projected off, every effect comes with the shape that
-fits it best, columns have unit variance. None knows of trips but the lasso, whose folds are trips.
+Each gets the help it needs: the declared model's coefficients are projected off, what they take up whole is left out,
+every effect comes in the way that fits it best (its sizes and the shapes they are at), columns have unit variance.
+None knows of trips but the lasso, whose folds are trips. Effects that the loop seeks elsewhere than in columns have no
+column here.
 """
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.candidates import columns
+from experiments.oracle import fitted_with
+from hdev_jax.diagnosis.candidates import Candidate, columns
+from hdev_jax.diagnosis.evidence import ABSORBED
+from hdev_jax.diagnosis.look import Search, look
 from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.select import twins_of
 from hdev_jax.diagnosis.split import Split
+from hdev_jax.fleet import SyntheticLog
 from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["run_rivals"]
+__all__ = ["comparable", "indistinguishable", "run_rivals"]
 
 
 def _stlsq(x: np.ndarray, y: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -77,21 +85,13 @@ def run_rivals(names: list[str], problem: Problem, split: Split) -> dict[str, di
     residual = problem.measured - problem.predict(fit.vehicle)
     jac = jacobian(fit.vehicle, fit.table, every.segments, problem.target)[: every.rows]
     candidates, matrix, _ = columns(fit.vehicle, list(LIBRARY.values()), every.segments, every.rows, problem.target)
-    single = {
-        k: c
-        for k, c in {c.columns[0]: c for c in candidates if len(c.columns) == 1}.items()
-        if np.any(matrix[train][:, k])
-    }
     trip = np.asarray(problem.segments.trip)[train]
     beyond = _projected(jac[train], matrix[train])
     y = _projected(jac[train], residual[train][:, None])[:, 0]
-    best: dict[str, tuple[float, int]] = {}
-    for k, c in single.items():
-        size = float(np.linalg.norm(beyond[:, k]))
-        if size > 1e-6 * np.linalg.norm(matrix[train][:, k]):
-            match = abs(float(beyond[:, k] @ y)) / size
-            best[c.id] = max(best.get(c.id, (0.0, k)), (match, k))
-    ids, at = list(best), [k for _, k in best.values()]
+    seen = np.sum(beyond**2, axis=0) > ABSORBED * np.sum(matrix[train] ** 2, axis=0)
+    best = _best_ways([c for c in candidates if seen[list(c.columns)].all()], beyond, y)
+    at = [k for c in best.values() for k in c.columns]
+    ids = [id_ for id_, c in best.items() for _ in c.columns]
     x = beyond[:, at] / np.std(beyond[:, at], axis=0)
     scaled = y / np.std(y)
     out: dict[str, dict[str, Any]] = {}
@@ -102,7 +102,7 @@ def run_rivals(names: list[str], problem: Problem, split: Split) -> dict[str, di
             named: list[str] = []
         else:
             chosen = SELECTORS[name](x, scaled, trip)
-            named = sorted(ids[k] for k in chosen)
+            named = sorted({ids[k] for k in chosen})
             design = np.concatenate([jac, matrix[:, [at[k] for k in chosen]]], axis=1)
             scale = np.maximum(np.linalg.norm(design[train], axis=0), 1e-300)
             beta = np.linalg.lstsq(design[train] / scale, residual[train], rcond=None)[0] / scale
@@ -110,6 +110,40 @@ def run_rivals(names: list[str], problem: Problem, split: Split) -> dict[str, di
         rmse = float(np.sqrt(np.mean((residual[test] - predicted) ** 2)))
         out[name] = {"named": named, "test_rmse": rmse, "seconds": time.perf_counter() - started}
     return out
+
+
+def comparable(planted: Sequence[str]) -> bool:
+    """Whether rivals could name all of it: what is sought elsewhere than in columns gives them no column."""
+    return not any(LIBRARY[k].searched for k in planted if k in LIBRARY)
+
+
+def indistinguishable(
+    planted: Sequence[str], synthetic: SyntheticLog, problem: Problem, split: Split
+) -> dict[str, list[str]]:
+    """For each planted effect of the library, the effects that the columns of this log cannot tell from it.
+
+    By the rule that makes the loop's classes, however large, from where all that is planted beside it is known: a
+    rival that names one of them is as right as a class.
+    """
+    inside = [k for k in planted if k in LIBRARY]
+    out = {}
+    for id_ in inside:
+        fit, loop = fitted_with([k for k in inside if k != id_], synthetic, problem, split)
+        view = look(replace(loop, effects=tuple(LIBRARY.values())), Search(fit.vehicle, fit.table, fit))
+        out[id_] = list(twins_of(view, view.best[id_])) if id_ in view.best else []
+    return out
+
+
+def _best_ways(candidates: Sequence[Candidate], x: np.ndarray, y: np.ndarray) -> dict[str, Candidate]:
+    """Of each effect the way that fits best, by BIC: one size, or several together."""
+    best: dict[str, tuple[float, Candidate]] = {}
+    for c in candidates:
+        a = x[:, list(c.columns)]
+        rest = y - a @ np.linalg.lstsq(a, y, rcond=None)[0]
+        score = len(y) * np.log(np.mean(rest**2)) + len(c.columns) * np.log(len(y))
+        if c.id not in best or score < best[c.id][0]:
+            best[c.id] = score, c
+    return {id_: c for id_, (_, c) in best.items()}
 
 
 def _projected(jac: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from experiments.data import MissingDataError
 from experiments.engine import run_config
 from experiments.log import Log
 from experiments.page import write_docs
-from experiments.planted import Config, exact, tasks
+from experiments.planted import Config, tasks
 from experiments.tables import wilson
 from hdev_jax.errors import InputError
 
@@ -172,24 +172,6 @@ def test_every_study_is_a_config(path):
     every = list(tasks(config))
     assert every
     assert len({t["seed"] for t in every}) == len(every), "each log has its own noise"
-
-
-@pytest.mark.parametrize(
-    ("planted", "classes", "is_exact"),
-    [
-        (["a"], [["a"]], True),
-        (["a"], [["b", "a"]], True),
-        (["a"], [["a"], ["b"]], False),
-        (["a"], [["b"]], False),
-        (["a"], [["a", "b", "c", "d"]], False),
-        (["a", "b"], [["b"], ["a"]], True),
-        (["a", "b"], [["b", "a"]], False),
-        ([], [], True),
-        ([], [["a"]], False),
-    ],
-)
-def test_what_counts_as_exactly_it(planted, classes, is_exact):
-    assert exact(planted, classes) == is_exact
 
 
 def test_intervals_of_shares():

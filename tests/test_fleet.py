@@ -51,7 +51,14 @@ FREE = Truth(c_rr=0.0, cda_m2=0.0, efficiency=1.0)
 
 def test_shares_no_code_with_the_physics():
     folder = Path(importlib.util.find_spec("hdev_jax.fleet").submodule_search_locations[0])
-    for file in ("__init__", "driving", "log", "truth"):  # the planted logs; the simulated fleet is the kernel's
+    for file in (
+        "__init__",
+        "driving",
+        "log",
+        "noise",
+        "plants",
+        "truth",
+    ):  # the planted logs; the simulated fleet is the kernel's
         for node in ast.walk(ast.parse((folder / f"{file}.py").read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
@@ -146,6 +153,13 @@ def test_wind_blows_from_where_it_says_and_drag_follows_the_air_speed():
         ("cornering", {"coefficient": 0.01}, 0.01 * 30e3 * 20**4 * 0.002**2),
         ("grade_bias", {"bias_rad": 1e-3}, 30e3 * 9.80665 * (np.sin(1e-3) + 0.006 * (np.cos(1e-3) - 1))),
         ("crosswind", {"drag_per_rad2": 2.0}, 0.5 * 1.225 * 5.6 * 400 * 2.0 * np.arctan2(4.0, 20.0) ** 2),
+        ("linear_cornering", {"share": 0.1}, 0.1 * 30e3 * 20**2 * 0.002),
+        ("hyperbolic_tyre_warmup", {"excess": 0.5, "distance_m": 50.0}, 30e3 * 9.80665 * 0.006 * 0.5 / 4),
+        (
+            "curved_rolling_temperature",
+            {"share": 0.1, "per_k": 0.05},
+            30e3 * 9.80665 * 0.006 * 0.1 * (np.exp(0.5) - 1),
+        ),
     ],
 )
 def test_force_of_an_effect_by_hand(effect, parameters, expected):
@@ -169,6 +183,12 @@ def test_battery_side_effects_by_hand():
     np.testing.assert_allclose(with_("regen_cutoff", speed_mps=19.0), base)
     np.testing.assert_allclose(with_("friction_blending", share=0.25), base * [1, 0.75, 1])
     np.testing.assert_allclose(with_("battery_resistance", resistance_ohm=0.1), base + 0.1 * (base / 650) ** 2)
+    half = with_("fading_regen_cutoff", none_below_mps=15.0, speed_mps=25.0)
+    np.testing.assert_allclose(half, np.where(base < 0, 0.5 * base, base))
+    np.testing.assert_allclose(with_("squared_hvac_power", w_per_k2=10.0, at_c=17.0), base + 10.0 * 3.0**2)
+    drive.columns["battery_temp_c"] = np.full(3, 10.0)
+    cold = with_("cold_battery_resistance", resistance_ohm=0.1, per_k=0.04)
+    np.testing.assert_allclose(cold, base + 0.1 * np.exp(0.4) * (base / 650) ** 2)
     np.testing.assert_allclose(with_("power_gain", gain=0.02, offset_w=50.0), 1.02 * base + 50)
     np.testing.assert_allclose(with_("auxiliary_power", power_w=3e3), base + 3e3)
     fade = with_("brake_drag", force_n=1e3, tau_s=30.0) - base
@@ -238,6 +258,44 @@ def test_same_seed_same_bytes_and_streams_are_independent():
     planted = synthetic_log(**SMALL, effects={"crosswind": {}})
     pd.testing.assert_frame_equal(plain.frame.drop(columns="energy_wh"), planted.frame.drop(columns="energy_wh"))
     np.testing.assert_array_equal(plain.truth["noise"], planted.truth["noise"])
+
+
+def test_a_channel_that_is_held_is_one_number_of_each_trip_and_nothing_else_of_the_road_changes():
+    moving, held = (synthetic_log(**SMALL, held=h, effects={"hvac_power": {}}) for h in ((), ("ambient_temp_c",)))
+    by_trip = held.frame.groupby("trip_id")["ambient_temp_c"]
+    assert (by_trip.nunique() == 1).all()
+    np.testing.assert_allclose(by_trip.mean(), moving.frame.groupby("trip_id")["ambient_temp_c"].mean(), rtol=1e-12)
+    assert (moving.frame.groupby("trip_id")["ambient_temp_c"].nunique() > 1).all()
+    follows = ["ambient_temp_c", "battery_temp_c", "energy_wh"]
+    pd.testing.assert_frame_equal(held.frame.drop(columns=follows), moving.frame.drop(columns=follows))
+    watts = held.truth["effect:hvac_power"] / held.frame["duration_s"] * 3600  # what happened follows what is written
+    expected = 350 * np.maximum(14 - held.frame["ambient_temp_c"], 0)
+    expected += 250 * np.maximum(held.frame["ambient_temp_c"] - 20, 0)
+    np.testing.assert_allclose(watts, expected, atol=1e-6)
+
+
+def test_a_sheet_that_knows_more_has_a_truth_nearer_to_it():
+    usual, sure = (synthetic_log(**SMALL, entry="shaft", table_sd=sd) for sd in ({}, {"motoring_efficiency": 0.01}))
+    sd = [tomllib.loads(x.sheet)["machine"]["motoring_efficiency"]["sd"] for x in (usual, sure)]
+    assert sd == [0.05, 0.01]
+    assert abs(sure.vehicle.motoring_efficiency - 0.93) <= 0.015 + 1e-9
+    np.testing.assert_allclose(sure.vehicle.regenerating_efficiency, usual.vehicle.regenerating_efficiency)
+
+
+def test_what_declared_coefficients_take_up_can_be_planted_and_has_no_size():
+    log = synthetic_log(**SMALL, entry="shaft", effects={"power_gain": {"gain": 0.05}})
+    assert log.ratio < 1e-9
+    np.testing.assert_allclose(log.truth["noise_free"], 1.05 * log.truth["baseline"], rtol=1e-12)
+    assert "power_gain" not in plantable("shaft")
+
+
+def test_what_stands_for_another_form_is_an_effect_of_the_library():
+    from hdev_jax.physics import LIBRARY
+
+    near = {k: p.like for k, p in PLANTABLE.items() if p.like}
+    assert len(near) >= 6
+    assert set(near.values()) <= set(LIBRARY)
+    assert not any(PLANTABLE[k].in_library or k in LIBRARY for k in near)
 
 
 @pytest.mark.parametrize("mode", ["segments", "samples"])
@@ -321,6 +379,8 @@ def test_the_demo_hides_one_effect_of_moderate_size():
     ({"noise": "pink"}, "noise: expected one of white"),
     ({"effects": {"step_change": {"auxiliary_w": 1e3, "trip": 99}}}, "changes nothing in this log"),
     ({"trips": 0}, "at least 1 trip"),
+    ({"held": ["heading_rad"]}, "held: unknown heading_rad; known: ambient_temp_c"),
+    ({"table_sd": {"mass_kg": 1.0}}, "table_sd: unknown mass_kg; known: c_rr"),
 ])  # fmt: skip
 def test_says_what_cannot_be_planted(kwargs, words):
     with pytest.raises(ValueError, match=words):

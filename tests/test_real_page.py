@@ -29,9 +29,10 @@ def block(rmse: float, trips=("A", "B")) -> dict:
 
 
 def effect(id_: str, path: str, value: float, sd: float, unit: str, twins=()) -> dict:
+    size = {"value": value, "sd": sd, "interval_90": [value - 3 * sd, value + 2 * sd], "unit": unit}
     return {
         "id": id_, "stage": "battery", "order": 1, "verdict": "one_of_class" if twins else "found",
-        "parameters": {path: {"value": value, "sd": sd, "unit": unit}, "shape": {"value": 1.0, "sd": 0.0, "unit": "1"}},
+        "parameters": {path: size, "shape": {"value": 1.0, "sd": 0.0, "unit": "1"}},
         "q_value": 1e-6, "stability": 0.97, "test_rmse_before": 12.0, "test_rmse_after": 9.0,
         "indistinguishable_from": list(twins),
     }  # fmt: skip
@@ -121,6 +122,19 @@ def test_sizes_of_one_class_share_a_row_and_a_unit(results):
     }
     assert shared.furthest() == pytest.approx(100.0 / np.hypot(600.0, 700.0))
     assert all("shape" not in path for paths in rows for path in paths)  # chosen among a few: no size
+
+
+def test_bars_of_sizes_are_the_intervals_of_the_diagnosis(results, monkeypatch):
+    """Few clusters: a size's distribution has heavier tails than its standard deviation says."""
+    import real_figures
+    from matplotlib.axes import Axes
+
+    drawn = []
+    monkeypatch.setattr(Axes, "errorbar", lambda self, x, y, xerr, **_: drawn.append((x, xerr)))
+    real_figures.sizes({"1": result([HEATING])}, "sizes", "fold")
+    ((value, ((below,), (above,))),) = drawn
+    assert value == 550.0
+    assert (below, above) == pytest.approx((240.0, 160.0))
 
 
 def test_sizes_of_effects_that_no_run_calls_one_class_stay_apart():

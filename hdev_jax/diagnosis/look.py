@@ -52,6 +52,7 @@ class Found:
     twins: tuple[str, ...]
     gain: float
     between: bool = False
+    alike: int = 0  # how many others would do in its place; `twins` are the best of them
 
 
 @dataclass(frozen=True)

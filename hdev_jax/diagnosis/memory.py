@@ -61,7 +61,7 @@ def _found(f: Found) -> dict[str, Any]:
     s, c = f.score, f.score.candidate
     return {
         "id": f.id, "q_value": f.q_value, "stability": f.stability, "twins": list(f.twins), "gain": f.gain,
-        "between": f.between,
+        "between": f.between, "alike": f.alike,
         "sizes": list(c.sizes), "groups": [-1 if g is None else g for g in c.groups], "kind": c.kind,
         "shapes": [[n, v] for n, v in c.shapes], "columns": list(c.columns), "beta": np.asarray(s.beta),
         "score": [s.gain, s.p_model, s.p_cluster, s.left_out_gain, s.left], "plain": s.plain,
@@ -83,4 +83,5 @@ def _score(plain: Mapping[str, Any], library: Mapping[str, type[Effect]]) -> Fou
         tuple(plain["twins"]),
         plain["gain"],
         bool(plain["between"]),
+        int(plain["alike"]),
     )

@@ -17,9 +17,10 @@ from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle, most_group
 from hdev_jax.physics.vehicle import Target
 
-__all__ = ["choose", "prune", "search"]
+__all__ = ["choose", "prune", "search", "twins_of"]
 
 MOST_EFFECTS = 10
+MOST_TWINS = 2  # that are named beside an effect
 LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
@@ -133,13 +134,16 @@ def choose(
                 view.reasons[c.id] = why
                 tell(f"turned down {c.id}: {why}")
                 continue
-            twins = _twins(view, s, problem)
+            alike = twins_of(view, s)
+            twins = alike[:MOST_TWINS]
             stability = _stability(problem, view, s, {c.id, *twins}, state.refused)
             if stability < STABLE:
                 view.reasons[c.id] = f"comes first in only {100 * stability:.0f} % of resampled sets of trips"
                 tell(f"turned down {c.id}: {view.reasons[c.id]}")
                 continue
-            found = Found(c.id, started, float(view.q[c.id]), stability, twins, float(gain), view.between(c))
+            found = Found(
+                c.id, started, float(view.q[c.id]), stability, twins, float(gain), view.between(c), len(alike)
+            )
             return replace(new, found=[*state.found, found])
     return None
 
@@ -178,8 +182,8 @@ def _placebo(problem: Loop, s: Score, view: View, draws: int = 19) -> str | None
     return "a placebo (its column shifted in time) does as well" if max(gains) >= s.gain else None
 
 
-def _twins(view: View, s: Score, problem: Loop) -> tuple[str, ...]:
-    """At most two other effects that, put in its place, leave the chosen one insignificant and explain as much."""
+def twins_of(view: View, s: Score) -> tuple[str, ...]:
+    """Other effects that, put in its place, leave the chosen one insignificant and explain as much, the best first."""
     total = view.evidence.totals()
     before = view.evidence.base_likelihood(total)
     out: list[tuple[float, str]] = []
@@ -196,7 +200,7 @@ def _twins(view: View, s: Score, problem: Loop) -> tuple[str, ...]:
             beside = float(stats.chi2.sf(2 * max(gain, 0.0), len(s.candidate.columns)))
         if rival > 0.8 * s.gain and beside > 0.05:
             out.append((-rival, id_))
-    return tuple(id_ for _, id_ in sorted(out)[:2])
+    return tuple(id_ for _, id_ in sorted(out))
 
 
 def _stability(problem: Loop, view: View, chosen: Score, names: set[str], refused: Sequence[str]) -> float:

@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder
 from hdev_jax.inference import Calibration, Coefficient, cluster_rows
 
-__all__ = ["baseline_block", "summarise"]
+__all__ = ["FAR", "baseline_block", "summarise"]
 
 ODD_SHARE = 0.2
 SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
@@ -75,6 +75,7 @@ def _effect_block(f: Found, fit: Calibration, before: float, after: float, clust
         "test_rmse_before": before,
         "test_rmse_after": after,
         "indistinguishable_from": list(f.twins),
+        "class_size": 1 + f.alike,
     }
 
 

@@ -1,7 +1,7 @@
 """Synthetic fleets with known truth: planted logs of one truck, and a whole fleet on thousands of routes.
 
-**Planted logs** (`driving`, `log`, `truth`): plain NumPy, nothing shared with `hdev_jax.physics`; for tests of the
-diagnosis.
+**Planted logs** (`driving`, `log`, `noise`, `plants`, `truth`): plain NumPy, nothing shared with `hdev_jax.physics`;
+for tests of the diagnosis.
 
 **The fleet** (all other modules): 28 variants of trucks, tractors and buses (`VARIANTS`), driven forward over roads,
 with the energy of each row from the kernel. In memory:
@@ -40,8 +40,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from hdev_jax.fleet.driving import Drive
-from hdev_jax.fleet.log import ENTRIES, NOISES, SyntheticLog, demo_log, size_effect, synthetic_log
-from hdev_jax.fleet.truth import PLANTABLE, Plant, Truth, plantable, power_w
+from hdev_jax.fleet.log import ENTRIES, SyntheticLog, demo_log, size_effect, synthetic_log
+from hdev_jax.fleet.noise import NOISES
+from hdev_jax.fleet.plants import PLANTABLE, Plant, plantable
+from hdev_jax.fleet.truth import Truth, power_w
 
 if TYPE_CHECKING:
     from hdev_jax.fleet.config import FleetConfig, load_config

@@ -5,18 +5,19 @@ speed limits, stops), the driver follows it within brake, comfort and power boun
 road segments of 60-140 m with standstill rows at the stops (`segments`), or samples at a fixed rate (`samples`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FINAL_DRIVE", "GEAR_RATIOS", "WHEEL_RADIUS_M", "Drive", "drive_trips", "smooth_noise"]
+__all__ = ["FINAL_DRIVE", "GEAR_RATIOS", "WHEEL_RADIUS_M", "Drive", "drive_trips", "hold", "smooth_noise"]
 
 Columns = dict[str, np.ndarray]
 
 GEAR_RATIOS = (9.16, 5.27, 3.33, 2.16)  # the example sheet of contract.md, section 2
 FINAL_DRIVE = 4.5  # keeps the shaft under 470 rad/s at 90 km/h
 WHEEL_RADIUS_M = 0.50  # 315/70 R22.5, loaded
+_HOLDS = ("ambient_temp_c", "air_density_kgpm3", "wind_speed_mps", "wet_road", "humidity_pct")
 _NODES = 10  # simulation steps in a road segment, about 10 m each
 _LIMITS_KMH = {"city": (30, 50, 50, 60), "regional": (50, 70, 80, 80), "motorway": (70, 80, 90, 90)}
 _POWER_W = 380e3  # traction power of the drive, bounds the driver's acceleration
@@ -270,3 +271,15 @@ def _rows(s, v, mass, road, stops, dwell, mode, sample_s, count) -> tuple[Column
         "altitude_m": np.interp(mid_s, road.s_m, climb),
     }
     return part, grade_at
+
+
+def hold(drive: Drive, channels: Collection[str]) -> None:
+    """Set these channels of the weather to their mean over each trip, in place.
+
+    **Raises:** `ValueError` for a channel of which a mean would mean nothing.
+    """
+    if unknown := set(channels) - set(_HOLDS):
+        raise ValueError(f"held: unknown {', '.join(sorted(unknown))}; known: {', '.join(_HOLDS)}")
+    trip = drive.columns["trip"]
+    for name in channels:
+        drive.columns[name] = (np.bincount(trip, drive.columns[name]) / np.bincount(trip))[trip]

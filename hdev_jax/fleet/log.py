@@ -4,20 +4,21 @@ Every log is labelled synthetic: in its sheet's name, its vehicle's name and `fr
 purpose (route, weather, vehicle, cycles, noise), so that the same seed drives the same roads whatever is planted.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from hdev_jax.fleet.driving import FINAL_DRIVE, GEAR_RATIOS, WHEEL_RADIUS_M, Drive, drive_trips, smooth_noise
-from hdev_jax.fleet.truth import PLANTABLE, Truth, power_w, shaft_channels
+from hdev_jax.fleet.driving import FINAL_DRIVE, GEAR_RATIOS, WHEEL_RADIUS_M, Drive, drive_trips, hold, smooth_noise
+from hdev_jax.fleet.noise import NOISES, noise_of_one, root_mean_square
+from hdev_jax.fleet.plants import PLANTABLE
+from hdev_jax.fleet.truth import Truth, power_w, shaft_channels
 
 __all__ = ["ENTRIES", "NOISES", "SyntheticLog", "demo_log", "size_effect", "synthetic_log"]
 
 ENTRIES = ("road", "shaft", "wheel")
-NOISES = ("white", "ar1", "ar1_white", "trip_levels", "student_t", "trip_variance")
 _SD = {"c_rr": 0.0008, "cda_m2": 0.5, "motoring_efficiency": 0.05, "regenerating_efficiency": 0.05}  # contract, 2
 _NUISANCE = ("humidity_pct", "cloud_cover", "gps_hdop", "tyre_pressure_kpa_display")
 _VEHICLE = "synthetic-truck-34t"
@@ -62,10 +63,6 @@ def _target(drive: Drive, truth: Truth, entry: str, effects: Mapping | None = No
     return power * drive.columns["duration_s"] / 3600 if drive.mode == "segments" else power / 1e3
 
 
-def _rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(x**2)))
-
-
 def _jacobian(drive: Drive, truth: Truth, entry: str) -> np.ndarray:
     """Columns of the coefficients that the sheet leaves open, by central differences of the baseline, scaled to 1."""
     names = ("c_rr", "cda_m2") if entry == "road" else ("motoring_efficiency", "regenerating_efficiency")
@@ -73,7 +70,7 @@ def _jacobian(drive: Drive, truth: Truth, entry: str) -> np.ndarray:
     for name in names:
         value = getattr(truth, name)
         up, down = (_target(drive, replace(truth, **{name: value * f}), entry, {}) for f in (1.0001, 0.9999))
-        columns.append((up - down) / _rms(up - down))
+        columns.append((up - down) / root_mean_square(up - down))
     return np.stack(columns, axis=1)
 
 
@@ -111,7 +108,7 @@ def size_effect(
 
     def reached(log_factor: float) -> float:
         fx = {effect: _scaled(truth, effect, parameters, float(np.exp(log_factor)), entry)}
-        return _rms(_beyond(jacobian, _target(drive, truth, entry, fx) - base))
+        return root_mean_square(_beyond(jacobian, _target(drive, truth, entry, fx) - base))
 
     low, high = -np.log(300.0), np.log(300.0)
     grid = np.linspace(low, high, 60)
@@ -129,35 +126,6 @@ def size_effect(
     if abs(reached(high) / rms - 1) > 1e-6:
         raise ValueError(f"{effect}: its energy jumps over RMS {rms:.4g}; match the noise with adjust='noise'")
     return _scaled(truth, effect, parameters, float(np.exp(high)), entry)
-
-
-def _ar1(innovations: np.ndarray, coefficient: float) -> np.ndarray:
-    """Stationary AR(1) along the last axis from unit-variance innovations."""
-    noise = np.empty_like(innovations)
-    noise[:, 0] = innovations[:, 0]
-    for k in range(1, innovations.shape[1]):
-        noise[:, k] = coefficient * noise[:, k - 1] + np.sqrt(1 - coefficient**2) * innovations[:, k]
-    return noise
-
-
-def _noise(rng: np.random.Generator, rows: np.ndarray, kind: str, coefficient: float) -> np.ndarray:
-    """Noise of RMS 1 over the log. `ar1_white`: a fifth of the variance is white; `trip_levels`: half of it is a level
-    by trip; `student_t`: innovations with three degrees of freedom; `trip_variance`: sizes log-normal by trip."""
-    trips, n = len(rows), int(rows.max())
-    white = rng.standard_normal((trips, n))
-    tails = rng.standard_t(3, (trips, n)) / np.sqrt(3.0)
-    other = rng.standard_normal((trips, n))
-    levels, sizes = rng.standard_normal((trips, 1)), np.exp(0.6 * rng.standard_normal((trips, 1)))
-    noise = {
-        "white": lambda: white,
-        "ar1": lambda: _ar1(white, coefficient),
-        "ar1_white": lambda: np.sqrt(0.8) * _ar1(white, coefficient) + np.sqrt(0.2) * other,
-        "trip_levels": lambda: np.sqrt(0.5) * (_ar1(white, coefficient) + levels),
-        "student_t": lambda: _ar1(tails, coefficient),
-        "trip_variance": lambda: sizes * _ar1(white, coefficient),
-    }[kind]()
-    flat = noise[np.arange(n)[None, :] < rows[:, None]]
-    return flat / _rms(flat)
 
 
 def _instruments(drive: Drive, truth: Truth, rng: np.random.Generator) -> None:
@@ -192,16 +160,18 @@ _KINEMATICS = {
 _SHAFT = {"road": (), "shaft": ("motor_torque_nm", "motor_speed_radps"), "wheel": ("traction_force_n",)}
 
 
-def _sheet(entry: str) -> str:
+def _sheet(entry: str, sd: Mapping[str, float]) -> str:
     """The vehicle sheet that goes with the log: the tabular values, nothing of what is planted."""
     head = 'name = "articulated truck, 34 t (synthetic)"\nmass_kg = 29000.0\n'
     if entry != "road":
         return head + (
-            "[machine]\nmotoring_efficiency     = { value = 0.93, sd = 0.05 }\n"
-            "regenerating_efficiency = { value = 0.93, sd = 0.05 }\n[battery]\nauxiliary_w = 0.0\n"
+            f"[machine]\nmotoring_efficiency     = {{ value = 0.93, sd = {sd['motoring_efficiency']:g} }}\n"
+            f"regenerating_efficiency = {{ value = 0.93, sd = {sd['regenerating_efficiency']:g} }}\n"
+            "[battery]\nauxiliary_w = 0.0\n"
         )
     return head + (
-        "[road]\nc_rr   = { value = 0.0060, sd = 0.0008 }\ncda_m2 = { value = 5.6, sd = 0.5 }\n"
+        f"[road]\nc_rr   = {{ value = 0.0060, sd = {sd['c_rr']:g} }}\n"
+        f"cda_m2 = {{ value = 5.6, sd = {sd['cda_m2']:g} }}\n"
         f"[driveline]\nefficiency = 0.91\ngear_ratios = {list(GEAR_RATIOS)}\nfinal_drive = {FINAL_DRIVE}\n"
         f"wheel_radius_m = {WHEEL_RADIUS_M}\n[battery]\nauxiliary_w = 0.0\n"
     )
@@ -222,7 +192,7 @@ def _check(entry: str, mode: str, noise: str, adjust: str, trips: int, rows: int
         if effect not in PLANTABLE:
             raise ValueError(f"{effect!r} cannot be planted; known: {', '.join(PLANTABLE)}")
         plant = PLANTABLE[effect]
-        if entry not in plant.entries or mode not in plant.modes:
+        if entry not in plant.entries + plant.absorbed or mode not in plant.modes:
             raise ValueError(f"{effect} needs entry {'|'.join(plant.entries)} and mode {'|'.join(plant.modes)}")
         known = {*plant.parameters, *plant.size}
         if unknown := set(parameters) - known:
@@ -244,6 +214,8 @@ def synthetic_log(
     entry: str = "road",
     mode: str = "segments",
     sample_s: float | int = 1.0,
+    held: Collection[str] = (),
+    table_sd: Mapping[str, float] | None = None,
 ) -> SyntheticLog:
     """A synthetic log of one truck.
 
@@ -260,12 +232,18 @@ def synthetic_log(
       the RMS of the baseline's target; `noise_rms` is absolute (Wh a row, or kW) and wins.
     - `entry`: road (slope and speed), shaft (torque and motor speed measured) or wheel (traction force measured).
     - `mode`: segments (target `energy_wh`) or samples every `sample_s` (target `battery_power_kw`).
+    - `held`: channels of the weather that stay at the trip's mean, in the log and in what happened.
+    - `table_sd`: how well the sheet says that it knows a coefficient, which is drawn about its value as loosely;
+      0.0008 for `c_rr`, 0.5 m² for `cda_m2` and 0.05 for the efficiencies otherwise.
 
     **Raises:** `ValueError` for what cannot be planted or sized.
     """
     wanted = {k: {n: float(x) for n, x in v.items()} for k, v in (effects or {}).items()}
     rows_per_trip = rows_per_trip or (250 if mode == "segments" else 1200)
     _check(entry, mode, noise, adjust, trips, rows_per_trip, wanted)
+    if unknown := set(table_sd or {}) - set(_SD):
+        raise ValueError(f"table_sd: unknown {', '.join(sorted(unknown))}; known: {', '.join(_SD)}")
+    table_sd = {**_SD, **(table_sd or {})}
     for effect, parameters in wanted.items():  # no size given: the default one; time constants and the like always
         plant = PLANTABLE[effect]
         sized = any(name in parameters for name in plant.size)
@@ -282,23 +260,24 @@ def synthetic_log(
     lengths = np.floor(rows_per_trip * route.uniform(0.7, 1.3, trips)).astype(int)
     lengths += np.diff(np.linspace(0, trips * rows_per_trip - lengths.sum(), trips + 1).round()).astype(int)
     drive = drive_trips(route, weather, rows=lengths, mode=mode, sample_s=float(sample_s))
-    draws = {k: getattr(Truth(), k) + sd * np.clip(vehicle.normal(), -1.5, 1.5) for k, sd in _SD.items()}
+    hold(drive, held)
+    draws = {k: getattr(Truth(), k) + sd * np.clip(vehicle.normal(), -1.5, 1.5) for k, sd in table_sd.items()}
     draws = {k: float(min(v, 0.97) if k.endswith("efficiency") else v) for k, v in draws.items()}
     truth = replace(Truth(), **draws, phase=tuple(cycles.random(trips).tolist()), lottery=_lottery(cycles, trips))
     _instruments(drive, truth, vehicle)
 
     baseline = _target(drive, truth, entry, {})
-    rms = noise_rms if noise_rms is not None else noise_level * _rms(baseline)
+    rms = noise_rms if noise_rms is not None else noise_level * root_mean_square(baseline)
     if wanted and ratio is not None and adjust == "effect":
         wanted = {k: size_effect(drive, truth, k, p, rms=ratio * rms, entry=entry) for k, p in wanted.items()}
     truth = replace(truth, effects=wanted)
     clean = _target(drive, truth, entry)
-    beyond = _rms(_beyond(_jacobian(drive, truth, entry), clean - baseline))
+    beyond = root_mean_square(_beyond(_jacobian(drive, truth, entry), clean - baseline))
     if wanted and not beyond > 0:
         raise ValueError(f"{', '.join(wanted)} changes nothing in this log: other parameters, or more rows")
     if wanted and ratio is not None and adjust == "noise":
         rms = beyond / ratio
-    error = rms * _noise(noises, lengths, noise, ar_coefficient)
+    error = rms * noise_of_one(noises, lengths, noise, ar_coefficient)
 
     target = "energy_wh" if mode == "segments" else "battery_power_kw"
     c = drive.columns
@@ -308,8 +287,9 @@ def synthetic_log(
     frame.attrs = {"synthetic": True, "seed": seed, "target": target}
     hidden = {"trip_id": trip, "time_s": c["time_s"], "noise_free": clean, "baseline": baseline, "noise": error}
     hidden |= {f"effect:{k}": _target(drive, truth, entry, {k: p}) - baseline for k, p in wanted.items()}
-    return SyntheticLog(frame, pd.DataFrame(hidden), _sheet(entry), truth, target, rms, beyond / rms if rms else np.inf,
-                        drive, entry)  # fmt: skip
+    ratio = beyond / rms if rms else np.inf
+    sheet = _sheet(entry, table_sd)
+    return SyntheticLog(frame, pd.DataFrame(hidden), sheet, truth, target, rms, ratio, drive, entry)
 
 
 def _lottery(rng: np.random.Generator, trips: int) -> tuple[float, ...]:

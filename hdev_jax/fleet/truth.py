@@ -9,6 +9,7 @@ Equations 3-5 of paper 1 with effects after `effects.md`, written a second time 
   (1 + gain)·torque + offset_nm. Measured power = (1 + gain)·P + offset_w, and lags by skew_s.
 - Order at the battery: driveline or machine, friction_blending, regen_cutoff, regen_limit, loads, voltage_dependence,
   battery_resistance, power_gain, sampling_filter, time_skew.
+- What the library holds in another form (`Plant.like`) comes where the library's effect does.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +20,7 @@ import numpy as np
 
 from hdev_jax.fleet.driving import FINAL_DRIVE, GEAR_RATIOS, WHEEL_RADIUS_M, Drive
 
-__all__ = ["PLANTABLE", "Plant", "Truth", "plantable", "power_w", "shaft_channels"]
+__all__ = ["Truth", "power_w", "shaft_channels"]
 
 G_MPS2 = 9.80665  # standard gravity, CGPM 1901
 AIR_DENSITY_KGPM3 = 1.225  # ISO 2533, sea level, 15 °C
@@ -43,79 +44,6 @@ class Truth:
     effects: Effects = field(default_factory=dict)
     phase: tuple[float, ...] = ()
     lottery: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
-class Plant:
-    """A plantable effect: its default parameters, the one that carries the size, and where a log can show it.
-
-    `null` is the value of `size` without the effect (infinite for a limit). `match` says which side gives way where a
-    ratio of effect to noise is asked for: "noise" where another size would be implausible, or jumps.
-    """
-
-    parameters: Mapping[str, float]
-    size: tuple[str, ...]
-    entries: tuple[str, ...] = ("road", "shaft", "wheel")
-    modes: tuple[str, ...] = ("segments", "samples")
-    null: float = 0.0
-    match: str = "effect"
-    in_library: bool = True
-
-
-_ROAD = ("road",)
-_SHAFT = ("shaft",)
-PLANTABLE: dict[str, Plant] = {
-    "auxiliary_power": Plant({"power_w": 4000.0}, ("power_w",)),
-    "hvac_power": Plant(
-        {"below_w_per_k": 350.0, "above_w_per_k": 250.0, "heat_c": 14.0, "cool_c": 20.0},
-        ("below_w_per_k", "above_w_per_k"),
-    ),
-    "cabin_warmup": Plant({"power_w": 9000.0, "tau_s": 400.0}, ("power_w",)),
-    "periodic_load": Plant({"power_w": 7000.0, "period_s": 300.0, "duty": 0.4}, ("power_w",)),
-    "standstill_load": Plant({"power_w": 9000.0}, ("power_w",)),
-    "constant_headwind": Plant({"speed_mps": 3.0}, ("speed_mps",), _ROAD, match="noise"),
-    "headwind": Plant({"scale": 0.98}, ("scale",), _ROAD, match="noise"),
-    "air_density": Plant({"scale": 1.0}, ("scale",), _ROAD, match="noise"),
-    "crosswind": Plant({"drag_per_rad2": 2.5}, ("drag_per_rad2",), _ROAD, match="noise"),
-    "rolling_speed": Plant({"per_mps2": 6e-6}, ("per_mps2",), _ROAD, match="noise"),
-    "rolling_temperature": Plant({"per_k": -6e-5}, ("per_k",), _ROAD, match="noise"),
-    "tyre_warmup": Plant({"excess": 0.4, "distance_m": 7000.0}, ("excess",), _ROAD, match="noise"),
-    "wet_road": Plant({"excess": 0.25, "spray": 0.12}, ("excess", "spray"), _ROAD, match="noise"),
-    "mass_scale": Plant({"scale": 0.06}, ("scale",), _ROAD),
-    "grade_bias": Plant({"bias_rad": 0.002}, ("bias_rad",), _ROAD, match="noise"),
-    "grade_lag": Plant({"lag_s": 3.0}, ("lag_s",), _ROAD),
-    "rotating_mass": Plant({"factor": 0.08}, ("factor",), _ROAD),
-    "speed_scale": Plant({"scale": 0.02}, ("scale",), _ROAD),
-    "cornering": Plant({"coefficient": 0.02}, ("coefficient",), _ROAD, match="noise"),
-    "driveline_drag": Plant({"torque_nm": 15.0}, ("torque_nm",), _ROAD),
-    "brake_drag": Plant({"force_n": 1500.0, "tau_s": 30.0}, ("force_n",), _ROAD),
-    "friction_blending": Plant({"share": 0.35}, ("share",)),
-    "regen_limit": Plant({"power_w": 90e3}, ("power_w",), null=np.inf),
-    "regen_cutoff": Plant({"speed_mps": 6.0}, ("speed_mps",), match="noise"),
-    "copper_loss": Plant({"w_per_nm2": 0.03}, ("w_per_nm2",), _SHAFT),
-    "iron_loss": Plant({"w_per_radps": 6.0, "w_per_radps2": 0.015}, ("w_per_radps", "w_per_radps2"), _SHAFT),
-    "inverter_loss": Plant({"standby_w": 0.0, "per_nm_w": 15.0}, ("standby_w", "per_nm_w"), _SHAFT, match="noise"),
-    "torque_offset": Plant({"offset_nm": 12.0, "gain": 0.0}, ("offset_nm", "gain"), _SHAFT),
-    "battery_resistance": Plant({"resistance_ohm": 0.08}, ("resistance_ohm",)),
-    "voltage_dependence": Plant({"per_v": 1.5e-3}, ("per_v",)),
-    "power_gain": Plant({"gain": 0.04, "offset_w": 0.0}, ("gain", "offset_w"), _ROAD),
-    "time_skew": Plant({"skew_s": 0.4}, ("skew_s",), modes=("samples",)),
-    "sampling_filter": Plant({"tau_s": 1.0}, ("tau_s",), modes=("samples",)),
-    "step_change": Plant({"auxiliary_w": 5000.0, "trip": 10.0}, ("auxiliary_w", "c_rr", "cda_m2")),
-    "mode_change": Plant(
-        {"regenerating_efficiency": 0.6, "share": 0.35}, ("regenerating_efficiency", "auxiliary_w", "c_rr", "cda_m2")
-    ),
-    "outside_thermal_cycle": Plant({"power_w": 8000.0, "period_s": 1500.0}, ("power_w",), in_library=False),
-    "outside_humidity_load": Plant(
-        {"power_w": 2500.0, "threshold_pct": 70.0}, ("power_w",), in_library=False, match="noise"
-    ),
-}
-
-
-def plantable(entry: str = "road", mode: str = "segments") -> tuple[str, ...]:
-    """Ids that a log of this entry and mode can carry, those outside the library of effects last."""
-    fits = [k for k, p in PLANTABLE.items() if entry in p.entries and mode in p.modes]
-    return tuple(sorted(fits, key=lambda k: not PLANTABLE[k].in_library))
 
 
 def _by_trip(trip: np.ndarray, values: np.ndarray, f: Callable[[slice, np.ndarray], np.ndarray]) -> np.ndarray:
@@ -188,8 +116,17 @@ def wheel_force_n(drive: Drive, truth: Truth, fx: Effects) -> np.ndarray:
         p, d = fx["tyre_warmup"], c["distance_m"]
         mid = _by_trip(c["trip"], d, lambda _, x: np.cumsum(x) - 0.5 * x)
         force = force + weight * c_rr * p["excess"] * np.exp(-mid / p["distance_m"])
+    if "hyperbolic_tyre_warmup" in fx:
+        p, d = fx["hyperbolic_tyre_warmup"], c["distance_m"]
+        mid = _by_trip(c["trip"], d, lambda _, x: np.cumsum(x) - 0.5 * x)
+        force = force + weight * c_rr * p["excess"] / (1 + mid / p["distance_m"]) ** 2
+    if "curved_rolling_temperature" in fx:  # stiffer rubber the colder, as an exponential
+        p = fx["curved_rolling_temperature"]
+        force = force + weight * c_rr * p["share"] * np.expm1(-p["per_k"] * (c["ambient_temp_c"] - 20.0))
     if "wet_road" in fx:
         force = force + weight * c_rr * fx["wet_road"]["excess"] * c["wet_road"]
+    if "linear_cornering" in fx:  # in proportion to the sideways force, not to its square
+        force = force + fx["linear_cornering"]["share"] * mass * v2 * np.abs(c["curvature_1pm"])
     if "cornering" in fx:
         force = force + fx["cornering"]["coefficient"] * mass * v2**2 * c["curvature_1pm"] ** 2
     if "brake_drag" in fx:
@@ -256,6 +193,9 @@ def _loads_w(c: Columns, truth: Truth, fx: Effects) -> np.ndarray:
         p, temp = fx["hvac_power"], c["ambient_temp_c"]
         load = load + p["below_w_per_k"] * np.maximum(p["heat_c"] - temp, 0.0)
         load = load + p["above_w_per_k"] * np.maximum(temp - p["cool_c"], 0.0)
+    if "squared_hvac_power" in fx:
+        p = fx["squared_hvac_power"]
+        load = load + p["w_per_k2"] * (c["ambient_temp_c"] - p["at_c"]) ** 2
     if "cabin_warmup" in fx:
         p = fx["cabin_warmup"]
         mean = p["tau_s"] / dt * -np.expm1(-dt / p["tau_s"])  # of the exponential over the row
@@ -293,6 +233,11 @@ def power_w(drive: Drive, truth: Truth, entry: str = "road", effects: Effects | 
     if "regen_cutoff" in fx:
         slow = c["distance_m"] / c["duration_s"] < fx["regen_cutoff"]["speed_mps"]
         power = np.where((power < 0) & slow, 0.0, power)
+    if "fading_regen_cutoff" in fx:  # from all to nothing between two speeds
+        p = fx["fading_regen_cutoff"]
+        width = max(p["speed_mps"] - p["none_below_mps"], 1e-9)
+        share = np.clip((c["distance_m"] / c["duration_s"] - p["none_below_mps"]) / width, 0.0, 1.0)
+        power = np.where(power < 0, share * power, power)
     if "regen_limit" in fx:
         power = np.maximum(power, -fx["regen_limit"]["power_w"])
     power = power + _loads_w(c, truth, fx)
@@ -300,6 +245,10 @@ def power_w(drive: Drive, truth: Truth, entry: str = "road", effects: Effects | 
         power = power * (1 + fx["voltage_dependence"]["per_v"] * (c["voltage_v"] - c["voltage_v"].mean()))
     if "battery_resistance" in fx:
         power = power + fx["battery_resistance"]["resistance_ohm"] * power**2 / c["voltage_v"] ** 2
+    if "cold_battery_resistance" in fx:
+        p = fx["cold_battery_resistance"]
+        ohm = p["resistance_ohm"] * np.exp(-p["per_k"] * (c["battery_temp_c"] - 20.0))
+        power = power + ohm * power**2 / c["voltage_v"] ** 2
     if "power_gain" in fx:
         power = (1 + fx["power_gain"]["gain"]) * power + fx["power_gain"]["offset_w"]
     if "sampling_filter" in fx:

@@ -1,17 +1,20 @@
 """Columns of candidates against refits of nothing: differences of whole vehicles. And a step of the loop kept."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hdev_jax.diagnosis import select
 from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Found, Search, Verdict
+from hdev_jax.diagnosis.look import Found, Search, Verdict, View
 from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.problem import Problem, prepare
+from hdev_jax.diagnosis.summary import _effect_block
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet
@@ -176,12 +179,31 @@ def state(problem, rows, gathered) -> Search:
         vehicle = vehicle.plus(effect)
         table = table.plus(*effect_coefficients(effect, c.sizes, groups=[str(g) for g in c.groups if g is not None]))
         score = Score(c, beta, 12.0, 1e-9, 1e-6, 8.0, 0.7, plain=effect_id == "tyre_warmup")
-        found.append(Found(effect_id, score, 1e-5, 0.97, ("headwind",), 11.0))
+        found.append(Found(effect_id, score, 1e-5, 0.97, ("headwind",), 11.0, alike=7))
     fit = calibrate(vehicle, table, rows, problem.target, cluster_rows(problem.segments))
     return Search(
         fit.vehicle, table, fit, found, [Verdict("drafting", None, 1.0, "no gap")], {"road.c_rr": ["mass_scale"]},
         ("headwind",), ("air_density",), {"tyre_warmup": [1.0, 2.0]}, True,
     )  # fmt: skip
+
+
+def test_a_class_is_told_with_its_size_before_it_was_cut(state):
+    block = _effect_block(state.found[0], state.fit, 2.0, 1.0, 8)
+    assert block["indistinguishable_from"] == ["headwind"]
+    assert block["class_size"] == 8
+
+
+def test_every_effect_that_would_do_is_counted(monkeypatch):
+    monkeypatch.setattr(select, "plausible", lambda _: True)
+    gains = {"a": 100.0, **{f"twin_{k}": 90.0 + k for k in range(7)}, "weak": 10.0, "absorbed": 99.0}
+    best = {k: Score.__new__(Score) for k in gains}
+    for k, score in best.items():
+        vars(score).update(candidate=SimpleNamespace(id=k, columns=(k,)), plain=True, gain=gains[k])
+    plain = SimpleNamespace(plain_score=lambda c: SimpleNamespace(gain=gains[c.id]), beside=lambda other, own: 0.5)
+    evidence = SimpleNamespace(totals=lambda: None, base_likelihood=lambda _: 0.0)
+    view = View.__new__(View)
+    vars(view).update(best=best, absorbed_by={"absorbed": "c_rr"}, plain=plain, evidence=evidence)
+    assert select.twins_of(view, best["a"]) == tuple(f"twin_{k}" for k in reversed(range(7)))
 
 
 def same(one: Any, other: Any) -> None:
@@ -214,6 +236,7 @@ def test_a_step_is_kept_and_comes_back(through, state, problem, rows, tmp_path):
     np.testing.assert_array_equal(predicted(problem, rows, again.vehicle), predicted(problem, rows, state.vehicle))
     same(to_plain(again), to_plain(state))
     assert again.finished
+    assert [f.alike for f in again.found] == [7, 7, 7]
     assert again.table == state.table
     assert [replace(f.score.candidate) for f in again.found] == [f.score.candidate for f in state.found]
     assert again.fit.table.structure == state.fit.table.structure

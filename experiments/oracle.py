@@ -1,0 +1,99 @@
+"""What a model that knows the cause makes of a log: its error on the same test trips, from the same training trips.
+
+The declared vehicle with what was planted, in the library's form and with the true shapes; sizes and declared
+coefficients are refitted as whitened rows have them, since that is where the loop may take its sizes from too.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hdev_jax.diagnosis.look import Loop
+from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.settle import settle
+from hdev_jax.diagnosis.split import Split
+from hdev_jax.fleet import SyntheticLog
+from hdev_jax.inference import Calibration, ParameterTable, calibrate, cluster_rows, effect_coefficients, padded
+from hdev_jax.physics import LIBRARY, Grouped, Vehicle, at_null, most_group
+
+__all__ = ["fitted_with", "noise_rmse", "oracle_rmse"]
+
+
+def noise_rmse(synthetic: SyntheticLog, problem: Problem, split: Split) -> float:
+    """RMS of the noise itself on the test trips, in the target's unit: no model does better but by luck."""
+    return float(np.sqrt(np.mean(synthetic.truth["noise"].to_numpy()[problem.rows(split.test)] ** 2)))
+
+
+def oracle_rmse(synthetic: SyntheticLog, problem: Problem, split: Split) -> float:
+    """The oracle's error on the test trips; the noise there, where the library does not hold what was planted."""
+    if any(_in_library(k, synthetic, split) is None for k in synthetic.vehicle.effects):
+        return noise_rmse(synthetic, problem, split)
+    fit, loop = fitted_with(list(synthetic.vehicle.effects), synthetic, problem, split)
+    settled, _ = settle(loop.ground(fit, loop.noise(fit)))
+    test = problem.rows(split.test)
+    return float(np.sqrt(np.mean((problem.measured - problem.predict(settled.vehicle))[test] ** 2)))
+
+
+def fitted_with(
+    ids: Sequence[str], synthetic: SyntheticLog, problem: Problem, split: Split
+) -> tuple[Calibration, Loop]:
+    """The declared vehicle with these of the planted effects, at their true shapes, calibrated on the training trips;
+    and the loop over those trips, without candidates. Raises `KeyError` where the library does not hold one."""
+    vehicle, table = problem.vehicle, problem.table
+    for id_ in ids:
+        vehicle, table = _with(id_, synthetic, split, vehicle, table)
+    train = problem.rows(split.train)
+    real = problem.segments.take(train)
+    rows, clusters = padded(real, problem.measured[train]), cluster_rows(real)
+    fit = calibrate(vehicle, table, rows, problem.target, clusters)
+    return fit, Loop(rows, problem.target, clusters, (), 0.05, np.random.default_rng(0), most_group(real))
+
+
+def _with(
+    id_: str, synthetic: SyntheticLog, split: Split, vehicle: Vehicle, table: ParameterTable
+) -> tuple[Vehicle, ParameterTable]:
+    values = _in_library(id_, synthetic, split)
+    if values is None:
+        raise KeyError(id_)
+    kind, null = LIBRARY[id_], at_null(LIBRARY[id_])
+    leaves: dict[str, Any] = {p.name: getattr(null, p.name) for p in kind.parameters}
+    leaves |= {p.name: None for p in kind.parameters if p.kind == "limit" and p.name not in values}
+    leaves |= {k: v if isinstance(v, Grouped) else np.asarray(float(v)) for k, v in values.items()}
+    effect = kind(**leaves)
+    sized = [p.name for p in kind.parameters if p.kind in ("size", "limit") and values.get(p.name)]
+    return vehicle.plus(effect), table.plus(*effect_coefficients(effect, sized, shapes=False))
+
+
+def _in_library(id_: str, synthetic: SyntheticLog, split: Split) -> dict[str, Any] | None:
+    """What was planted by the library's parameters, or None where the library has no such form.
+
+    Where a trip's phase or mode has to be known, it is that of the training trips: nobody knows the others.
+    """
+    truth, values = synthetic.vehicle, dict(synthetic.vehicle.effects[id_])
+    if id_ == "friction_blending":
+        values["above_pa"] = 0.0
+    if id_ == "voltage_dependence":
+        values["at_v"] = float(synthetic.drive.columns["voltage_v"].mean())
+    if id_ == "periodic_load":  # the truth's load comes on at its phase, the library's is centred there
+        values["phase"] = _of_training(np.array(truth.phase) - 0.5 * values["duty"], split)
+    if id_ == "step_change" and set(values) == {"auxiliary_w", "trip"}:
+        values = {"power_w": values["auxiliary_w"], "at_trip": values["trip"]}
+    if id_ == "mode_change" and set(values) == {"regenerating_efficiency", "share"}:
+        second = np.array(truth.lottery) < values["share"]
+        values = {
+            "regeneration": 1.0 - values["regenerating_efficiency"] / truth.efficiency,
+            "in_mode": _of_training(second, split),
+            "share": float(np.mean(second[list(split.train)])),
+        }
+    known = {p.name for p in LIBRARY[id_].parameters} if id_ in LIBRARY else set()
+    return values if set(values) <= known else None
+
+
+def _of_training(by_trip: np.ndarray, split: Split) -> Grouped:
+    """A number of each training trip, NaN for every other."""
+    values = np.full(len(by_trip) + 1, np.nan)
+    train = list(split.train)
+    values[train] = np.asarray(by_trip, dtype=float)[train]
+    return Grouped(jnp.asarray(values), "trip")
