@@ -23,6 +23,7 @@ __all__ = ["GROUP", "LinearFit", "Rows", "design", "linear_fit", "supported", "t
 GROUP = "coefficient_group"  # the channel that says which group's coefficients hold for a row
 PASSES = 8  # a kernel that is linear needs two, the second to see that it is
 ROBUST_PASSES = 24  # an outlier's weight falls by a factor a pass, with the noise that it is measured by
+LEAST_NOISE = 1e-5  # of what a usual change of the coefficient that tells most changes in a row
 SETTLED = 0.01  # relative change of the noise
 ENOUGH = 0.02  # posterior sds: a step that is shorter changes nothing that anyone would report
 
@@ -173,6 +174,7 @@ def linear_fit(
         summed = Statistics.zero(k, cells)
         for piece in read():
             summed = summed + _of_piece(vehicle, table, target, piece, at, scale, cells, bool(groups), tail)
+        summed = _no_perfect_log(summed, scale, np.array([c.scale for c in table.free]))
         data = summed if groups else summed.total()
         if first is None:  # as against a perfect log
             first = _noise(data) if noise is None else noise
@@ -219,6 +221,19 @@ def _of_piece(
         weight = weight * (STUDENT_DF + 1.0) / (STUDENT_DF + (r / tail) ** 2)
     ids = group if grouped else (whole(piece.cluster) if cells > 1 else np.zeros(size, dtype=int))
     return statistics(x * jnp.asarray(scale)[None, :], r, fit.measured, weight, ids, cells)
+
+
+def _no_perfect_log(
+    summed: Statistics, scale: Float[np.ndarray, " k"], unit: Float[np.ndarray, " k"]
+) -> Statistics:  # fmt: skip
+    """Rows with the noise that computed ones have: without any, the table's own width would go to 0 with the noise's,
+    also of what the rows do not tell.
+    """
+    effect = jnp.einsum("...kk,k->...k", summed.gram, jnp.asarray(unit / scale) ** 2)
+    least = (
+        LEAST_NOISE**2 * jnp.sum(effect, axis=tuple(range(effect.ndim - 1))) / jnp.maximum(jnp.sum(summed.rows), 1.0)
+    )
+    return eqx.tree_at(lambda s: s.square, summed, summed.square + summed.rows * jnp.max(least))
 
 
 def _noise(data: Statistics, first: float | None = None) -> float:

@@ -258,6 +258,16 @@ def test_clusters_that_agree_about_nothing_are_no_knowledge(noise):
     assert of_sum < 2.0 * noise / np.sqrt(100) + 0.02
 
 
+def test_a_log_without_noise_tells_no_more_than_its_rows_do():
+    """Computed to the last digit, at constant speed: the sum is known, how the two share it is the tables' word."""
+    s = constant_speed()
+    found = fit(s, power_kw(s, TRUTH))
+    assert np.all(found.sd > 0.5 * np.array([C_RR_SD, CDA_SD]))
+    assert "cannot be told apart" in " | ".join(caveats(found))
+    columns, _ = by_hand(s)
+    assert float(np.sqrt(columns[0] @ found.covariance @ columns[0])) < 1e-3
+
+
 @pytest.mark.parametrize("method", ["linear", "nuts"])
 def test_a_table_that_is_sure_and_wrong_is_no_good_fit(method):
     """c_rr held at three times its value drives C_d·A below zero: told, kept in range, not called good."""
