@@ -54,7 +54,7 @@ def told_apart(
         left = Remainder(**plain)
         told = checkpoint(
             f"formula-{round_}",
-            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, s, fresh(), p, f, r, tell),
+            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, train, s, fresh(), p, f, r, tell),
         )
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told["factors"]
@@ -70,8 +70,8 @@ def told_apart(
 
 
 def _formula(
-    problem: Problem, state: Search, loop: Loop, predicted: np.ndarray, first: Sequence[Mapping[str, Any]],
-    left: Remainder, tell: Tell,
+    problem: Problem, train: np.ndarray, state: Search, loop: Loop, predicted: np.ndarray,
+    first: Sequence[Mapping[str, Any]], left: Remainder, tell: Tell,
 ) -> dict[str, Any]:  # fmt: skip
     """A formula for what is left, as plain values; empty where none clears the bar. `first` is tried before others.
 
@@ -82,8 +82,8 @@ def _formula(
     found = find_expression(state, loop, problem.segments, predict=problem.predict, first=before)
     if found is None or (np.any(left.cycle_w) and found.state.found[-1].between):
         return {}
-    rms = float(np.sqrt(np.mean((found.predicted - predicted) ** 2)))
-    if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted) ** 2):
+    rms = float(np.sqrt(np.mean((found.predicted - predicted)[train] ** 2)))
+    if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted)[train] ** 2):
         return {}  # real perhaps, but it explains nothing
     channels = tuple(dict.fromkeys(f.name for f in found.factors))
     kept = {f.id for f in prune(found.loop, found.state, tell).found}
@@ -117,10 +117,8 @@ def _shadow(
     """A found effect that may be no more than the mean of the structure that is left, the latest first.
 
     The mean of a cause that the library does not hold is a constant load: one that reads no channel and explains less
-    than what is left is no cause of its own.
+    than what is left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
     """
-    if not left.significant:
-        return None
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect

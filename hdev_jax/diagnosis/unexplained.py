@@ -30,7 +30,7 @@ class Remainder:
     noise_floor_rmse: float
     depends_on: tuple[str, ...]
     signature: str
-    rms: float  # of the structure seen, in the target's unit; 0 where none is
+    rms: float  # of the structure that training rows alone show, in the target's unit; 0 where they show none
     cycle_w: Float[np.ndarray, " train"]  # the cycle's swing about each training row, 0 where none is or it is no power
     correction: Float[np.ndarray, " test"]
     expression: str | None = None
@@ -72,12 +72,11 @@ def remainder(
 
     The learner (LightGBM) is trained on training rows; its share is what it predicts of the test residual. It counts
     only where it also helps on training clusters left out of its own fit. The others ask whether whitened noise could
-    have done it.
+    have done it. What is reported is measured on test rows; `rms`, which decides what was found, never sees them.
     """
     tell("what is left: a flexible learner, validated by trip")
-    correction, p_learner, order = _learner(train, test, names, seed)
-    sst = float(np.sum(test.residual**2))
-    share = float(np.clip(1.0 - np.sum((test.residual - correction) ** 2) / max(sst, 1e-300), 0.0, 1.0))
+    correction, share_train, p_learner, order = _learner(train, test, names, seed)
+    share = _share(test.residual, correction)
     learned = p_learner < LEVEL and share > LEAST_SHARE
     tell("what is left: periods, change points, levels of trips")
     noise = estimate_noise(train.residual, train.trip, train.duration_s, levels=False)
@@ -86,8 +85,9 @@ def remainder(
     steps = _change_point(white, train.trip)
     level = _levels(train, noise)
     parts, depends, sizes = [], [], [0.0]
+    if p_learner < LEVEL and share_train > LEAST_SHARE:
+        sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
     if learned:
-        sizes.append(float(np.sqrt(share * np.mean(test.residual**2))))
         depends += list(order)
         parts.append(f"{100 * share:.0f} % of it follows {', '.join(order)} in a way the library does not hold")
     if period is not None:
@@ -123,8 +123,17 @@ def _colour(noise: Noise) -> str:
     return "independent from row to row" if abs(first) < 0.1 else f"correlated from row to row ({first:.2f})"
 
 
-def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[np.ndarray, float, tuple[str, ...]]:
-    """Correction on test rows, p of its gain on left-out training clusters, and the features it leans on."""
+def _share(residual: np.ndarray, predicted: np.ndarray) -> float:
+    """Share of a residual's squares that a prediction of it takes away, 0 at least."""
+    squares = float(np.sum(residual**2))
+    return float(np.clip(1.0 - np.sum((residual - predicted) ** 2) / max(squares, 1e-300), 0.0, 1.0))
+
+
+def _learner(
+    train: Rows, test: Rows, names: Sequence[str], seed: int
+) -> tuple[np.ndarray, float, float, tuple[str, ...]]:
+    """Correction on test rows, what share is predicted of training clusters left out in turn and its p, and the
+    features it leans on."""
     import lightgbm as lgb
 
     every = max(1, len(train.residual) // MOST_ROWS)  # neighbours say the same: a thinned log teaches as much
@@ -141,7 +150,7 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
         "deterministic": True, "force_row_wise": True, "max_bin": 127,
     }  # fmt: skip
     scale = float(np.std(train.residual)) + 1e-300
-    out_of_fold = np.zeros((rows, 2))
+    out_of_fold = np.zeros(rows)
     steps: list[int] = []
     for k in range(4):
         inside, outside = fold != k, fold == k
@@ -156,14 +165,14 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
         steps.append(max(booster.best_iteration, 0))
     rounds = int(np.median(steps)) if steps else 0
     if rounds < 2:
-        return np.zeros(len(test.residual)), 1.0, ()
+        return np.zeros(len(test.residual)), 0.0, 1.0, ()
     for k in range(4):
         inside, outside = fold != k, fold == k
         if outside.any() and inside.any():
             data = lgb.Dataset(train.features[inside], train.residual[inside] / scale, feature_name=_safe(names))
             booster = lgb.train(parameters, data, rounds)
-            out_of_fold[outside, 0] = np.asarray(booster.predict(train.features[outside])) * scale
-    gain = train.clusters.sums(train.residual**2 - (train.residual - out_of_fold[:, 0]) ** 2)
+            out_of_fold[outside] = np.asarray(booster.predict(train.features[outside])) * scale
+    gain = train.clusters.sums(train.residual**2 - (train.residual - out_of_fold) ** 2)
     size = train.clusters.sums(train.residual**2)
     relative = gain / np.mean(size)
     t = np.mean(relative) / (np.std(relative, ddof=1) / np.sqrt(len(relative)) + 1e-300)
@@ -174,7 +183,7 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
     importance = booster.feature_importance("gain")
     first = np.argsort(-importance)[:3]
     leading = tuple(str(names[int(i)]) for i in first if importance[i] > 0.15 * importance.sum())
-    return correction, p, leading
+    return correction, _share(train.residual, out_of_fold), p, leading
 
 
 def _safe(names: Sequence[str]) -> list[str]:
