@@ -85,12 +85,13 @@ class Described(Effect):
 
 @dataclass(frozen=True)
 class Expression:
-    """What was accepted: the formula with its coefficient, the channels in it, the prediction with it in place, and the
-    loop and the state that have it."""
+    """What was accepted: the formula with its coefficient, the channels in it, in how many ways it was sought, the
+    prediction with it in place, and the loop and the state that have it."""
 
     formula: str
     factors: tuple[Factor, ...]
     q_value: float
+    ways: float
     predicted: np.ndarray
     loop: Loop
     state: Search
@@ -201,16 +202,21 @@ def _terms(
 
 def find_expression(
     state: Search, problem: Loop, everything: Segments, *, predict: Callable[..., np.ndarray],
-    first: tuple[Factor, ...] = (), tell: Callable[[str], None] = lambda _: None,
+    first: tuple[Factor, ...] = (), ways: float = 1.0, tell: Callable[[str], None] = lambda _: None,
 ) -> Expression | None:  # fmt: skip
     """The monomial that clears every bar that an effect has to clear, at a stricter level; None where none does.
 
     **Arguments:** where the loop ended; its `problem` on training rows (whose effects are not looked at); `everything`,
-    the rows to predict with `predict(vehicle, segments)`; `first`, a monomial that is tried before all others.
+    the rows to predict with `predict(vehicle, segments)`; `first`, a monomial that is tried before all others, and in
+    how many `ways` it was sought on these rows before.
     """
     start = replace(state, refused=(), taken_out=())
-    if first and (found := _chosen(start, problem, *_best(start, problem, [first]), everything, predict, tell)):
-        return found
+    if first:
+        best, view = _best(start, problem, [first])
+        if best is not None and view is not None:
+            view.counted(Described.id, ways)  # the same rows chose it
+        if found := _chosen(start, problem, best, view, everything, predict, tell):
+            return found
     made = monomials(problem.rows.segments, problem.rows.rows)
     best, view = _best(start, problem, made)
     if best is None or view is None or view.q[Described.id] > problem.fdr:
@@ -252,4 +258,5 @@ def _chosen(
     formula = f"({value:.3g} ± {sd:.2g}) {_power_unit(factors)} · {words}"
     everything = everything.with_channels(**{TERM: product(factors, everything) / scale})
     predicted = predict(chosen.fit.vehicle, everything)
-    return Expression(formula, factors, chosen.found[-1].q_value, predicted, narrow, chosen)
+    ways = view.ways[Described.id]
+    return Expression(formula, factors, chosen.found[-1].q_value, ways, predicted, narrow, chosen)

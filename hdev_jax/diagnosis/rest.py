@@ -39,7 +39,7 @@ def told_apart(
     **Returns:** the state without effects that only stood in for what is left; the declared model's fit and that with
     each effect in turn; their predictions on all rows; and what is left.
     """
-    train, first = problem.rows(split.train), []
+    train, first = problem.rows(split.train), {}
 
     def fresh() -> Loop:  # what is kept of an earlier round draws nothing: every stage has its own numbers
         return replace(loop, rng=np.random.default_rng([seed, 999]))
@@ -57,7 +57,7 @@ def told_apart(
             lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, train, s, fresh(), p, f, r, tell),
         )
         if told:
-            left, first = _described(problem, split, left, told, predicted[-1]), told["factors"]
+            left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
             told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, fresh(), c, tell))
         gone = told["superfluous"] if told else []
@@ -71,15 +71,16 @@ def told_apart(
 
 def _formula(
     problem: Problem, train: np.ndarray, state: Search, loop: Loop, predicted: np.ndarray,
-    first: Sequence[Mapping[str, Any]], left: Remainder, tell: Tell,
+    first: Mapping[str, Any], left: Remainder, tell: Tell,
 ) -> dict[str, Any]:  # fmt: skip
-    """A formula for what is left, as plain values; empty where none clears the bar. `first` is tried before others.
+    """A formula for what is left, as plain values; empty where none clears the bar. That of the round before, `first`,
+    is tried before others.
 
     Where what is `left` is a cycle, what only trips tell is no formula: it would be the cycle's mean in each of them.
     """
     tell("what is left: a formula from the log's own channels")
-    before = tuple(Factor(**f) for f in first)
-    found = find_expression(state, loop, problem.segments, predict=problem.predict, first=before)
+    before = {"first": tuple(Factor(**f) for f in first["factors"]), "ways": first["ways"]} if first else {}
+    found = find_expression(state, loop, problem.segments, predict=problem.predict, **before)
     if found is None or (np.any(left.cycle_w) and found.state.found[-1].between):
         return {}
     rms = float(np.sqrt(np.mean((found.predicted - predicted)[train] ** 2)))
@@ -91,7 +92,7 @@ def _formula(
     again += [k for k in stand_ins(replace(found.loop, fdr=loop.fdr), found.state, channels, tell) if k in kept]
     return {
         "formula": found.formula, "factors": [asdict(f) for f in found.factors], "channels": list(channels),
-        "rms": rms, "predicted": found.predicted, "superfluous": again,
+        "rms": rms, "ways": found.ways, "predicted": found.predicted, "superfluous": again,
     }  # fmt: skip
 
 

@@ -9,8 +9,9 @@ from scipy import stats
 from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import CLOSE, LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
+from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
 from hdev_jax.diagnosis.modes import add_mode
+from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, plausible, worth
 from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened, without
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows

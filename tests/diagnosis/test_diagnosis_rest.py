@@ -61,7 +61,7 @@ def test_a_formula_that_explains_test_rows_alone_is_none(monkeypatch):
     found = bare(Expression, predicted=np.where(train, 0.01, 5.0))
     monkeypatch.setattr(rest, "find_expression", lambda *_, **__: found)
     left = bare(Remainder, cycle_w=np.zeros(200))
-    assert rest._formula(problem, train, bare(Search), bare(Loop), np.zeros(300), [], left, silent) == {}
+    assert rest._formula(problem, train, bare(Search), bare(Loop), np.zeros(300), {}, left, silent) == {}
 
 
 @pytest.mark.parametrize(("rms", "gone"), [(0.0, None), (0.1, None), (2.0, "power_gain")])
