@@ -226,7 +226,9 @@ class Evidence:
         better = self._loss(base, np.arange(self.base), 0) - self._loss(full, np.r_[np.arange(self.base), at], 0)
         t = float(np.mean(better) / (np.std(better) + 1e-300) * np.sqrt(g))
         gain = 0.5 * g * float(np.log1p(statistic))
-        left_out = gain if t > 1.0 else 0.0
+        # as much of it as clusters keep that are left out of the fit
+        kept = float(np.sum(better)) / max(self.gain(self.totals(), candidate.columns)[0], 1e-300)
+        left_out = gain * min(kept, 1.0) if t > 1.0 else 0.0
         return Score(candidate, beta, gain, p, p, left_out, self.left(self.totals(), candidate.columns), plain=True)
 
     def beside(self, other: Sequence[int], own: Sequence[int]) -> float:

@@ -8,11 +8,12 @@ from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import Evidence, Score
 from hdev_jax.diagnosis.significance import effective_number
 
-__all__ = ["CLOSE", "LEFT_OUT", "best_of", "plausible", "worth"]
+__all__ = ["CLOSE", "LEFT_OUT", "STABLE", "best_of", "plausible", "worth"]
 
 CERTAIN = 1e-6  # p below which it does not matter how small it is
 CLOSE = 0.85  # of what the best is worth, for a candidate to be about as good
 LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
+STABLE = 0.25  # least share of resampled sets of clusters in which it is chosen again
 
 
 def plausible(s: Score) -> bool:

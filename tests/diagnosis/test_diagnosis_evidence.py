@@ -250,6 +250,20 @@ def test_plain_rows_count_clusters_alone():
     assert one.gain == pytest.approx(0.5 * g * np.log1p(f / (g - 1)), rel=1e-6)
 
 
+@pytest.mark.parametrize("effect", [0.15, 0.6])
+def test_the_left_out_gain_of_plain_rows_is_of_clusters_left_out(effect):
+    """Its gain times the share that explicit refits without each cluster in turn keep of what one fit to all gains."""
+    rows = Rows(level=0.0, effect=effect)
+    score = rows.evidence().plain_score(candidate(0))
+    better = 0.0
+    for cluster in range(rows.clusters.count):
+        keep = rows.ids != cluster
+        better += rows.gls((), 0.0, keep)[2][cluster] - rows.gls((0,), 0.0, keep)[2][cluster]
+    kept = better / (rows.gls((0,), 0.0)[0] - rows.gls((), 0.0)[0])
+    assert 0.0 < kept < 1.0
+    assert score.left_out_gain == pytest.approx(score.gain * kept, rel=1e-6)
+
+
 # --- tests and their correction --------------------------------------------------------------------------------------
 
 
