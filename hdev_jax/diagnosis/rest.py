@@ -183,10 +183,14 @@ def _remainder(
         at = problem.rows(trips)
         segments = problem.segments.take(at)
         residual, seconds = (problem.measured - predicted)[at], np.asarray(segments.duration_s)
-        energy = problem.target == "energy_wh"  # a load in kW, whatever the rows' lengths
-        worth, unit = (seconds / SECONDS_PER_WH_OF_A_KW, "kW") if energy else (np.ones(len(seconds)), problem.unit)
+        worth, unit = np.ones(len(seconds)), problem.unit
+        if problem.target == "energy_wh":  # a load in kW, whatever the rows' lengths
+            worth, unit = seconds / SECONDS_PER_WH_OF_A_KW, "kW"
         trip = np.asarray(segments.trip)
-        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit)
+        weight = problem.weight()[at]
+        meters, energy = np.asarray(segments.distance_m), weight * np.abs(problem.measured[at])
+        amounts = {"time": seconds, "distance": meters, "energy": energy}
+        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit, weight, amounts)
 
     trip_names = problem.log.trip_names
     return remainder(side(split.train), side(split.test), names, problem.unit, trip_names, seed=seed, tell=tell)

@@ -36,7 +36,9 @@ def side(seed: int, *, size: float) -> Rows:
     features = rng.uniform(-1, 1, (n, 2))
     residual = size * np.where(np.abs(features[:, 0]) < 0.5, 1.0, -1.0) + rng.standard_normal(n)
     trip = np.repeat(np.arange(TRIPS), ROWS)
-    return Rows(features, residual, Clusters(trip, TRIPS, "trip"), trip, np.full(n, 2.0), np.ones(n), "kW")
+    amounts = {"time": np.full(n, 2.0), "distance": np.full(n, 20.0), "energy": np.ones(n)}
+    clusters = Clusters(trip, TRIPS, "trip")
+    return Rows(features, residual, clusters, trip, np.full(n, 2.0), np.ones(n), "kW", np.ones(n), amounts)
 
 
 def left_of(train: Rows, test: Rows) -> Remainder:
@@ -49,7 +51,14 @@ def test_what_decides_is_seen_on_training_rows_alone():
     there, gone = left_of(train, side(1, size=1.0)), left_of(train, side(1, size=0.0))
     assert there.significant
     assert there.share == pytest.approx(0.5, abs=0.1)
+    assert there.correction is not None
+    assert there.correction["channel"] == "humidity_pct"
+    at, value = np.array(there.correction["at"]), np.array(there.correction["value"])
+    clear = np.abs(np.abs(at) - 0.5) > 0.15  # a bin about the edge holds both
+    np.testing.assert_allclose(value[clear], np.where(np.abs(at[clear]) < 0.5, 1.0, -1.0), atol=0.4)
     assert not gone.significant
+    assert gone.correction is None
+    assert gone.scales_with is None
     assert gone.rms == there.rms == pytest.approx(1.0, abs=0.15)
     assert left_of(side(2, size=0.0), side(1, size=1.0)).rms == 0.0
 
