@@ -162,8 +162,10 @@ def test_trips_left_out_bear_a_mode_out():
     rng = np.random.default_rng(0)
     truth = np.array([0, 1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1.0])
     grams = _grams(rng, 0.5 * truth)
+    split = _split(grams, *NOTHING)
+    assert split is not None
     gain, p_cluster = _left_out(grams, *NOTHING, truth)
-    assert 20.0 < gain < _split(grams, *NOTHING)[0]
+    assert 20.0 < gain < split[0]
     assert p_cluster < 1e-4
     assert 0.8 < _stability(grams[None], *NOTHING, 0.05) <= 1.0
 
@@ -175,9 +177,10 @@ def test_noise_has_a_split_that_gains_and_none_that_holds():
     for _ in range(15):
         grams = _grams(rng, np.zeros(12))
         split = _split(grams, *NOTHING)
+        assert split is not None
         inside.append(split[0])
         outside.append(_left_out(grams, *NOTHING, split[1])[0])
-        again.append(_stability(grams[None, :, :, :], *NOTHING, 0.05 / 30))
+        again.append(_stability(grams[None], *NOTHING, 0.05 / 30))
     assert np.median(inside) > LEFT_OUT > max(outside)
     assert np.mean(again) < 0.1
 
