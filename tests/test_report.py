@@ -243,6 +243,18 @@ def test_one_of_a_class_names_the_others_and_how_to_tell(tmp_path):
     assert "To tell them apart: headings all around on one windy day" in text
 
 
+@pytest.mark.parametrize(("scale", "said"), [("distance", "distance"), (None, "neither time, distance nor energy")])
+def test_what_is_left_is_told_with_what_it_grows_with(scale, said, tmp_path):
+    data = fake("unexplained_structure")
+    curve = {"channel": "humidity_pct", "at": [40.0, 80.0], "value": [-1.25, 2.5], "unit": "Wh"}
+    data.summary["unexplained"] |= {"scales_with": scale, "correction": curve}
+    text = plain(written(data, tmp_path / "left"))
+    assert f"Grows with{said}" in text
+    assert "Unexplained, and in no vehicle." in text
+    assert "where humidity_pct is so much: 40.0: −1.2 Wh, 80.0: 2.5 Wh." in text
+    assert "Grows with" not in plain(written(fake("nothing_missing"), tmp_path / "bare"))
+
+
 def test_synthetic_data_are_labelled(tmp_path):
     text = written(fake(), tmp_path / "a")
     assert re.search(r"<title>synthetic", text)

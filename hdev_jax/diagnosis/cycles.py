@@ -7,15 +7,18 @@ otherwise stays unexplained.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import stats
+from scipy import special, stats
 
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict, barred
+from hdev_jax.diagnosis.ranking import LEFT_OUT, STABLE
 from hdev_jax.diagnosis.refit import joined
 from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.whiten import estimate_noise
@@ -34,6 +37,7 @@ WITHIN = 1.5  # of the shortest and the longest period, so that a fit may move
 COST = 3.0  # of each of its numbers, in log-likelihood
 LEAST_SHARE = 0.02  # of the residual's variance
 RESAMPLES = 100
+NEAR = 5  # periods, and duties, about the best that are asked again without some of the trips
 
 
 @dataclass(frozen=True)
@@ -98,11 +102,17 @@ def add_cycle(problem: Loop, state: Search) -> tuple[Search | None, Verdict | No
     share = float(np.mean((rows.worth * beta[0]) ** 2 * wave.duty * (1 - wave.duty)) / np.mean(residual**2))
     if gain < COST * freedoms or share < LEAST_SHARE:
         return None, Verdict(ID, gain, q, f"a cycle of {wave.period_s:.0f} s that explains too little for its numbers")
-    score = Score(c, beta, gain, hit.p, hit.p, gain - COST * freedoms, 1.0)
+    again = _profile(rows, wave)
+    left_out, stability = again.left_out_gain(), again.stability(COST * freedoms)
+    if left_out <= LEFT_OUT:
+        return None, Verdict(ID, gain, q, f"a cycle of {wave.period_s:.0f} s that trips left out do not bear out")
+    if stability < STABLE:
+        return None, Verdict(ID, gain, q, f"chosen in only {100 * stability:.0f} % of resampled sets of trips")
+    score = Score(c, beta, gain, hit.p, hit.p, left_out, 1.0)
     new = joined(problem, state, score, rows.noise) or joined(problem, state, score)
     if new is None:
         return None, Verdict(ID, gain, q, "in the joint refit it is out of range or not told from nothing")
-    found = Found(ID, score, q, _stability(gains, COST * freedoms), (), gain)
+    found = Found(ID, score, q, stability, (), gain)
     return replace(new, found=[*state.found, found]), None
 
 
@@ -183,15 +193,22 @@ def _fundamental(rows: _Rows, period_s: float, width: float) -> _Wave:
     return _Wave(best[1], 0.5, best[2])
 
 
+def _differ(sizes: np.ndarray, precision: np.ndarray, times: np.ndarray) -> bool:
+    """Whether sizes differ between trips, each counted so many times, by more than chance and by much of themselves."""
+    weight = precision * times
+    mean = float(np.sum(weight * sizes) / np.sum(weight))
+    chi2, freedom = float(np.sum(weight * (sizes - mean) ** 2)), float(np.sum(times)) - 1
+    if freedom < 1 or stats.chi2.sf(chi2, freedom) >= UNLIKE:
+        return False
+    between = max(chi2 - freedom, 0.0) / (np.sum(weight) - np.sum(weight * precision) / np.sum(weight))
+    return bool(np.sqrt(between) > SPREAD * mean)
+
+
 def _unlike(
     rows: _Rows, wave: _Wave, square: np.ndarray, gains: np.ndarray, sizes: np.ndarray, sd: np.ndarray
 ) -> str | None:
     """Why it is not one load that is switched in every trip, or None."""
-    weight = 1.0 / sd**2
-    mean = float(np.sum(weight * sizes) / np.sum(weight))
-    chi2, freedom = float(np.sum(weight * (sizes - mean) ** 2)), len(sizes) - 1
-    between = max(chi2 - freedom, 0.0) / (np.sum(weight) - np.sum(weight**2) / np.sum(weight)) if freedom else 0.0
-    if freedom and stats.chi2.sf(chi2, freedom) < UNLIKE and np.sqrt(between) > SPREAD * mean:
+    if _differ(sizes, 1.0 / sd**2, np.ones(len(sizes))):
         return f"a cycle of {wave.period_s:.0f} s, but not of the same size in every trip"
     angle = 2 * np.pi * (rows.clock_s / wave.period_s + wave.phase[rows.place])
     others = np.stack([f(k * angle) for k in (1, 2, 3) for f in (np.cos, np.sin)], axis=1)
@@ -204,8 +221,62 @@ def _unlike(
     return None
 
 
-def _stability(gains: np.ndarray, cost: float) -> float:
-    """Share of resampled sets of trips in which it gains more than its numbers cost."""
-    rng = np.random.default_rng(0)
-    draws = rng.integers(0, len(gains), (RESAMPLES, len(gains)))
-    return float(np.mean(np.sum(gains[draws], axis=1) > cost))
+@dataclass(frozen=True)
+class _Profile:
+    """What whitened rows of each trip say of waves near the best one, at phases `step` apart about the trip's own."""
+
+    cross: Float[np.ndarray, "wave trip phase"]  # of the wave's column of 1 W with the residual
+    square: Float[np.ndarray, "wave trip phase"]
+    step: float
+
+    @cached_property
+    def own(self) -> tuple[Float[np.ndarray, "wave trip"], Float[np.ndarray, "wave trip"]]:
+        """`cross` and `square` at the phase that suits each trip best."""
+        gain = np.where(self.cross > 0, self.cross, 0.0) ** 2 / self.square
+        at = np.argmax(gain, axis=2)[..., None]
+        return np.take_along_axis(self.cross, at, 2)[..., 0], np.take_along_axis(self.square, at, 2)[..., 0]
+
+    def _chosen(self, weight: Float[np.ndarray, " trip"]) -> tuple[int, float, float]:
+        """The best wave of trips that count so many times, its gain and its size."""
+        cross, square = (x @ weight for x in self.own)
+        gain = 0.5 * np.maximum(cross, 0.0) ** 2 / (square + 1e-300)
+        k = int(np.argmax(gain))
+        return k, float(gain[k]), float(cross[k] / (square[k] + 1e-300))
+
+    def left_out_gain(self) -> float:
+        """Gain in log-likelihood over trips left out in turn: wave and size are the others', and the phase is unknown.
+
+        Phases far from the trip's own add next to nothing and are left out of the mean: a little less than it is.
+        """
+        total, trips = 0.0, self.cross.shape[1]
+        for t in range(trips):
+            k, _, size = self._chosen((np.arange(trips) != t).astype(float))
+            each = size * self.cross[k, t] - 0.5 * size**2 * self.square[k, t]
+            total += float(special.logsumexp(each) + np.log(self.step))
+        return total
+
+    def stability(self, cost: float) -> float:
+        """Share of resampled sets of trips in which a cycle is chosen again: of one size, and worth its numbers."""
+        rng, trips, hits = np.random.default_rng(0), self.cross.shape[1], 0
+        for _ in range(RESAMPLES):
+            weight = np.bincount(rng.integers(0, trips, trips), minlength=trips).astype(float)
+            k, gain, _ = self._chosen(weight)
+            cross, square = (x[k] for x in self.own)
+            hits += gain > cost and not _differ(cross / square, square, weight)
+        return hits / RESAMPLES
+
+
+def _profile(rows: _Rows, wave: _Wave) -> _Profile:
+    """The waves near one: periods that its trips can just tell apart, duties, and phases of each trip."""
+    longest = max(float(np.sum(rows.duration_s[s])) for s in rows.slices)
+    periods = wave.period_s * (1 + 0.2 * wave.period_s / longest * np.linspace(-1, 1, NEAR))
+    duties = np.unique(np.clip(wave.duty + 0.1 * np.linspace(-1, 1, NEAR), 0.05, 0.95))
+    shifts, step = np.linspace(-0.1, 0.1, PHASES, retstep=True)
+    middle = np.array([np.mean(rows.clock_s[s]) for s in rows.slices])
+    out = []
+    for period, duty in product(periods, duties):
+        near = _Wave(float(period), float(duty), wave.phase + middle / wave.period_s - middle / period)
+        columns = rows.met(np.stack([rows.load(near, near.phase + x) for x in shifts], axis=1))
+        out.append([(columns[s].T @ rows.white[s], np.sum(columns[s] ** 2, axis=0) + 1e-300) for s in rows.slices])
+    both = np.array(out)  # [wave, trip, cross or square, phase]
+    return _Profile(both[:, :, 0], both[:, :, 1], float(step))

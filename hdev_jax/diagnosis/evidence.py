@@ -149,6 +149,21 @@ class Evidence:
             shares.append(1.0 - float(c @ x) / max(gram[j, j], 1e-300))
         return min(shares)
 
+    def projected(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "left left"]:
+        """Gram matrix of columns with the base columns taken off, as far as their prior lets those move.
+
+        Tests are of these: columns that all hold a large constant look alike, what is left of them need not. Columns
+        that nothing is left of are not in it.
+        """
+        none, totals = np.empty(0, int), self.totals()
+        v = int(np.argmax(self._fit(totals, none)[0]))
+        normal, at = self._normal(totals[v], none)[0], self.base + at
+        d = np.sqrt(np.diag(normal))
+        own, cross = totals[v][np.ix_(at, at)], totals[v][: self.base, at] / d[:, None]
+        out = own - cross.T @ np.linalg.pinv(normal / np.outer(d, d), hermitian=True) @ cross
+        there = np.diag(out) > 1e-9 * np.diag(own)
+        return out[np.ix_(there, there)]
+
     def score(self, candidate: Candidate) -> Score:
         """All tests of one candidate."""
         totals = self.totals()
@@ -211,7 +226,9 @@ class Evidence:
         better = self._loss(base, np.arange(self.base), 0) - self._loss(full, np.r_[np.arange(self.base), at], 0)
         t = float(np.mean(better) / (np.std(better) + 1e-300) * np.sqrt(g))
         gain = 0.5 * g * float(np.log1p(statistic))
-        left_out = gain if t > 1.0 else 0.0
+        # as much of it as clusters keep that are left out of the fit
+        kept = float(np.sum(better)) / max(self.gain(self.totals(), candidate.columns)[0], 1e-300)
+        left_out = gain * min(kept, 1.0) if t > 1.0 else 0.0
         return Score(candidate, beta, gain, p, p, left_out, self.left(self.totals(), candidate.columns), plain=True)
 
     def beside(self, other: Sequence[int], own: Sequence[int]) -> float:

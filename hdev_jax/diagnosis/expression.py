@@ -1,9 +1,9 @@
 """A formula for what is left where the library has none: sparse search over monomials of the log's channels.
 
-Each monomial is a power at the battery, k times a product of channels, and goes through the kernel, the scores, the
-joint refit and the placebos as an effect of the library does; trying many of them counts. Its coefficient has the unit
-that makes the product a power. What is accepted is a description, not a cause: it is labelled as not in the library
-and is added to no vehicle.
+Each monomial is a power at the battery (where force or torque is the target, a force at the wheels), k times a product
+of channels, and goes through the kernel, the scores, the joint refit and the placebos as an effect of the library does;
+trying many of them counts. Its coefficient has the unit that makes the product a power (a force). What is accepted is a
+description, not a cause: it is labelled as not in the library and is added to no vehicle.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,12 +20,13 @@ from jaxtyping import Array
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.look import Loop, Search, View, look
 from hdev_jax.diagnosis.select import choose
+from hdev_jax.inference.sheet import BATTERY_TARGETS
 from hdev_jax.physics import Effect, Parameter, Vehicle
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 from hdev_jax.units import registry, unit_of
 
-__all__ = ["TERM", "Described", "Expression", "Factor", "find_expression", "monomials"]
+__all__ = ["TERM", "Described", "DescribedForce", "Expression", "Factor", "find_expression", "monomials"]
 
 STRICTER = 5.0  # a description of the rest has to clear a level so much lower than a cause does
 MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds of columns
@@ -83,23 +84,45 @@ class Described(Effect):
         return self.k * row.channels[TERM]
 
 
+class DescribedForce(Effect):
+    """k times a column that was made for it, as a force at the wheels: for targets that the battery lies behind."""
+
+    id: ClassVar = Described.id
+    stage: ClassVar = "road"
+    order: ClassVar = 80
+    equation: ClassVar = Described.equation
+    source: ClassVar = Described.source
+    needs: ClassVar = (TERM,)
+    entries: ClassVar = ("road",)
+    parameters: ClassVar = (Parameter("k", "N", 0.0, 100.0),)
+    k: Any
+
+    def force(self, row, car):
+        return self.k * row.channels[TERM]
+
+
+def _describing(target: Target) -> type[Effect]:
+    return Described if target in BATTERY_TARGETS else DescribedForce
+
+
 @dataclass(frozen=True)
 class Expression:
-    """What was accepted: the formula with its coefficient, the channels in it, the prediction with it in place, and the
-    loop and the state that have it."""
+    """What was accepted: the formula with its coefficient, the channels in it, in how many ways it was sought, the
+    prediction with it in place, and the loop and the state that have it."""
 
     formula: str
     factors: tuple[Factor, ...]
     q_value: float
+    ways: float
     predicted: np.ndarray
     loop: Loop
     state: Search
 
 
-def _power_unit(factors: Sequence[Factor]) -> str:
-    """The coefficient's unit: a watt over the product of the factors' units."""
+def _coefficient_unit(factors: Sequence[Factor], of: str) -> str:
+    """The coefficient's unit: that of the whole (`W`, `N`) over the product of the factors' units."""
     ureg = registry()
-    unit = ureg.Quantity(1.0, "watt")
+    unit = ureg.Quantity(1.0, of)
     for f in factors:
         unit = unit / ureg.Quantity(1.0, f.unit())
     return f"{unit.units:~P}"
@@ -144,7 +167,7 @@ class Terms:
     @property
     def candidates(self) -> list[Candidate]:
         """One for each monomial."""
-        return [Candidate(Described, ("k",), (None,), (), "size", (i,)) for i in range(self.width)]
+        return [Candidate(_describing(self.target), ("k",), (None,), (), "size", (i,)) for i in range(self.width)]
 
     @property
     def left_out(self) -> dict[str, str]:
@@ -157,7 +180,7 @@ class Terms:
         return len(self.sets)
 
     def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
-        """Write what a watt times each monomial adds to the target, through the whole vehicle, into `out`."""
+        """Write what 1 W (or 1 N) times each monomial adds to the target, through the whole vehicle, into `out`."""
         wanted = list(range(self.width) if at is None else at)
         segments = jax.tree.map(jnp.asarray, segments)
         for start in range(0, len(wanted), TOGETHER):
@@ -196,21 +219,26 @@ def _terms(
         scale = float(np.sqrt(np.mean(term**2)))
         if np.isfinite(scale) and np.std(term) > 1e-9 * scale > 0:
             sets, scales = [*sets, factors], [*scales, scale]
-    return Terms(tuple(sets), tuple(scales), vehicle.plus(Described(np.asarray(1.0))), target)
+    return Terms(tuple(sets), tuple(scales), vehicle.plus(_describing(target)(np.asarray(1.0))), target)
 
 
 def find_expression(
     state: Search, problem: Loop, everything: Segments, *, predict: Callable[..., np.ndarray],
-    first: tuple[Factor, ...] = (), tell: Callable[[str], None] = lambda _: None,
+    first: tuple[Factor, ...] = (), ways: float = 1.0, tell: Callable[[str], None] = lambda _: None,
 ) -> Expression | None:  # fmt: skip
     """The monomial that clears every bar that an effect has to clear, at a stricter level; None where none does.
 
     **Arguments:** where the loop ended; its `problem` on training rows (whose effects are not looked at); `everything`,
-    the rows to predict with `predict(vehicle, segments)`; `first`, a monomial that is tried before all others.
+    the rows to predict with `predict(vehicle, segments)`; `first`, a monomial that is tried before all others, and in
+    how many `ways` it was sought on these rows before.
     """
     start = replace(state, refused=(), taken_out=())
-    if first and (found := _chosen(start, problem, *_best(start, problem, [first]), everything, predict, tell)):
-        return found
+    if first:
+        best, view = _best(start, problem, [first])
+        if best is not None and view is not None:
+            view.counted(Described.id, ways)  # the same rows chose it
+        if found := _chosen(start, problem, best, view, everything, predict, tell):
+            return found
     made = monomials(problem.rows.segments, problem.rows.rows)
     best, view = _best(start, problem, made)
     if best is None or view is None or view.q[Described.id] > problem.fdr:
@@ -249,7 +277,9 @@ def _chosen(
     at = next(i for i, c in enumerate(chosen.fit.table.free) if c.path == "effects.expression.k")
     value, sd = chosen.fit.values[at] / scale, chosen.fit.sd[at] / scale
     words = "·".join(f.words() for f in factors)
-    formula = f"({value:.3g} ± {sd:.2g}) {_power_unit(factors)} · {words}"
+    unit = _coefficient_unit(factors, _describing(problem.target).parameters[0].unit)
+    formula = f"({value:.3g} ± {sd:.2g}) {unit} · {words}"
     everything = everything.with_channels(**{TERM: product(factors, everything) / scale})
     predicted = predict(chosen.fit.vehicle, everything)
-    return Expression(formula, factors, chosen.found[-1].q_value, predicted, narrow, chosen)
+    ways = view.ways[Described.id]
+    return Expression(formula, factors, chosen.found[-1].q_value, ways, predicted, narrow, chosen)

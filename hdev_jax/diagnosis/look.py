@@ -9,8 +9,9 @@ from hdev_jax.diagnosis.candidates import Candidate, Source, plan_of
 from hdev_jax.diagnosis.chunks import CHUNK_ROWS, Shapes, chunks_of_fit
 from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.facts import Facts, facts_of
+from hdev_jax.diagnosis.ranking import LEFT_OUT, best_of, plausible
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import adjusted, clusters_needed, effective_number
+from hdev_jax.diagnosis.significance import adjusted, clusters_needed
 from hdev_jax.diagnosis.sums import Ground, both_looks
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
@@ -20,25 +21,17 @@ from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import trip_slices
 
 __all__ = [
-    "CLOSE",
-    "LEFT_OUT",
     "Found",
     "Loop",
     "Search",
     "Verdict",
     "View",
     "barred",
-    "best_of",
     "look",
-    "plausible",
     "scored",
-    "worth",
 ]
 
 HINT = 0.1  # p, before any correction, from which on a candidate is not even hinted at
-CERTAIN = 1e-6  # p below which it does not matter how small it is
-CLOSE = 0.85  # of what the best is worth, for a candidate to be about as good
-LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
 
 
 @dataclass(frozen=True)
@@ -151,12 +144,24 @@ class View:
     slow: np.ndarray
     best: dict[str, Score]
     ways: dict[str, float]
-    q: dict[str, float]
     left_out: dict[str, str]
     absorbs: dict[str, list[str]]
     absorbed_by: dict[str, str]
     reasons: dict[str, str] = field(default_factory=dict)
     sought: list[Verdict] = field(default_factory=list)  # on what is looked for elsewhere than in columns
+    q: dict[str, float] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._correct()
+
+    def _correct(self) -> None:
+        every = [1.0 if k in self.absorbed_by else min(1.0, s.p * self.ways[k]) for k, s in self.best.items()]
+        self.q = dict(zip(self.best, adjusted(every), strict=True))
+
+    def counted(self, id_: str, ways: float) -> None:
+        """Count so many times the ways in which an effect was tried, and correct every p anew."""
+        self.ways[id_] *= ways
+        self._correct()
 
     def verdicts(self, state: Search, fdr: float) -> list[Verdict]:
         """Why each candidate that the vehicle still lacks was not chosen."""
@@ -198,26 +203,6 @@ def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
     return "explains less than what was chosen, or too little for the numbers it fits"
 
 
-def plausible(s: Score) -> bool:
-    """Signs, ranges and least sizes; a switch has to make about the whole of its difference."""
-    c = s.candidate
-    if c.kind == "limit":
-        first = c.parameter(c.sizes[0])
-        size = abs(dict(c.shapes)[first.name] * s.beta[0])
-        return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5 and size >= first.least)
-    parameters = [c.parameter(n) for n in c.sizes]
-    within = all(p.lower <= p.null + b <= p.upper for p, b in zip(parameters, s.beta, strict=True))
-    return within and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
-
-
-def worth(gain: float, c: Candidate) -> float:
-    """Gain less what its numbers cost: as BIC would for 400 independent rows a size, 20 a shape.
-
-    Rows of a log are not independent, and what differs only between trips has no more of them than trips.
-    """
-    return gain - 3.0 * len(c.columns) - 1.5 * (c.freedoms - len(c.columns))
-
-
 def look(problem: Loop, state: Search, made: Source | None = None) -> View:
     """Whiten, gather and score everything once: the problem's effects, or candidates `made` elsewhere."""
     noise = problem.noise(state.fit)
@@ -234,59 +219,7 @@ def scored(ground: Ground, source: Source) -> View:
     for id_ in {c.id for c in source.candidates} - set(best):
         left_out[id_] = "does nothing on this log"
     absorbs, absorbed_by = _absorption(evidence, ground.fit.table, best)
-    ids = list(best)
-    ps = [min(1.0, best[i].p * ways[i]) if i not in absorbed_by else 1.0 for i in ids]
-    q = dict(zip(ids, adjusted(ps), strict=True))
-    return View(evidence, plain, ground, source, slow, best, ways, q, left_out, absorbs, absorbed_by)
-
-
-def best_of(
-    evidence: Evidence, plain: Evidence, candidates: Sequence[Candidate], slow: np.ndarray
-) -> tuple[dict[str, Score], dict[str, float]]:
-    """The best plausible way to have each effect, and how many independent ways were tried."""
-    totals = evidence.totals()
-    before = evidence.base_likelihood(totals)
-    tried: dict[str, int] = {}
-    ranked: dict[str, list[tuple[float, Candidate]]] = {}
-    for c in candidates:
-        if min(totals[0, evidence.base + k, evidence.base + k] for k in c.columns) <= 1e-20:
-            continue
-        gain, _ = evidence.gain(totals, c.columns, before)
-        tried[c.id] = tried.get(c.id, 0) + 1
-        ranked.setdefault(c.id, []).append((worth(gain, c), c))
-    best, ways = {}, {}
-    for id_, entries in ranked.items():
-        at = evidence.base + np.unique([k for _, c in entries for k in c.columns])
-        ways[id_] = min(float(tried[id_]), effective_number(totals[0][np.ix_(at, at)]))
-        looks = [_clearest([evidence.score(c) for _, c in _leading(entries)])]
-        scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
-        if scores:
-            looks.append(_clearest(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
-        # what both looks see is told by the whitened rows, which see it better
-        able = [s for s in looks if plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
-        best[id_] = min(able, key=lambda s: (s.p > CERTAIN, s.p if s.p > CERTAIN else 0.0))
-    return best, ways
-
-
-def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
-    return sorted(entries, key=lambda e: _falling(e[0]))[:6]
-
-
-def _falling(worth: float) -> float:
-    """For sorting from the best: ways that come to the same but for rounding keep the order of the library's grids.
-
-    A delay of a row by linear and by cubic interpolation is one column, but where a refit starts from differs.
-    """
-    return -float(f"{worth:.9g}")
-
-
-def _clearest(scores: list[Score]) -> Score:
-    """The first that is plausible, or one that explains about as much with fewer doubts: a second size may blur it."""
-    able = [s for s in scores if plausible(s)]
-    if not able or able[0].p <= CERTAIN:
-        return (able or scores)[0]
-    bar = CLOSE * worth(able[0].gain, able[0].candidate)
-    return min((s for s in able if worth(s.gain, s.candidate) >= bar), key=lambda s: s.p, default=able[0])
+    return View(evidence, plain, ground, source, slow, best, ways, left_out, absorbs, absorbed_by)
 
 
 def _absorption(

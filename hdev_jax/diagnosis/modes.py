@@ -13,7 +13,9 @@ from scipy import stats
 from hdev_jax.diagnosis.candidates import Candidate, plan_of
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict, barred
+from hdev_jax.diagnosis.ranking import LEFT_OUT
 from hdev_jax.diagnosis.refit import joined
+from hdev_jax.diagnosis.significance import wald
 from hdev_jax.diagnosis.sums import evidence_of
 from hdev_jax.inference import Clusters
 from hdev_jax.physics.battery import ModeChange
@@ -28,9 +30,11 @@ ENOUGH = 0.01  # p from which on two values leave trips that differ still
 RANDOM = (0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)  # variances of random levels, over the sizes' own
 BEATS = 3.0  # in log-likelihood, that two values are better than levels that differ at random
 LEAST_SHARE = 0.02  # of the residual's variance
-RESAMPLES = 100
+RESAMPLES, MOST_SPLITS = 100, 4000  # resampled sets of trips; fewer of them where many trips have many splits each
 
 Grams = Float[np.ndarray, "trip d d"]
+Every = Float[np.ndarray, "coefficient trip d d"]
+Split = tuple[float, np.ndarray, float, float, float]
 
 
 def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | None]:
@@ -49,35 +53,33 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     on = {"in_mode": (1.0,), "share": (0.5,)}
     plan = plan_of(state.fit.vehicle, [ModeChange], problem.facts, problem.target, on, searched=True)
     evidence = evidence_of(ground, plan.width, lambda out, chunk: plan.write(out, chunk.segments))
-    base, best = evidence.base, None
-    for c in plan.candidates:
-        at = np.r_[np.arange(base), base + c.columns[0], evidence.grams.shape[-1] - 1]
-        split = _split(evidence.grams[:, at[:, None], at[None, :]], np.diag(evidence.precision), evidence.pull)
-        if split is not None and (best is None or split[0] > best[1][0]):
-            best = c, split
+    base, last = np.arange(evidence.base), evidence.grams.shape[-1] - 1
+    places = [np.r_[base, evidence.base + c.columns[0], last] for c in plan.candidates]
+    every = np.stack([evidence.grams[:, at[:, None], at[None, :]] for at in places])
+    prior, level = (np.diag(evidence.precision), evidence.pull), problem.fdr / len(problem.effects)
+    best = _best(every, *prior)
     if best is None:
         return None, Verdict(ID, None, 1.0, "no trip tells of it")
-    c, (gain, z, size, left, over_levels) = best
-    n = len(slices)
-    p = _p(gain, n, len(plan.candidates))
+    k, (gain, z, size, *_) = best
+    c, p = plan.candidates[k], _p(gain, len(slices), len(every))
     q = min(1.0, p * len(problem.effects))
-    if q > problem.fdr:
-        return None, Verdict(ID, gain, q, f"trips do not fall into two groups (q = {q:.2g})")
-    if stats.chi2.sf(2.0 * left, n - 2) < ENOUGH or over_levels < BEATS:
-        return None, Verdict(ID, gain, q, "trips differ, but two values are not enough for them")
-    if _ordered(z):
-        return None, Verdict(ID, gain, q, "a change that stays from one trip on says as much")
+    if (why := _against(best[1], len(every), level)) is not None:
+        return None, Verdict(ID, gain, q, why)
+    left_out, p_cluster = _left_out(every[k], *prior, z)
+    if left_out <= LEFT_OUT or p_cluster > problem.fdr:
+        return None, Verdict(ID, gain, q, "does not lower the error on trips left out of the fit")
     names = [int(problem.trip[s.start]) for s in slices]
     chosen = tuple((f"in_mode[{t}]", float(x)) for t, x in zip(names, z, strict=True))
     seconds = np.array([np.sum(problem.seconds[s]) for s in slices])
     share = float(z @ seconds / np.sum(seconds))
     candidate = Candidate(ModeChange, c.sizes, (None,), (("share", share), *chosen), "size", ())
-    score = Score(candidate, np.array([size]), gain, p, p, gain, 1.0)
+    score = Score(candidate, np.array([size]), gain, p, p_cluster, left_out, 1.0)
     new = joined(problem, state, score, noise) or joined(problem, state, score)
     before = float(np.mean((problem.measured - state.fit.predicted) ** 2))
     if new is None or before - float(np.mean((problem.measured - new.fit.predicted) ** 2)) < LEAST_SHARE * before:
         return None, Verdict(ID, gain, q, "in the joint refit it is out of range or not told from nothing")
-    stability = _stability(evidence.grams, c, base, z)
+    # told, not asked for: two trips of eight are both in a resampled set in four of ten
+    stability = _stability(every, *prior, level)
     found = Found(ID, score, q, stability, (), gain)
     return replace(new, found=[*state.found, found]), None
 
@@ -95,9 +97,23 @@ def _p(gain: float, trips: int, coefficients: int) -> float:
     return float(np.exp(min(stats.chi2.logsf(2.0 * gain, 1) + ways, 0.0)))
 
 
-def _split(
-    grams: Grams, precision: np.ndarray, pull: np.ndarray
-) -> tuple[float, np.ndarray, float, float, float] | None:
+def _best(every: Every, precision: np.ndarray, pull: np.ndarray) -> tuple[int, Split] | None:
+    """Which coefficient's split of the trips gains most, and the split."""
+    splits = [(k, split) for k, grams in enumerate(every) if (split := _split(grams, precision, pull)) is not None]
+    return max(splits, key=lambda s: s[1][0], default=None)
+
+
+def _against(split: Split, coefficients: int, level: float) -> str | None:
+    """Why a split is no mode, its p to be no larger than `level`; or None."""
+    gain, z, _, left, over_levels = split
+    if (p := _p(gain, len(z), coefficients)) > level:
+        return f"trips do not fall into two groups (p = {p:.2g})"
+    if stats.chi2.sf(2.0 * left, len(z) - 2) < ENOUGH or over_levels < BEATS:
+        return "trips differ, but two values are not enough for them"
+    return "a change that stays from one trip on says as much" if _ordered(z) else None
+
+
+def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray) -> Split | None:
     """Gain of the best split of the trips in two, the trips of the second mode, its size, what more one value for
     each trip would gain, and how much better two values are than levels that differ at random; None where no trip has
     the column."""
@@ -143,18 +159,45 @@ def _ordered(z: np.ndarray) -> bool:
     return int(np.count_nonzero(np.diff(z))) <= 1
 
 
-def _stability(grams: Grams, c: Candidate, base: int, z: np.ndarray) -> float:
-    """Share of resampled sets of trips in which the mode gains more than its number costs."""
-    rng = np.random.default_rng(0)
-    column, last = base + c.columns[0], grams.shape[-1] - 1
-    hits = 0
-    for _ in range(RESAMPLES):
-        w = np.bincount(rng.integers(0, len(grams), len(grams)), minlength=len(grams)).astype(float)
-        a = np.tensordot(w, grams, axes=1)
-        side = np.tensordot(w * z, grams, axes=1)
-        inner = a[:base, :base] + 1e-12 * np.diag(np.diag(a)[:base])
-        alone, _ = _solved(inner, a[:base, last])
-        cross = side[:base, column]
-        both = np.block([[inner, cross[:, None]], [cross[None], side[column, column]]])
-        hits += _solved(both, np.r_[a[:base, last], side[column, last]])[0] - alone > 3.0
-    return hits / RESAMPLES
+def _left_out(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarray) -> tuple[float, float]:
+    """Gain in log-likelihood over trips left out of the fit in turn, and p of the size with these clusters.
+
+    Which mode a trip is in that was left out is not known beforehand: either is as likely as it is among the others.
+    """
+    n, base = len(grams), len(pull)
+    cross, square, told = grams[:, :base, base], grams[:, base, base], grams[:, base, base + 1]
+    inner, right = grams[:, :base, :base], grams[:, :base, base + 1]
+
+    def fitted(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b = np.tensordot(times, inner, axes=1) + precision, times @ right - pull
+        on = times * z
+        column = on @ cross
+        both = np.block([[a, column[:, None]], [column[None], on @ square]])
+        return _solved(a, b)[1], _solved(both, np.r_[b, on @ told])[1]
+
+    def likelihood(t: int, x: np.ndarray, size: float) -> float:
+        quadratic = x @ inner[t] @ x + 2.0 * size * float(x @ cross[t]) + size**2 * square[t]
+        return float(x @ right[t] + size * told[t] - 0.5 * quadratic)
+
+    gain, sizes = 0.0, []
+    for t in range(n):
+        others = (np.arange(n) != t).astype(float)
+        without, (*x, size) = fitted(others)
+        share, x = float(others @ z) / (n - 1), np.array(x)
+        off, on = likelihood(t, x, 0.0) + np.log1p(-share), likelihood(t, x, size) + np.log(share)
+        gain += float(np.logaddexp(off, on)) - likelihood(t, without, 0.0)
+        sizes.append([size])
+    return gain, wald(fitted(np.ones(n))[1][-1:], np.array(sizes))
+
+
+def _stability(every: Every, precision: np.ndarray, pull: np.ndarray, level: float) -> float:
+    """Share of resampled sets of trips that fall into two modes again, whichever trips they are then."""
+    rng, n = np.random.default_rng(0), every.shape[1]
+    draws, hits = int(np.clip(MOST_SPLITS // n, 10, RESAMPLES)), 0
+    for _ in range(draws):
+        drawn = np.sort(rng.integers(0, n, n))
+        best = _best(every[:, drawn], precision, pull)
+        if best is not None and _against(best[1], len(every), level) is None:
+            in_mode = best[1][1] > 0
+            hits += min(len(np.unique(drawn[in_mode])), len(np.unique(drawn[~in_mode]))) >= LEAST_SIDE
+    return hits / draws

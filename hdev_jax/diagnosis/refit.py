@@ -8,7 +8,8 @@ from scipy import stats
 
 from hdev_jax.diagnosis.candidates import FIXED, Candidate, finer, plan_of, realised
 from hdev_jax.diagnosis.evidence import ABSORBED, Score
-from hdev_jax.diagnosis.look import Found, Loop, Search, View, best_of, plausible
+from hdev_jax.diagnosis.look import Found, Loop, Search, View
+from hdev_jax.diagnosis.ranking import best_of, plausible
 from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.sums import both_looks, distance_from_table, evidence_of
 from hdev_jax.diagnosis.whiten import Noise
@@ -43,7 +44,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
-    refined = _refined(problem, s, view) if shaped or try_plain else s
+    refined = _refined(problem, s, view)[0] if shaped or try_plain else s
     # What rows of equal weight bear out is the luckier half of what they may say of a size; whitened rows that know it
     # better are asked first. Where those cannot tell it apart, they come after, as far as plain rows leave room.
     noise = view.ground.noise
@@ -127,8 +128,10 @@ def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) 
     return tuple(replace(r, free=False) if _idle(candidate, r.path) else r for r in rows)
 
 
-def _refined(problem: Loop, s: Score, view: View) -> Score:
-    """The same way to have the effect with its shapes on a finer grid: switches have many small optima.
+def _refined(problem: Loop, s: Score, view: View) -> tuple[Score, float]:
+    """The same way to have the effect with its shapes on a finer grid, and how many ways that grid tries.
+
+    Switches have many small optima.
 
     Where trips alone tell it, the grid reaches a whole step to either side and least squares chooses on it: thresholds
     of a few trips have many small optima for the joint refit to end in.
@@ -138,7 +141,7 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
     if "at_trip" in grids:
         grids["at_trip"] = facts.steps_near(dict(s.candidate.shapes)["at_trip"])
     if all(len(g) == 1 for g in grids.values()):
-        return s
+        return s, 1.0
     plan = plan_of(view.ground.fit.vehicle, [s.candidate.effect], facts, problem.target, grids)
     same = [c for c in plan.candidates if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
     evidence, plain, slow = both_looks(view.ground, plan)
@@ -147,12 +150,12 @@ def _refined(problem: Loop, s: Score, view: View) -> Score:
         fits = [(*plain.gain(totals, c.columns), c) for c in same]
         inside = [(gain, beta, c) for gain, beta, c in fits if plausible(replace(s, candidate=c, beta=beta))]
         if not inside:
-            return s
+            return s, 1.0
         _, beta, c = max(inside, key=lambda f: f[0])
-        return replace(s, candidate=c, beta=beta)
-    best, _ = best_of(evidence, plain, same, slow)
+        return replace(s, candidate=c, beta=beta), 1.0  # its p stays that of the way it started from
+    best, ways = best_of(evidence, plain, same, slow)
     finest = best.get(s.candidate.id)
-    return finest if finest is not None and finest.gain > s.gain and not finest.plain else s
+    return (finest, ways[s.candidate.id]) if finest and finest.gain > s.gain and not finest.plain else (s, 1.0)
 
 
 def sharpened(problem: Loop, view: View) -> View:
@@ -166,12 +169,12 @@ def sharpened(problem: Loop, view: View) -> View:
         and id_ not in view.absorbed_by
     ]  # fmt: skip
     for s in sorted(doubted, key=lambda s: -s.gain)[:MOST_SHARPENED]:
-        finer_one = _refined(problem, s, view)
-        if finer_one is not s and finer_one.p < s.p:
+        finer_one, ways = _refined(problem, s, view)
+        if finer_one is not s and finer_one.p * ways < s.p:
             # places among the view's columns stay those of its own grid; a refit looks for finer shapes again
             tests = {k: getattr(finer_one, k) for k in ("p_model", "p_cluster", "left_out_gain")}
             view.best[s.candidate.id] = replace(s, **tests)
-            view.q[s.candidate.id] *= finer_one.p / s.p
+            view.counted(s.candidate.id, ways)
     return view
 
 

@@ -39,7 +39,7 @@ def told_apart(
     **Returns:** the state without effects that only stood in for what is left; the declared model's fit and that with
     each effect in turn; their predictions on all rows; and what is left.
     """
-    train, first = problem.rows(split.train), []
+    train, first = problem.rows(split.train), {}
 
     def fresh() -> Loop:  # what is kept of an earlier round draws nothing: every stage has its own numbers
         return replace(loop, rng=np.random.default_rng([seed, 999]))
@@ -54,10 +54,10 @@ def told_apart(
         left = Remainder(**plain)
         told = checkpoint(
             f"formula-{round_}",
-            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, s, fresh(), p, f, r, tell),
+            lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, train, s, fresh(), p, f, r, tell),
         )
         if told:
-            left, first = _described(problem, split, left, told, predicted[-1]), told["factors"]
+            left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
             told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, fresh(), c, tell))
         gone = told["superfluous"] if told else []
@@ -70,20 +70,21 @@ def told_apart(
 
 
 def _formula(
-    problem: Problem, state: Search, loop: Loop, predicted: np.ndarray, first: Sequence[Mapping[str, Any]],
-    left: Remainder, tell: Tell,
+    problem: Problem, train: np.ndarray, state: Search, loop: Loop, predicted: np.ndarray,
+    first: Mapping[str, Any], left: Remainder, tell: Tell,
 ) -> dict[str, Any]:  # fmt: skip
-    """A formula for what is left, as plain values; empty where none clears the bar. `first` is tried before others.
+    """A formula for what is left, as plain values; empty where none clears the bar. That of the round before, `first`,
+    is tried before others.
 
     Where what is `left` is a cycle, what only trips tell is no formula: it would be the cycle's mean in each of them.
     """
     tell("what is left: a formula from the log's own channels")
-    before = tuple(Factor(**f) for f in first)
-    found = find_expression(state, loop, problem.segments, predict=problem.predict, first=before)
+    before = {"first": tuple(Factor(**f) for f in first["factors"]), "ways": first["ways"]} if first else {}
+    found = find_expression(state, loop, problem.segments, predict=problem.predict, **before)
     if found is None or (np.any(left.cycle_w) and found.state.found[-1].between):
         return {}
-    rms = float(np.sqrt(np.mean((found.predicted - predicted) ** 2)))
-    if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted) ** 2):
+    rms = float(np.sqrt(np.mean((found.predicted - predicted)[train] ** 2)))
+    if rms**2 < LEAST_SHARE * np.mean((problem.measured - predicted)[train] ** 2):
         return {}  # real perhaps, but it explains nothing
     channels = tuple(dict.fromkeys(f.name for f in found.factors))
     kept = {f.id for f in prune(found.loop, found.state, tell).found}
@@ -91,7 +92,7 @@ def _formula(
     again += [k for k in stand_ins(replace(found.loop, fdr=loop.fdr), found.state, channels, tell) if k in kept]
     return {
         "formula": found.formula, "factors": [asdict(f) for f in found.factors], "channels": list(channels),
-        "rms": rms, "predicted": found.predicted, "superfluous": again,
+        "rms": rms, "ways": found.ways, "predicted": found.predicted, "superfluous": again,
     }  # fmt: skip
 
 
@@ -117,10 +118,8 @@ def _shadow(
     """A found effect that may be no more than the mean of the structure that is left, the latest first.
 
     The mean of a cause that the library does not hold is a constant load: one that reads no channel and explains less
-    than what is left is no cause of its own.
+    than what is left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
     """
-    if not left.significant:
-        return None
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
@@ -184,10 +183,14 @@ def _remainder(
         at = problem.rows(trips)
         segments = problem.segments.take(at)
         residual, seconds = (problem.measured - predicted)[at], np.asarray(segments.duration_s)
-        energy = problem.target == "energy_wh"  # a load in kW, whatever the rows' lengths
-        worth, unit = (seconds / SECONDS_PER_WH_OF_A_KW, "kW") if energy else (np.ones(len(seconds)), problem.unit)
+        worth, unit = np.ones(len(seconds)), problem.unit
+        if problem.target == "energy_wh":  # a load in kW, whatever the rows' lengths
+            worth, unit = seconds / SECONDS_PER_WH_OF_A_KW, "kW"
         trip = np.asarray(segments.trip)
-        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit)
+        weight = problem.weight()[at]
+        meters, energy = np.asarray(segments.distance_m), weight * np.abs(problem.measured[at])
+        amounts = {"time": seconds, "distance": meters, "energy": energy}
+        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit, weight, amounts)
 
     trip_names = problem.log.trip_names
     return remainder(side(split.train), side(split.test), names, problem.unit, trip_names, seed=seed, tell=tell)

@@ -9,8 +9,9 @@ from scipy import stats
 from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import CLOSE, LEFT_OUT, Found, Loop, Search, View, look, plausible, worth
+from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
 from hdev_jax.diagnosis.modes import add_mode
+from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, STABLE, plausible, worth
 from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened, without
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
@@ -25,7 +26,6 @@ LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
 TRIES = 4  # rounds of refits in one step before the loop ends
-STABLE = 0.25  # least share of resampled sets of clusters in which it comes first
 
 
 def search(

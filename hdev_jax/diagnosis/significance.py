@@ -50,13 +50,13 @@ def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:
 def effective_number(gram: Float[np.ndarray, "k k"]) -> float:
     """How many independent tests columns amount to, by the eigenvalues of their correlations (Nyholt 2004).
 
-    One where all are alike, their number where none is like another. The same threshold at neighbouring values of a
-    grid is nearly the same test. Their mean is 1 and their squares add up to those of the correlations, so that their
-    variance needs no eigenvalue.
+    One where all are alike (or there is none), their number where none is like another. The same threshold at
+    neighbouring values of a grid is nearly the same test. Their mean is 1 and their squares add up to those of the
+    correlations, so that their variance needs no eigenvalue.
     """
     d = np.sqrt(np.diag(gram))
     count = len(d)
     if count < 2:
-        return float(count)
+        return 1.0
     variance = (np.sum((gram / np.outer(d, d)) ** 2) - count) / (count - 1)
     return float(1.0 + (count - 1) * (1.0 - variance / count))

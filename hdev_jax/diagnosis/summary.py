@@ -136,6 +136,8 @@ def summarise(
             "noise_floor_rmse": left.noise_floor_rmse,
             "depends_on": list(left.depends_on),
             "signature": left.signature,
+            "scales_with": left.scales_with,
+            "correction": left.correction,
             "expression": left.expression,
         },
         "not_decidable": _not_decidable(state.verdicts, left),

@@ -1,7 +1,8 @@
 """What is left: how much of the residual anything in the log predicts, and what it looks like."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,21 +19,28 @@ LEVEL = 1e-3  # for each of the looks below; there are four, so false alarms sta
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
+APART = 2.0  # in log-likelihood, that one amount explains trips' remainders better than the next
+GROWS_AS = {"time": "a power", "distance": "a force", "energy": "an efficiency"}
+BINS = 10  # of the smooth correction
 MOST_ROWS = 30_000  # that the flexible learner is trained on
 
 
 @dataclass(frozen=True)
 class Remainder:
-    """The contract's `unexplained`, and the smooth correction that a flexible learner makes on the test rows."""
+    """The contract's `unexplained`, and a smooth correction: what a flexible learner would add, by its first channel.
+
+    `scales_with` is what a trip's remainder is in proportion to: `time`, `distance`, `energy`, or None.
+    """
 
     significant: bool
     share: float
     noise_floor_rmse: float
     depends_on: tuple[str, ...]
     signature: str
-    rms: float  # of the structure seen, in the target's unit; 0 where none is
+    rms: float  # of the structure that training rows alone show, in the target's unit; 0 where they show none
     cycle_w: Float[np.ndarray, " train"]  # the cycle's swing about each training row, 0 where none is or it is no power
-    correction: Float[np.ndarray, " test"]
+    scales_with: str | None = None
+    correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
     expression: str | None = None
 
     def described(
@@ -52,7 +60,8 @@ class Remainder:
 class Rows:
     """Features, residual (measured − predicted), trips and clock of one side of the split.
 
-    `worth` is what a constant power (or force) of one `cycle_unit` is in each row's unit.
+    `worth` is what a constant power (or force) of one `cycle_unit` is in each row's unit; `weight` what a row weighs in
+    a sum; `amounts` what a sum may be in proportion to, on each row.
     """
 
     features: Float[np.ndarray, "row feature"]
@@ -62,6 +71,8 @@ class Rows:
     duration_s: np.ndarray
     worth: np.ndarray
     cycle_unit: str
+    weight: np.ndarray
+    amounts: Mapping[str, np.ndarray]
 
 
 def remainder(
@@ -72,12 +83,11 @@ def remainder(
 
     The learner (LightGBM) is trained on training rows; its share is what it predicts of the test residual. It counts
     only where it also helps on training clusters left out of its own fit. The others ask whether whitened noise could
-    have done it.
+    have done it. What is reported is measured on test rows; `rms`, which decides what was found, never sees them.
     """
     tell("what is left: a flexible learner, validated by trip")
-    correction, p_learner, order = _learner(train, test, names, seed)
-    sst = float(np.sum(test.residual**2))
-    share = float(np.clip(1.0 - np.sum((test.residual - correction) ** 2) / max(sst, 1e-300), 0.0, 1.0))
+    correction, share_train, p_learner, order = _learner(train, test, names, seed)
+    share = _share(test.residual, correction)
     learned = p_learner < LEVEL and share > LEAST_SHARE
     tell("what is left: periods, change points, levels of trips")
     noise = estimate_noise(train.residual, train.trip, train.duration_s, levels=False)
@@ -86,8 +96,9 @@ def remainder(
     steps = _change_point(white, train.trip)
     level = _levels(train, noise)
     parts, depends, sizes = [], [], [0.0]
+    if p_learner < LEVEL and share_train > LEAST_SHARE:
+        sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
     if learned:
-        sizes.append(float(np.sqrt(share * np.mean(test.residual**2))))
         depends += list(order)
         parts.append(f"{100 * share:.0f} % of it follows {', '.join(order)} in a way the library does not hold")
     if period is not None:
@@ -107,6 +118,9 @@ def remainder(
         parts.append(
             f"levels that differ by trip by about {sd:.2g} {unit}, most in {trip_names[where]} ({size:+.2g} {unit})"
         )
+    scales_with = _scale(train) if parts else None
+    if scales_with is not None:
+        parts.append(f"from trip to trip it grows with {scales_with}, as {GROWS_AS[scales_with]} does")
     rmse = float(np.sqrt(np.mean(test.residual**2)))
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
@@ -114,7 +128,39 @@ def remainder(
     watts = {"kW": 1000.0, "W": 1.0}.get(train.cycle_unit, 0.0)
     cycle_w = watts * period.amplitudes if period is not None else np.zeros(len(train.residual))
     depends_on = tuple(dict.fromkeys(depends))
-    return Remainder(bool(parts), share, floor, depends_on, signature + ".", rms, cycle_w, correction)
+    curve = _curve(correction, test, list(names), order[0], unit) if learned and order else None
+    return Remainder(
+        bool(parts), share, floor, depends_on, signature + ".", rms, cycle_w, scales_with=scales_with, correction=curve
+    )
+
+
+def _curve(correction: np.ndarray, rows: Rows, names: list[str], channel: str, unit: str) -> dict[str, Any]:
+    """The mean of a correction in bins of one channel with like numbers of rows."""
+    x = rows.features[:, names.index(channel)]
+    edges = np.unique(np.quantile(x, np.linspace(0, 1, BINS + 1)[1:-1]))
+    place = np.searchsorted(edges, x)
+    groups = [place == k for k in np.unique(place)]
+    at, value = ([float(np.mean(y[g])) for g in groups] for y in (x, correction))
+    return {"channel": channel, "at": at, "value": value, "unit": unit}
+
+
+def _scale(rows: Rows) -> str | None:
+    """What a trip's remainder is in proportion to; None where it is to nothing, or as well to something else.
+
+    Sums over longer trips are noisier as the root of their time, and count so much less.
+    """
+    _, trip = np.unique(rows.trip, return_inverse=True)
+    root = np.sqrt(np.bincount(trip, rows.duration_s))
+    total = np.bincount(trip, rows.weight * rows.residual) / root
+    squares, n = float(total @ total), len(total)
+    missed = {}
+    for name, amount in rows.amounts.items():
+        x = np.bincount(trip, amount) / root
+        missed[name] = max(squares - float(total @ x) ** 2 / max(float(x @ x), 1e-300), 1e-12 * squares + 1e-300)
+    best, second = sorted(missed, key=missed.__getitem__)[:2]
+    f = (n - 1) * (squares - missed[best]) / missed[best]
+    told = n > 2 and len(missed) * stats.f.sf(f, 1, n - 1) < LEVEL
+    return best if told and 0.5 * n * np.log(missed[second] / missed[best]) > APART else None
 
 
 def _colour(noise: Noise) -> str:
@@ -123,14 +169,24 @@ def _colour(noise: Noise) -> str:
     return "independent from row to row" if abs(first) < 0.1 else f"correlated from row to row ({first:.2f})"
 
 
-def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[np.ndarray, float, tuple[str, ...]]:
-    """Correction on test rows, p of its gain on left-out training clusters, and the features it leans on."""
+def _share(residual: np.ndarray, predicted: np.ndarray) -> float:
+    """Share of a residual's squares that a prediction of it takes away, 0 at least."""
+    squares = float(np.sum(residual**2))
+    return float(np.clip(1.0 - np.sum((residual - predicted) ** 2) / max(squares, 1e-300), 0.0, 1.0))
+
+
+def _learner(
+    train: Rows, test: Rows, names: Sequence[str], seed: int
+) -> tuple[np.ndarray, float, float, tuple[str, ...]]:
+    """Correction on test rows, what share is predicted of training clusters left out in turn and its p, and the
+    features it leans on."""
     import lightgbm as lgb
 
     every = max(1, len(train.residual) // MOST_ROWS)  # neighbours say the same: a thinned log teaches as much
     train = Rows(
         train.features[::every], train.residual[::every], replace(train.clusters, ids=train.clusters.ids[::every]),
-        train.trip[::every], train.duration_s[::every], train.worth[::every], train.cycle_unit,
+        train.trip[::every], train.duration_s[::every], train.worth[::every], train.cycle_unit, train.weight[::every],
+        {k: x[::every] for k, x in train.amounts.items()},
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     fold = rng.permutation(np.arange(train.clusters.count) % 4)[train.clusters.ids]
@@ -141,40 +197,34 @@ def _learner(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[
         "deterministic": True, "force_row_wise": True, "max_bin": 127,
     }  # fmt: skip
     scale = float(np.std(train.residual)) + 1e-300
-    out_of_fold = np.zeros((rows, 2))
-    steps: list[int] = []
-    for k in range(4):
-        inside, outside = fold != k, fold == k
-        if not outside.any() or not inside.any():
-            continue
-        data = lgb.Dataset(train.features[inside], train.residual[inside] / scale, feature_name=_safe(names))
-        check = lgb.Dataset(train.features[outside], train.residual[outside] / scale, reference=data)
-        # rounds are chosen on the fold next to the one that is predicted, so that neither sees its own error
-        booster = lgb.train(
-            parameters, data, ROUNDS, valid_sets=[check], callbacks=[lgb.early_stopping(20, verbose=False)]
-        )
-        steps.append(max(booster.best_iteration, 0))
+
+    def part(at: np.ndarray, **options: Any) -> Any:
+        return lgb.Dataset(train.features[at], train.residual[at] / scale, feature_name=_safe(names), **options)
+
+    out_of_fold, steps = np.zeros(rows), []
+    folds = np.unique(fold)
+    for k, k_next in zip(folds, np.roll(folds, -1), strict=True) if len(folds) > 2 else ():
+        # rounds are chosen on the fold after the one that is predicted, which has no say in them
+        data = part((fold != k) & (fold != k_next))
+        check = part(fold == k_next, reference=data)
+        stop = [lgb.early_stopping(20, verbose=False)]
+        steps.append(max(lgb.train(parameters, data, ROUNDS, valid_sets=[check], callbacks=stop).best_iteration, 0))
+        booster = lgb.train(parameters, part(fold != k), max(steps[-1], 1))
+        out_of_fold[fold == k] = np.asarray(booster.predict(train.features[fold == k])) * scale
     rounds = int(np.median(steps)) if steps else 0
     if rounds < 2:
-        return np.zeros(len(test.residual)), 1.0, ()
-    for k in range(4):
-        inside, outside = fold != k, fold == k
-        if outside.any() and inside.any():
-            data = lgb.Dataset(train.features[inside], train.residual[inside] / scale, feature_name=_safe(names))
-            booster = lgb.train(parameters, data, rounds)
-            out_of_fold[outside, 0] = np.asarray(booster.predict(train.features[outside])) * scale
-    gain = train.clusters.sums(train.residual**2 - (train.residual - out_of_fold[:, 0]) ** 2)
+        return np.zeros(len(test.residual)), 0.0, 1.0, ()
+    gain = train.clusters.sums(train.residual**2 - (train.residual - out_of_fold) ** 2)
     size = train.clusters.sums(train.residual**2)
     relative = gain / np.mean(size)
     t = np.mean(relative) / (np.std(relative, ddof=1) / np.sqrt(len(relative)) + 1e-300)
     p = float(stats.t.sf(t, len(relative) - 1))
-    data = lgb.Dataset(train.features, train.residual / scale, feature_name=_safe(names))
-    booster = lgb.train(parameters, data, rounds)
+    booster = lgb.train(parameters, part(np.ones(rows, bool)), rounds)
     correction = np.asarray(booster.predict(test.features)) * scale
     importance = booster.feature_importance("gain")
     first = np.argsort(-importance)[:3]
     leading = tuple(str(names[int(i)]) for i in first if importance[i] > 0.15 * importance.sum())
-    return correction, p, leading
+    return correction, _share(train.residual, out_of_fold), p, leading
 
 
 def _safe(names: Sequence[str]) -> list[str]:

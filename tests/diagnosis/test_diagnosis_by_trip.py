@@ -1,5 +1,7 @@
 """What differs from trip to trip: the phase of a cycle, the trips of a mode."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +9,10 @@ from hypothesis import strategies as st
 from planted import run
 from scipy import stats
 
-from hdev_jax.diagnosis.modes import BEATS, _p, _split
+from hdev_jax.diagnosis.cycles import COST, _fitted, _profile, _Rows
+from hdev_jax.diagnosis.modes import BEATS, _left_out, _p, _split, _stability
+from hdev_jax.diagnosis.ranking import LEFT_OUT
+from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.physics.loads import PeriodicLoad
 
 
@@ -103,3 +108,84 @@ def test_ways_to_split_many_trips_are_counted():
     assert _p(5.0, 2, 1) == pytest.approx(2.0 * stats.chi2.sf(10.0, 1))
     assert _p(100.0, 5000, 4) == 1.0
     assert _p(5000.0, 5000, 4) < 1e-100
+
+
+# --- without some of the trips ----------------------------------------------------------------------------------------
+
+
+def _noisy(seed, sizes, rows=200):
+    """Rows of 2 s with white noise of variance 1 and a load of so much in each trip, on for 30 % of 80 s, of a phase of
+    its own in each."""
+    rng, trips = np.random.default_rng(seed), len(sizes)
+    trip, clock = np.repeat(np.arange(trips), rows), np.tile(np.arange(rows) * 2.0 + 1.0, trips)
+    n = trips * rows
+    noise = Noise(np.zeros((2, 1)), np.ones(2), 0.0, np.ones(trips), 0.0)
+    made = _Rows(clock, np.full(n, 2.0), trip, np.ones(n), noise, white=np.zeros(n))
+    wave = (np.mod(clock / 80.0 + rng.random(trips)[trip], 1.0) < 0.3).astype(float)
+    residual = np.repeat(sizes, rows) * wave + rng.standard_normal(n)
+    return replace(made, white=made.whitened(residual[:, None])[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("sizes", "borne_out", "again"),
+    [(np.ones(8), True, 1.0), (np.zeros(8), False, 0.0), (np.r_[4.0, np.zeros(7)], False, 0.0)],
+    ids=["in every trip", "noise", "in one trip"],
+)
+def test_trips_left_out_bear_a_cycle_out(sizes, borne_out, again):
+    """The gain on trips left out and the share of resamples in which it is chosen are of trips, not of the best fit."""
+    for seed in range(3):
+        rows = _noisy(seed, sizes)
+        profile = _profile(rows, _fitted(rows, 80.0)[0])
+        assert (profile.left_out_gain() > LEFT_OUT) is borne_out
+        assert profile.stability(COST * (len(sizes) + 3)) == pytest.approx(again, abs=0.05)
+
+
+def test_the_gain_of_a_cycle_on_a_trip_left_out_is_that_of_the_others_size():
+    """The mean likelihood over phases, which are 1/40 of a period apart, with the size of the other trips."""
+    rows = _noisy(1, np.ones(4))
+    profile = _profile(rows, _fitted(rows, 80.0)[0])
+    one = replace(profile, cross=profile.cross[:1], square=profile.square[:1])
+    cross, square = one.own
+    total = 0.0
+    for t in range(4):
+        others = np.arange(4) != t
+        size = np.sum(cross[0, others]) / np.sum(square[0, others])
+        likelihood = np.exp(size * one.cross[0, t] - 0.5 * size**2 * one.square[0, t])
+        total += np.log(np.sum(likelihood) / 40.0)
+    assert one.left_out_gain() == pytest.approx(total)
+
+
+NOTHING = np.zeros((1, 1)), np.zeros(1)
+
+
+def test_trips_left_out_bear_a_mode_out():
+    rng = np.random.default_rng(0)
+    truth = np.array([0, 1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1.0])
+    grams = _grams(rng, 0.5 * truth)
+    split = _split(grams, *NOTHING)
+    assert split is not None
+    gain, p_cluster = _left_out(grams, *NOTHING, truth)
+    assert 20.0 < gain < split[0]
+    assert p_cluster < 1e-4
+    assert 0.8 < _stability(grams[None], *NOTHING, 0.05) <= 1.0
+
+
+def test_noise_has_a_split_that_gains_and_none_that_holds():
+    """Where trips differ by chance alone the best split gains much of what it was chosen by; left out, it loses."""
+    rng = np.random.default_rng(2)
+    inside, outside, again = [], [], []
+    for _ in range(15):
+        grams = _grams(rng, np.zeros(12))
+        split = _split(grams, *NOTHING)
+        assert split is not None
+        inside.append(split[0])
+        outside.append(_left_out(grams, *NOTHING, split[1])[0])
+        again.append(_stability(grams[None], *NOTHING, 0.05 / 30))
+    assert np.median(inside) > LEFT_OUT > max(outside)
+    assert np.mean(again) < 0.1
+
+
+def test_one_odd_trip_is_no_mode_of_resampled_trips():
+    """Drawn twice it is still one trip: a mode has two of them at least."""
+    grams = _grams(np.random.default_rng(3), np.r_[2.0, np.zeros(11)])
+    assert _stability(grams[None], *NOTHING, 0.05) < 0.1

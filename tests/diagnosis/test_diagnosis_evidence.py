@@ -8,7 +8,8 @@ from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import Evidence
-from hdev_jax.diagnosis.significance import adjusted, wald
+from hdev_jax.diagnosis.ranking import best_of
+from hdev_jax.diagnosis.significance import adjusted, effective_number, wald
 from hdev_jax.diagnosis.sums import LEVELS, Sums
 from hdev_jax.inference import Clusters
 from hdev_jax.physics import LIBRARY
@@ -136,6 +137,44 @@ def test_absorbed_columns_gain_nothing():
     assert wide.gain(wide.totals(), (2,))[0] == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.parametrize("level", [0.0, 0.8])
+def test_what_tests_are_of(level):
+    """Columns as rows hold them with the Jacobian's projected off, the prior being more rows of it."""
+    rows = Rows(level=level, effect=0.0)
+    v = max(rows.variances(), key=lambda v: rows.gls((), v)[0])
+    white = np.c_[rows.jacobian, rows.columns]
+    for g in range(rows.clusters.count):
+        at = rows.ids == g
+        covariance = np.eye(at.sum()) + v * np.outer(rows.level[at], rows.level[at])
+        white[at] = np.linalg.inv(np.linalg.cholesky(covariance)) @ white[at]
+    base = np.r_[white[:, :BASE], np.diag(1 / PRIOR_SD)]
+    own = np.r_[white[:, BASE:], np.zeros((BASE, CANDIDATES))]
+    rest = own - base @ np.linalg.lstsq(base, own, rcond=None)[0]
+    np.testing.assert_allclose(rows.evidence().projected(np.array([2, 0])), (rest.T @ rest)[np.ix_([2, 0], [2, 0])])
+
+
+def test_ways_are_counted_by_what_the_declared_coefficients_leave_of_them():
+    """Ten ways that share a large constant are one before a declared constant is projected off, and ten after."""
+    rng = np.random.default_rng(0)
+    n = 4000
+    z = rng.normal(size=(n, 10))
+    sums = Sums(12, 8, 0)
+    sums.add(np.c_[np.ones(n), 1.0 + 0.1 * z, rng.normal(size=n)], np.repeat(np.arange(8), n // 8))
+    ways = [candidate(k) for k in range(10)]
+    for prior_sd, expected in ((1e3, 10.0), (1e-6, 1.2)):  # a coefficient that its table holds fast takes nothing off
+        evidence = sums.evidence(1, moved=np.zeros(1), prior_sd=np.array([prior_sd]))
+        counted = best_of(evidence, evidence, ways, np.zeros(10, bool))[1]["auxiliary_power"]
+        assert counted == pytest.approx(expected, abs=0.1)
+
+
+def test_what_lies_in_the_jacobian_is_no_way_of_its_own():
+    rows = Rows(level=0.0)
+    rows.columns[:, 2] = rows.jacobian @ np.array([2.0, -1.0])
+    free = {"moved": np.zeros(BASE), "prior_sd": np.full(BASE, 1e9)}
+    assert rows.evidence(**free).projected(np.array([0, 2])).shape == (1, 1)
+    assert effective_number(rows.evidence(**free).projected(np.array([2]))) == 1.0
+
+
 def test_weights_count_clusters():
     """Resampling by weights is the same as gathering the drawn clusters again."""
     rows = Rows(level=0.0)
@@ -209,6 +248,20 @@ def test_plain_rows_count_clusters_alone():
     f = stats.f.isf(one.p_cluster, 1, g - 1)
     # the likelihood ratio of g observations whose F is this
     assert one.gain == pytest.approx(0.5 * g * np.log1p(f / (g - 1)), rel=1e-6)
+
+
+@pytest.mark.parametrize("effect", [0.15, 0.6])
+def test_the_left_out_gain_of_plain_rows_is_of_clusters_left_out(effect):
+    """Its gain times the share that explicit refits without each cluster in turn keep of what one fit to all gains."""
+    rows = Rows(level=0.0, effect=effect)
+    score = rows.evidence().plain_score(candidate(0))
+    better = 0.0
+    for cluster in range(rows.clusters.count):
+        keep = rows.ids != cluster
+        better += rows.gls((), 0.0, keep)[2][cluster] - rows.gls((0,), 0.0, keep)[2][cluster]
+    kept = better / (rows.gls((0,), 0.0)[0] - rows.gls((), 0.0)[0])
+    assert 0.0 < kept < 1.0
+    assert score.left_out_gain == pytest.approx(score.gain * kept, rel=1e-6)
 
 
 # --- tests and their correction --------------------------------------------------------------------------------------

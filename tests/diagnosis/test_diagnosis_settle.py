@@ -121,7 +121,7 @@ def test_a_slow_size_of_which_the_rows_rule_out_a_quarter_is_contradicted(white,
 
 
 def test_between_trips_a_log_knows_no_more_than_it_has_trips():
-    left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, np.zeros(3), np.zeros(3))
+    left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, np.zeros(3))
     hinted = Verdict("hvac_power", 2.0, 1.0, "not significant", needed=40, between=True)
     inside = Verdict("headwind", 2.0, 1.0, "not significant", needed=30)
     strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=14)

@@ -1,14 +1,19 @@
 """What is left: cycles are found with their period and size whatever their phase, noise has none; levels; formulas."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+
+import lightgbm as lgb
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis.expression import Factor, _power_unit, monomials
+from hdev_jax.diagnosis.expression import TERM, DescribedForce, Factor, _coefficient_unit, find_expression, monomials
+from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.unexplained import Rows, _levels, _period
+from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _period, _scale
 from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.fleet import synthetic_log
-from hdev_jax.inference import Clusters
+from hdev_jax.inference import Clusters, calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.units import _SUFFIXES
@@ -23,8 +28,16 @@ def residual(rng, trips: int, rows: int, *, rho: float = 0.0, cycles: float = 0.
     wave = np.sqrt(2) * np.sin(2 * np.pi * (cycles * clock + rng.random((trips, 1))))
     trip = np.repeat(np.arange(trips), rows)
     clusters = Clusters(trip, trips, "trip")
-    n = trips * rows
-    return Rows(np.zeros((n, 1)), (noise + size * wave).ravel(), clusters, trip, np.full(n, 2.0), np.ones(n), "kW")
+    return rows_of((noise + size * wave).ravel(), clusters)
+
+
+def rows_of(residual: np.ndarray, clusters: Clusters) -> Rows:
+    """Rows of 2 s and 20 m without features, each cluster a trip."""
+    n = len(residual)
+    amounts = {"time": np.full(n, 2.0), "distance": np.full(n, 20.0), "energy": np.ones(n)}
+    return Rows(
+        np.zeros((n, 1)), residual, clusters, clusters.ids, np.full(n, 2.0), np.ones(n), "kW", np.ones(n), amounts
+    )
 
 
 def _without_levels(rows):
@@ -70,15 +83,110 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     rows = residual(rng, 8, 200)
     level = np.repeat(rng.normal(0, 2.0, 8), 200)
     trip, values = np.r_[rows.trip, 8, 8, 8], np.r_[rows.residual + level, 0.1, 0.0, -0.1]
-    short = Rows(np.zeros((1603, 1)), values, Clusters(trip, 9, "trip"), trip, np.full(1603, 2.0), np.ones(1603), "kW")
+    short = rows_of(values, Clusters(trip, 9, "trip"))
     found = _levels(short, _without_levels(short))
     assert found is not None
     assert found[2] == pytest.approx(np.std(level), rel=0.3)
 
 
+def travelled(seed: int, of: str | None, *, alike: bool = False) -> Rows:
+    """Trips of one length or of several, and of speeds and forces of their own; a remainder so much of one amount."""
+    rng = np.random.default_rng(seed)
+    trips, longest = 12, 400
+    lengths = np.full(trips, longest) if alike else rng.integers(60, longest, trips)
+    trip = np.repeat(np.arange(trips), lengths)
+    speed, force = np.ones(trips), np.ones(trips)
+    if not alike:
+        speed, force = rng.uniform(5, 25, trips), rng.uniform(1, 9, trips)
+    amounts: Mapping[str, np.ndarray] = {
+        "time": np.full(len(trip), 2.0), "distance": 2.0 * speed[trip], "energy": 2.0 * (speed * force)[trip]
+    }  # fmt: skip
+    residual = rng.standard_normal(len(trip))
+    if of is not None:
+        residual += 0.6 * amounts[of] / np.sqrt(np.mean(amounts[of] ** 2))
+    return replace(rows_of(residual, Clusters(trip, trips, "trip")), amounts=amounts)
+
+
+@pytest.mark.parametrize("of", ["time", "distance", "energy", None])
+def test_what_a_trips_remainder_is_in_proportion_to(of):
+    assert [_scale(travelled(seed, of)) for seed in range(5)] == [of] * 5
+
+
+def test_trips_of_one_length_and_speed_tell_no_amounts_apart():
+    assert _scale(travelled(0, "time", alike=True)) is None
+
+
+def test_a_fold_has_no_say_in_the_rounds_that_predict_it(monkeypatch):
+    """The rows that a model predicts are in neither part of the run that chooses its number of rounds."""
+    rng, trained, judged = np.random.default_rng(0), [], []
+    n, real = 800, lgb.train
+    rows = replace(rows_of(rng.standard_normal(n), Clusters(np.repeat(np.arange(8), 100), 8, "trip")))
+    x = rng.standard_normal((n, 2))
+    rows = replace(rows, features=x, residual=x[:, 0] + 0.1 * rng.standard_normal(n))
+
+    def train(parameters, data, rounds, valid_sets=(), **options):
+        trained.append([set(np.asarray(d.label)) for d in (data, *valid_sets)])
+        return real(parameters, data, rounds, valid_sets=list(valid_sets), **options)
+
+    monkeypatch.setattr(lgb, "train", train)
+    _, share, p, leading = _learner(rows, rows, ["one", "other"], 0)
+    assert share > 0.9
+    assert p < 1e-3
+    assert leading == ("one",)
+    *folds, (last,) = trained
+    labels = {np.float32(y) for y in rows.residual / np.std(rows.residual)}
+    assert len(last) == len(labels) == n
+    for (inside, stop), (fitted,) in zip(folds[::2], folds[1::2], strict=True):
+        out = last - fitted  # the fold that this model predicts
+        judged.append(out)
+        assert not out & (inside | stop)
+        assert inside | stop == fitted
+    assert set.union(*judged) == last
+    assert sum(len(out) for out in judged) == n
+
+
+ROAD_SIDE = """
+[road]
+c_rr   = { value = 0.0060, sd = 0.0008 }
+cda_m2 = { value = 5.6, sd = 0.5 }
+[driveline]
+efficiency = 0.91
+gear_ratios = [9.16, 5.27, 3.33, 2.16]
+final_drive = 4.5
+wheel_radius_m = 0.5
+"""
+
+
+@pytest.mark.parametrize("target", ["traction_force_n", "motor_torque_nm"])
+def test_a_formula_is_found_where_the_target_lies_before_the_battery(target, tmp_path):
+    """A force in proportion to a channel, where the target is the force at the wheels or the torque at the shaft."""
+    files = synthetic_log(seed=2, trips=12, rows_per_trip=120, entry="shaft", mode="samples").write(tmp_path)
+    files["sheet"].write_text(files["sheet"].read_text() + ROAD_SIDE)
+    problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]), target)
+    sway = np.random.default_rng(1).standard_normal(len(problem.segments))
+    problem = replace(problem, segments=problem.segments.with_channels(sway=sway))
+    base = problem.predict(problem.vehicle)
+    pushed = problem.segments.with_channels(**{TERM: 900.0 * sway})
+    cause = problem.predict(problem.vehicle.plus(DescribedForce(np.asarray(1.0))), pushed) - base
+    if target == "traction_force_n":
+        np.testing.assert_allclose(cause, 900.0 * sway)
+    noise = 0.3 * np.std(cause) * np.random.default_rng(0).standard_normal(len(base))
+    rows, clusters = padded(problem.segments, base + cause + noise), cluster_rows(problem.segments)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    loop = Loop(rows, problem.target, clusters, [], 0.05, np.random.default_rng(0), 4)
+    found = find_expression(
+        Search(problem.vehicle, problem.table, fit), loop, problem.segments, predict=problem.predict
+    )
+    assert found is not None
+    assert found.factors[0] == Factor("sway")  # maybe times a channel that hardly changes
+    assert " N" in found.formula
+    better = np.std(base + cause - found.predicted) / np.std(base + cause - fit.predicted)
+    assert better < 0.2
+
+
 @pytest.mark.parametrize("suffix", [s for kind in _SUFFIXES.values() for s in kind])
 def test_every_suffix_gives_a_coefficient_its_unit(suffix):
-    assert _power_unit((Factor(f"something_{suffix}"), Factor("speed_mps", 2)))
+    assert _coefficient_unit((Factor(f"something_{suffix}"), Factor("speed_mps", 2)), "W")
 
 
 def test_monomials_carry_units_that_make_a_power(tmp_path):

@@ -1,0 +1,85 @@
+"""The best way to have each effect: what is plausible, what it is worth, and how many ways were tried."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hdev_jax.diagnosis.candidates import Candidate
+from hdev_jax.diagnosis.evidence import Evidence, Score
+from hdev_jax.diagnosis.significance import effective_number
+
+__all__ = ["CLOSE", "LEFT_OUT", "STABLE", "best_of", "plausible", "worth"]
+
+CERTAIN = 1e-6  # p below which it does not matter how small it is
+CLOSE = 0.85  # of what the best is worth, for a candidate to be about as good
+LEFT_OUT = 3.0  # least gain in log-likelihood over the clusters left out: chance alone gives about half a unit
+STABLE = 0.25  # least share of resampled sets of clusters in which it is chosen again
+
+
+def plausible(s: Score) -> bool:
+    """Signs, ranges and least sizes; a switch has to make about the whole of its difference."""
+    c = s.candidate
+    if c.kind == "limit":
+        first = c.parameter(c.sizes[0])
+        size = abs(dict(c.shapes)[first.name] * s.beta[0])
+        return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5 and size >= first.least)
+    parameters = [c.parameter(n) for n in c.sizes]
+    within = all(p.lower <= p.null + b <= p.upper for p, b in zip(parameters, s.beta, strict=True))
+    return within and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
+
+
+def worth(gain: float, c: Candidate) -> float:
+    """Gain less what its numbers cost: as BIC would for 400 independent rows a size, 20 a shape.
+
+    Rows of a log are not independent, and what differs only between trips has no more of them than trips.
+    """
+    return gain - 3.0 * len(c.columns) - 1.5 * (c.freedoms - len(c.columns))
+
+
+def best_of(
+    evidence: Evidence, plain: Evidence, candidates: Sequence[Candidate], slow: np.ndarray
+) -> tuple[dict[str, Score], dict[str, float]]:
+    """The best plausible way to have each effect, and how many independent ways were tried."""
+    totals = evidence.totals()
+    before = evidence.base_likelihood(totals)
+    tried: dict[str, int] = {}
+    ranked: dict[str, list[tuple[float, Candidate]]] = {}
+    for c in candidates:
+        if min(totals[0, evidence.base + k, evidence.base + k] for k in c.columns) <= 1e-20:
+            continue
+        gain, _ = evidence.gain(totals, c.columns, before)
+        tried[c.id] = tried.get(c.id, 0) + 1
+        ranked.setdefault(c.id, []).append((worth(gain, c), c))
+    best, ways = {}, {}
+    for id_, entries in ranked.items():
+        apart = evidence.projected(np.unique([k for _, c in entries for k in c.columns]))
+        ways[id_] = min(float(tried[id_]), effective_number(apart))
+        looks = [_clearest([evidence.score(c) for _, c in _leading(entries)])]
+        scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
+        if scores:
+            looks.append(_clearest(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
+        # what both looks see is told by the whitened rows, which see it better
+        able = [s for s in looks if plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
+        best[id_] = min(able, key=lambda s: (s.p > CERTAIN, s.p if s.p > CERTAIN else 0.0))
+    return best, ways
+
+
+def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
+    return sorted(entries, key=lambda e: _falling(e[0]))[:6]
+
+
+def _falling(worth: float) -> float:
+    """For sorting from the best: ways that come to the same but for rounding keep the order of the library's grids.
+
+    A delay of a row by linear and by cubic interpolation is one column, but where a refit starts from differs.
+    """
+    return -float(f"{worth:.9g}")
+
+
+def _clearest(scores: list[Score]) -> Score:
+    """The first that is plausible, or one that explains about as much with fewer doubts: a second size may blur it."""
+    able = [s for s in scores if plausible(s)]
+    if not able or able[0].p <= CERTAIN:
+        return (able or scores)[0]
+    bar = CLOSE * worth(able[0].gain, able[0].candidate)
+    return min((s for s in able if worth(s.gain, s.candidate) >= bar), key=lambda s: s.p, default=able[0])

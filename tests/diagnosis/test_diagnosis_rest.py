@@ -1,0 +1,86 @@
+"""What is left decides what was found by training rows alone; test rows are for the report."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hdev_jax.diagnosis import rest
+from hdev_jax.diagnosis.expression import Expression
+from hdev_jax.diagnosis.look import Loop, Search
+from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
+from hdev_jax.inference import Clusters
+
+TRIPS, ROWS = 8, 150
+
+
+def silent(_: str) -> None:
+    return None
+
+
+def bare(cls: type, **values: Any) -> Any:
+    """An object of the class that has these attributes alone."""
+    made = object.__new__(cls)
+    for name, value in values.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def side(seed: int, *, size: float) -> Rows:
+    """Rows whose residual follows a bump of the first of two features, of so much beside noise of variance 1."""
+    rng = np.random.default_rng(seed)
+    n = TRIPS * ROWS
+    features = rng.uniform(-1, 1, (n, 2))
+    residual = size * np.where(np.abs(features[:, 0]) < 0.5, 1.0, -1.0) + rng.standard_normal(n)
+    trip = np.repeat(np.arange(TRIPS), ROWS)
+    amounts = {"time": np.full(n, 2.0), "distance": np.full(n, 20.0), "energy": np.ones(n)}
+    clusters = Clusters(trip, TRIPS, "trip")
+    return Rows(features, residual, clusters, trip, np.full(n, 2.0), np.ones(n), "kW", np.ones(n), amounts)
+
+
+def left_of(train: Rows, test: Rows) -> Remainder:
+    return remainder(train, test, ["humidity_pct", "soc"], "Wh", [f"T{k}" for k in range(TRIPS)], seed=0)
+
+
+def test_what_decides_is_seen_on_training_rows_alone():
+    """Test rows without the structure change what is told of it, not its size: that one removes effects."""
+    train = side(0, size=1.0)
+    there, gone = left_of(train, side(1, size=1.0)), left_of(train, side(1, size=0.0))
+    assert there.significant
+    assert there.share == pytest.approx(0.5, abs=0.1)
+    assert there.correction is not None
+    assert there.correction["channel"] == "humidity_pct"
+    at, value = np.array(there.correction["at"]), np.array(there.correction["value"])
+    clear = np.abs(np.abs(at) - 0.5) > 0.15  # a bin about the edge holds both
+    np.testing.assert_allclose(value[clear], np.where(np.abs(at[clear]) < 0.5, 1.0, -1.0), atol=0.4)
+    assert not gone.significant
+    assert gone.correction is None
+    assert gone.scales_with is None
+    assert gone.rms == there.rms == pytest.approx(1.0, abs=0.15)
+    assert left_of(side(2, size=0.0), side(1, size=1.0)).rms == 0.0
+
+
+def test_a_formula_that_explains_test_rows_alone_is_none(monkeypatch):
+    """Whether a formula explains enough is asked of training rows, not of test rows nor of those that nobody uses."""
+    train = np.arange(300) < 200
+    problem = bare(Problem, measured=np.random.default_rng(0).standard_normal(300), segments=None)
+    found = bare(Expression, predicted=np.where(train, 0.01, 5.0))
+    monkeypatch.setattr(rest, "find_expression", lambda *_, **__: found)
+    left = bare(Remainder, cycle_w=np.zeros(200))
+    assert rest._formula(problem, train, bare(Search), bare(Loop), np.zeros(300), {}, left, silent) == {}
+
+
+@pytest.mark.parametrize(("rms", "gone"), [(0.0, None), (0.1, None), (2.0, "power_gain")])
+def test_a_constant_goes_where_more_than_it_explains_is_left(rms, gone):
+    effect = SimpleNamespace(id="power_gain", stage="sensors", needs=(), searched="")
+    state = bare(
+        Search,
+        found=[SimpleNamespace(id="power_gain", score=SimpleNamespace(candidate=SimpleNamespace(effect=effect)))],
+    )
+    problem, train = bare(Problem, measured=np.r_[np.ones(10), np.full(5, 9.0)]), np.arange(15) < 10
+    predicted = [np.zeros(15), np.where(train, 1.0, 0.0)]  # explains the training rows: a gain of 1
+    left = replace(left_of(side(0, size=0.0), side(1, size=0.0)), rms=rms, significant=rms == 0.0)
+    assert rest._shadow(problem, state, predicted, train, left) == gone
