@@ -71,7 +71,8 @@ def _in_library(id_: str, synthetic: SyntheticLog, split: Split) -> dict[str, An
 
     Where a trip's phase or mode has to be known, it is that of the training trips: nobody knows the others.
     """
-    truth, values = synthetic.vehicle, dict(synthetic.vehicle.effects[id_])
+    truth = synthetic.vehicle
+    values: dict[str, Any] = dict(truth.effects[id_])
     if id_ == "friction_blending":
         values["above_pa"] = 0.0
     if id_ == "voltage_dependence":

@@ -101,7 +101,7 @@ class DescribedForce(Effect):
         return self.k * row.channels[TERM]
 
 
-def _describing(target: Target) -> type[Effect]:
+def _describing(target: Target) -> type[Described] | type[DescribedForce]:
     return Described if target in BATTERY_TARGETS else DescribedForce
 
 
