@@ -20,6 +20,7 @@ ENOUGH_ROWS = 20_000  # tell the shape of a row's noise; every so many of more
 MOST_FREEDOM = 200.0  # of a Student t that is a normal
 MOST_LAG = 20  # rows: enough to tell what is left of a correlation from a row's own noise
 DECAYS = np.linspace(0.3, 0.99, 70)  # of the correlation, from a row to the next
+GROWS = 3.0  # least gain in log-likelihood, of rows worth independent ones, for a noise that grows
 FAULT = 6.0  # scales: where outliers are weighed down, a row beyond this is an instrument's fault and no trip's energy
 
 
@@ -130,7 +131,11 @@ def spread_of(
     `open_row` of each row: what the coefficients leave open of them is no noise. `row_s`, what a row lasts. `robust`: a
     row beyond `FAULT` scales is no energy.
     """
-    scale, growth, freedom = _of_rows(error, predicted, open_row)
+    scale, growth, freedom, loss = _of_rows(error, np.zeros(len(error)), open_row)
+    grown = _of_rows(error, predicted, open_row)
+    # rows that go together tell less: in a short drive the noise is soon larger by chance where the energy is
+    if (loss - grown[3]) * len(error) / _times(error / scale, clusters) > GROWS:
+        scale, growth, freedom, _ = grown
     square = _square(scale, growth, predicted)
     if robust:
         error = np.clip(error, -FAULT * np.sqrt(square), FAULT * np.sqrt(square))
@@ -187,8 +192,8 @@ def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> float:
     return times
 
 
-def _of_rows(error: np.ndarray, predicted: np.ndarray, open_row: np.ndarray) -> tuple[float, float, float]:
-    """Scale, growth and degrees of freedom of a row's Student t, by maximum likelihood."""
+def _of_rows(error: np.ndarray, predicted: np.ndarray, open_row: np.ndarray) -> tuple[float, float, float, float]:
+    """Scale, growth, degrees of freedom of a row's Student t by maximum likelihood; −log of that, mean of the rows."""
     every = max(len(error) // ENOUGH_ROWS, 1)
     error, size, besides = error[::every], np.abs(predicted[::every]), open_row[::every] ** 2
     unit = max(float(np.sqrt(np.mean(error**2))), 1e-9 * max(float(np.max(size)), 1.0))
@@ -204,5 +209,6 @@ def _of_rows(error: np.ndarray, predicted: np.ndarray, open_row: np.ndarray) -> 
     most = 2.0 if np.any(size > 0) else 0.0  # where nothing is predicted nothing grows
     bounds = [(np.log(1e-3), np.log(2.0)), (0.0, most), (np.log(2.1), np.log(MOST_FREEDOM))]
     start = np.array([np.log(0.7), min(0.3, most), np.log(8.0)])
-    z = optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
-    return unit * float(np.exp(z[0])), float(z[1]) * unit / typical, float(np.exp(z[2]))
+    best = optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds)
+    z = best.x
+    return unit * float(np.exp(z[0])), float(z[1]) * unit / typical, float(np.exp(z[2])), float(best.fun)
