@@ -87,14 +87,14 @@ def left_out(
     segments = rows.segments.take(np.arange(len(rows.segments)) < n)
     clusters, row_s = sums_of(segments), float(np.median(np.asarray(segments.duration_s)))
     error = np.asarray(rows.measured)[:n] - fit.predicted
-    open_sd, open_row = np.zeros(clusters.count), np.zeros(n)
+    open_sd = np.zeros(clusters.count)
     if fit.table.free:
         x = jacobian(fit.vehicle, fit.table, rows.segments, target)[:n]
         tail = (STUDENT_DF + 1.0) / (STUDENT_DF + (error / fit.sigma) ** 2) if robust else np.ones(n)
         counted = tail / (fit.sigma**2 * fit.inflation)
         error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])
-        open_row = np.linalg.norm(x @ covariance_root(fit.covariance), axis=1)
-    spread = spread_of(error, fit.predicted, weight, clusters, open_sd, open_row, row_s=row_s, robust=robust)
+    # of one row the coefficients leave next to nothing open beside its noise
+    spread = spread_of(error, fit.predicted, weight, clusters, open_sd, np.zeros(n), row_s=row_s, robust=robust)
     return spread, clusters
 
 
