@@ -1,6 +1,6 @@
 """What a prediction may be off by on trips that no fit has seen: a row's noise, and how a trip's errors add up."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -31,7 +31,8 @@ class Spread:
     A row is off by a Student t of `freedom` degrees whose scale s is √(`scale`² + (`growth`·predicted)²), in the
     target's unit. The sum of a trip's rows, each weighed by w, has the variance `together`·Σw²s² + (`level`·Σws)²: what
     goes from row to row, and what all rows of a trip share. It is known to `total_freedom` degrees of freedom, one for
-    each training trip, predicted by a fit without it. Rows last about `row_s`.
+    each training trip, predicted by a fit without it. Rows last about `row_s`. `open_times`: how much more the
+    coefficients leave open, as a variance, than the fit's covariance says whose blocks of one trip err together.
     """
 
     scale: float
@@ -41,13 +42,14 @@ class Spread:
     level: float
     total_freedom: float
     row_s: float
+    open_times: float = 1.0
 
     def rows(
         self, level: float, open_sd: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
     ) -> Float[np.ndarray, " row"]:
         """Half the interval of each row, of which the coefficients leave `open_sd` open."""
         own = float(stats.t.ppf(0.5 + level / 2, self.freedom)) * np.sqrt(_square(self.scale, self.growth, predicted))
-        return np.hypot(float(stats.norm.ppf(0.5 + level / 2)) * open_sd, own)
+        return np.hypot(float(stats.norm.ppf(0.5 + level / 2)) * np.sqrt(self.open_times) * open_sd, own)
 
     def total(
         self, level: float, open_sd: float, weight: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
@@ -55,7 +57,7 @@ class Spread:
         """Half the interval of the weighed sum of these rows, of which the coefficients leave `open_sd` open."""
         each = weight * np.sqrt(_square(self.scale, self.growth, predicted))
         own = self.together * float(np.sum(each**2)) + (self.level * float(np.sum(each))) ** 2
-        return float(stats.t.ppf(0.5 + level / 2, self.total_freedom) * np.sqrt(open_sd**2 + own))
+        return float(stats.t.ppf(0.5 + level / 2, self.total_freedom) * np.sqrt(self.open_times * open_sd**2 + own))
 
 
 def _square(scale: float, growth: float, predicted: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:
@@ -95,6 +97,9 @@ def left_out(
         error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])
     # of one row the coefficients leave next to nothing open beside its noise
     spread = spread_of(error, fit.predicted, weight, clusters, open_sd, np.zeros(n), row_s=row_s, robust=robust)
+    if clusters.kind == "block" and fit.table.free:  # as the inflation of the fit's covariance, at their full length
+        lasting = _times(error / np.sqrt(_square(spread.scale, spread.growth, fit.predicted)), clusters)
+        spread = replace(spread, open_times=max(lasting / fit.inflation, 1.0))
     return spread, clusters
 
 

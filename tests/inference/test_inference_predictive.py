@@ -206,3 +206,17 @@ def test_a_calibrations_own_spread():
         found, clusters = left_out(fit, rows, "battery_power_kw", np.full(len(s), 5.0))
         assert (found.total_freedom, clusters.kind) == (TRIPS, "trip")
         assert found.scale == pytest.approx(2.0, rel=0.15)
+
+
+@pytest.mark.parametrize(("rho", "low", "high"), [(0.0, 1.0, 1.5), (0.97, 2.0, np.inf)])
+def test_coefficients_of_a_single_drive_are_as_open_as_its_errors_last(rho, low, high):
+    """Blocks of the drive that are no longer than its errors last agree with each other by more than they know."""
+    s, rng = driving(400, seed=3), np.random.default_rng(1)
+    clean = np.asarray(truck().predict(padded(s, np.zeros(len(s))).segments, "battery_power_kw"))[: len(s)]
+    rows = padded(s, clean + 4.0 * autocorrelated(rng, 1, len(s), rho)[0])
+    fit = calibrate(truck(), tabular(), rows, "battery_power_kw", cluster_rows(s))
+    found, clusters = left_out(fit, rows, "battery_power_kw", np.full(len(s), 5.0))
+    assert clusters.kind == "block"
+    assert low <= found.open_times <= high
+    x = np.full(3, 2.0)
+    assert np.all(found.rows(0.9, x, x) >= 1.6 * np.sqrt(found.open_times) * x)
