@@ -211,6 +211,6 @@ def _figure(run: Run, found: dict[str, dict[str, list[float]]]) -> None:
     ax.axvline(90, color=GREY)
     ax.set_yticks(-np.arange(len(found)), list(found))
     ax.set_xlabel("totals of new trips inside the 90 % interval [%]")
-    ax.legend(loc="lower left")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=2, title="synthetic logs and fleet")
     tidy(ax, grid="x")
     save_figure(run, fig, "coverage")
