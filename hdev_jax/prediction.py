@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from hdev_jax.diagnosis.metrics import PER_KWH
 from hdev_jax.diagnosis.problem import UNITS, Problem, prepare
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.errors import InputError
@@ -22,7 +23,6 @@ __all__ = ["predict", "write_predictive"]
 BESIDE = "predictive.json"  # what a fitted sheet has beside it
 Noise = Literal["normal", "student_t"]
 LIKE = 1.5  # times as long: rows of another log whose noise is still like
-KWH = {"energy_wh": 1e3, "battery_power_kw": 3600.0, "traction_force_n": 3.6e6}
 
 
 def write_predictive(
@@ -199,11 +199,11 @@ def _totals(problem: Problem, predicted: np.ndarray, x: np.ndarray, spread: Spre
     from scipy import stats
 
     weight = problem.weight()
-    unit = "kWh" if problem.target in KWH else problem.unit
+    unit = "kWh" if problem.target in PER_KWH else problem.unit
     lines = []
     for i, trip in enumerate(problem.log.trip_names):
         rows = problem.rows([i])
-        per = KWH.get(problem.target, float(np.sum(weight[rows])))
+        per = PER_KWH.get(problem.target, float(np.sum(weight[rows])))
         if not per > 0:
             lines.append(f"{trip:40s} {'-':>10s} {unit}  stands all the time")
             continue

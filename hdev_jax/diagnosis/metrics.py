@@ -5,7 +5,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["metrics", "sum_weight"]
+__all__ = ["PER_KWH", "metrics", "sum_weight"]
+
+# of a weighed sum, by target: Wh, kW·s and N·m; a torque's sum is no energy
+PER_KWH = {"energy_wh": 1e3, "battery_power_kw": 3600.0, "traction_force_n": 3.6e6}
 
 
 def sum_weight(target: str, duration_s: np.ndarray, distance_m: np.ndarray) -> Float[np.ndarray, " row"]:

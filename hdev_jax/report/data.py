@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax.diagnosis.metrics import PER_KWH, sum_weight
 from hdev_jax.diagnosis.metrics import metrics as errors
-from hdev_jax.diagnosis.metrics import sum_weight
 
 __all__ = ["ReportData", "TripLine", "metrics", "same_model", "test_rows", "total", "total_name", "trip_lines"]
 
@@ -101,7 +101,7 @@ def total(data: ReportData, rows: np.ndarray) -> float:
     s = float(np.sum(data.row("measured")[rows] * weight))
     if data.unit == "Nm":
         return s / max(float(np.sum(weight)), 1e-12)
-    return s / {"Wh": 1e3, "kW": 3600.0, "N": 3.6e6}.get(data.unit, 1.0)
+    return s / PER_KWH[data.summary["target"]]
 
 
 def metrics(data: ReportData, rows: np.ndarray, when: str) -> dict[str, Any]:

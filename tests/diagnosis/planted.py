@@ -14,7 +14,19 @@ from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["breaches", "run"]
+__all__ = ["ROAD_SIDE", "breaches", "run"]
+
+# what a sheet of a log that enters at the shaft needs besides, to be asked from the road
+ROAD_SIDE = """
+[road]
+c_rr   = { value = 0.0060, sd = 0.0008 }
+cda_m2 = { value = 5.6, sd = 0.5 }
+[driveline]
+efficiency = 0.91
+gear_ratios = [9.16, 5.27, 3.33, 2.16]
+final_drive = 4.5
+wheel_radius_m = 0.5
+"""
 
 _runs = 0
 

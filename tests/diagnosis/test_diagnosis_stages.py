@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from planted import ROAD_SIDE
 
 from hdev_jax.diagnosis.diagnose import diagnose
 from hdev_jax.diagnosis.problem import prepare
@@ -14,16 +15,6 @@ from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
 
 SIDES = ("copper_loss", "iron_loss", "auxiliary_power", "rolling_speed", "headwind", "mass_scale")
-ROAD_SIDE = """
-[road]
-c_rr   = { value = 0.0060, sd = 0.0008 }
-cda_m2 = { value = 5.6, sd = 0.5 }
-[driveline]
-efficiency = 0.91
-gear_ratios = [9.16, 5.27, 3.33, 2.16]
-final_drive = 4.5
-wheel_radius_m = 0.5
-"""
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from dataclasses import replace
 import lightgbm as lgb
 import numpy as np
 import pytest
+from planted import ROAD_SIDE
 
 from hdev_jax.diagnosis.expression import TERM, DescribedForce, Factor, _coefficient_unit, find_expression, monomials
 from hdev_jax.diagnosis.look import Loop, Search
@@ -143,18 +144,6 @@ def test_a_fold_has_no_say_in_the_rounds_that_predict_it(monkeypatch):
         assert inside | stop == fitted
     assert set.union(*judged) == last
     assert sum(len(out) for out in judged) == n
-
-
-ROAD_SIDE = """
-[road]
-c_rr   = { value = 0.0060, sd = 0.0008 }
-cda_m2 = { value = 5.6, sd = 0.5 }
-[driveline]
-efficiency = 0.91
-gear_ratios = [9.16, 5.27, 3.33, 2.16]
-final_drive = 4.5
-wheel_radius_m = 0.5
-"""
 
 
 @pytest.mark.parametrize("target", ["traction_force_n", "motor_torque_nm"])
