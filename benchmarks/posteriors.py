@@ -2,12 +2,12 @@
 
 recursive   a row more of one vehicle, and of 1,000 at once, with the prediction before and the coefficients after it
 fleet       20 vehicles × 25,000 rows, hierarchical, linear-Gaussian: effective draws a second, first answer
-kernel      20 × 1,000 rows, hierarchical, through the kernel's switch with Student-t noise: ours against NumPyro's NUTS
-agreement   the same on a small fleet, where both samplers converge: do they have the same posterior?
+kernel      20 × 1,000 rows, hierarchical, through the kernel's switch with Student-t noise: ours and NumPyro's NUTS,
+            their speed and whether they have the same posterior once both have converged (over half an hour)
 rows        the closed form in chunks, one piece again and again: one pass over 10 million rows, memory
 
 All data are synthetic. Seconds are wall clock; where cores are shared, `cpu` (of this process) tells more. With --write
-the table is kept in docs/posteriors.md.
+what was measured takes its place in docs/posteriors.md, with the command.
 """
 
 import argparse
@@ -25,8 +25,8 @@ import numpy as np
 __all__ = ["main"]
 
 DOC = Path(__file__).parents[1] / "docs" / "posteriors.md"
-WHAT = ("recursive", "fleet", "kernel", "agreement", "rows")
-SMALL, SMALL_DRAWS = (8, 100), 700  # vehicles and rows of each on which NumPyro's NUTS converges in minutes
+WHAT = ("recursive", "fleet", "kernel", "rows")
+HEAD = ["| synthetic data | compiling [s] | measured | besides | wanted |", "|---|---:|---:|---:|---:|"]
 CONVERGED = 1.1  # R-hat above which draws say nothing of a speed or a mean
 TABLE = (("road.c_rr", "1", 0.006, 0.0008), ("road.cda_m2", "m²", 5.6, 0.5))
 
@@ -132,13 +132,8 @@ def linear_fleet() -> list[list[str]]:
     ]  # fmt: skip
 
 
-def through_kernel(
-    vehicles: int, rows_each: int, draws: int, plain_draws: int, *, centred: bool = True
-) -> list[list[str]]:
-    """Ours and NumPyro's NUTS on the same model and rows, and whether they agree where both have converged.
-
-    `centred`: vehicles as the model has them, which suits many rows of each; else relative to the fleet, for few.
-    """
+def through_kernel(vehicles: int, rows_each: int, draws: int, plain_draws: int) -> list[list[str]]:
+    """Ours and NumPyro's NUTS on the same model and rows, and whether they agree where both have converged."""
     import arviz
     import jax
 
@@ -156,9 +151,7 @@ def through_kernel(
     first = Clock(lambda: run(model, placed.result, jax.random.key(0)))
     ours = Clock(lambda: run(model, placed.result, jax.random.key(1)))
     plain = Clock(
-        lambda: numpyro_nuts(
-            model, key=jax.random.key(2), chains=2, draws=plain_draws, warm_up=2 * plain_draws, centred=centred
-        )
+        lambda: numpyro_nuts(model, key=jax.random.key(2), chains=2, draws=plain_draws, warm_up=2 * plain_draws)
     )
     a, b = ours.result.quality(), plain.result.quality()
     apart = []
@@ -220,14 +213,25 @@ def many_rows(rows: int) -> list[list[str]]:
     ]
 
 
+def _kept() -> dict[str, list[str]]:
+    """The page's sections by name, as earlier commands left them."""
+    sections: dict[str, list[str]] = {}
+    for line in DOC.read_text(encoding="utf-8").splitlines() if DOC.exists() else []:
+        if line.startswith("## "):
+            sections[line.removeprefix("## ")] = [line]
+        elif sections:
+            sections[next(reversed(sections))].append(line)
+    return sections
+
+
 def main(argv: list[str] | None = None) -> int:
     """Measure, print, and with `--write` keep the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="*", default=[], choices=[*WHAT, []], help="all, where none is named")
     parser.add_argument("--rows", type=int, default=10_000_000)
-    parser.add_argument("--draws", type=int, default=500, help="of each chain, ours")
+    parser.add_argument("--draws", type=int, default=2000, help="of each chain, ours")
     parser.add_argument(
-        "--plain-draws", type=int, default=300, help="of each chain, NumPyro's, after twice as many to warm up"
+        "--plain-draws", type=int, default=500, help="of each chain, NumPyro's, after twice as many to warm up"
     )
     parser.add_argument("--write", action="store_true", help="keep the table in docs/posteriors.md")
     options = parser.parse_args(argv)
@@ -235,20 +239,23 @@ def main(argv: list[str] | None = None) -> int:
 
     jax.config.update("jax_enable_x64", True)
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    lines = ["| synthetic data | compiling [s] | measured | besides | wanted |", "|---|---:|---:|---:|---:|"]
     calls = {
         "recursive": recursive, "fleet": linear_fleet, "rows": lambda: many_rows(options.rows),
         "kernel": lambda: through_kernel(20, 1000, options.draws, options.plain_draws),
-        "agreement": lambda: through_kernel(*SMALL, options.draws, SMALL_DRAWS, centred=False),
     }  # fmt: skip
+    sections = _kept()
+    print("\n".join(HEAD), flush=True)
     for name in options.what or WHAT:
+        table = [*HEAD]
         for row in calls[name]():
-            lines.append(f"| {' | '.join(row)} |")
-            print(lines[-1], flush=True)
-    head = ["# Posteriors: speed", "", f"Made by `python benchmarks/posteriors.py {shlex.join(sys.argv[1:])}`.",
-            f"{cores} cores, float64; load of the machine {os.getloadavg()[0]:.1f}.", ""]  # fmt: skip
+            table.append(f"| {' | '.join(row)} |")
+            print(table[-1], flush=True)
+        made = [f"Made by `python benchmarks/posteriors.py {shlex.join(sys.argv[1:])}`: {cores} cores, float64;",
+                f"load of the machine {os.getloadavg()[0]:.1f}."]  # fmt: skip
+        sections[name] = [f"## {name}", "", *made, "", *table, ""]
     if options.write:
-        DOC.write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
+        lines = ["# Posteriors: speed", "", *(line for name in WHAT for line in sections.get(name, []))]
+        DOC.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     return 0
 
 

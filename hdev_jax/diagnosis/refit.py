@@ -1,6 +1,6 @@
 """Joint refits: the vehicle with a candidate, every free coefficient fitted anew, and whether it stands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_co
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
-__all__ = ["grow", "is_size", "joined", "refit", "sharpened", "without"]
+__all__ = ["as_known", "grow", "is_size", "joined", "refit", "sharpened", "without"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
 AGREES = 0.9878  # of Student's distribution between what plain rows say of a size and what whitened ones do: 2.25 sd
@@ -91,6 +91,37 @@ def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
 
 
+def as_known(problem: Loop, fit: Calibration) -> Calibration:
+    """The fit of a vehicle whose effects are chosen, with what whitened rows say of its declared coefficients.
+
+    Where errors are slow they know them several times as well as rows of equal weight, as long as both agree (Hausman,
+    Econometrica 46, 1978). Before the effects are there, weights that suit the noise would only serve what is missing.
+
+    **Returns:** the fit itself where whitened rows know no declared coefficient better, or one is contradicted. In the
+    table of the other, declared coefficients are borrowed.
+    """
+    settled, error = settle(problem.ground(fit, problem.noise(fit)))
+    declared = np.array([not c.path.startswith("effects.") for c in fit.table.free], dtype=bool)
+    apart = float(stats.t.ppf(AGREES, max(problem.clusters.count - 1, 1)))
+    agree = np.abs(settled.values - fit.values) <= apart * fit.sd
+    better = declared & (KNOWN * error <= fit.sd)
+    if not better.any() or not np.all(agree[declared]):
+        return fit
+    told = {(c.path, c.group): (float(x), float(e))
+            for c, x, e, b in zip(fit.table.free, settled.values, error, better, strict=True) if b}  # fmt: skip
+    return calibrate(fit.vehicle, _lent(fit.table, told), problem.rows, problem.target, problem.clusters)
+
+
+def _lent(table: ParameterTable, told: Mapping[tuple[str, int | None], tuple[float, float]]) -> ParameterTable:
+    """The table with these values and standard errors of borrowed coefficients, by path and group."""
+    rows = []
+    for c in table.rows:
+        if (told_of := told.get((c.path, c.group))) is not None:
+            c = replace(c, value=told_of[0], sd=told_of[1], borrowed=True)
+        rows.append(c)
+    return ParameterTable(tuple(rows))
+
+
 def without(problem: Loop, state: Search, effect_id: str) -> Search:
     """The state with one effect taken out again and the rest refitted."""
     table, vehicle = state.table.minus(effect_id), state.fit.vehicle.minus(effect_id)
@@ -114,11 +145,7 @@ def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | No
             for c, x, e in zip(state.table.free, fit.values, error, strict=True) if c.borrowed}  # fmt: skip
     if not all(np.isfinite(e) for _, e in told.values()):
         return None
-    rows = []
-    for c in state.table.rows:
-        value, sd = told.get((c.path, c.group), (c.value, c.sd))
-        rows.append(replace(c, value=value, sd=sd))
-    return ParameterTable(tuple(rows))
+    return _lent(state.table, told)
 
 
 def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) -> tuple[Coefficient, ...]:

@@ -15,7 +15,7 @@ import numpy as np
 from hdev_jax.diagnosis.expression import Factor, find_expression
 from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.refit import without
+from hdev_jax.diagnosis.refit import as_known, without
 from hdev_jax.diagnosis.select import prune
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.standins import beside, stand_ins
@@ -140,7 +140,8 @@ def _gone(loop: Loop, state: Search, effect_id: str) -> Search:
 
 
 def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:
-    """The declared model, then with each effect in the order found, each fitted to all training rows."""
+    """The declared model, then with each effect in the order found, each fitted to all training rows; the last as well
+    as its rows know it."""
     rows, clusters = loop.rows, loop.clusters
     fits = [calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)]
     for k in range(1, len(state.found)):
@@ -154,7 +155,7 @@ def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:
             fits.append(replace(fits[0], vehicle=table.insert(vehicle, jnp.asarray(values)), table=table))
         else:
             fits.append(calibrate(vehicle, table, rows, problem.target, clusters))
-    return [*fits, state.fit] if state.found else fits
+    return [*fits, as_known(loop, state.fit)] if state.found else fits
 
 
 def _features(problem: Problem, predicted: np.ndarray, declared: np.ndarray) -> tuple[np.ndarray, list[str]]:

@@ -202,16 +202,12 @@ def _named(
     return Draws(sites, how, axes, labels, diverging, np.asarray(steps, dtype=float))
 
 
-def numpyro_nuts(
-    m: Model, *, key: Array, chains: int = 2, draws: int = 1000, warm_up: int = 500, centred: bool = True
-) -> Draws:
+def numpyro_nuts(m: Model, *, key: Array, chains: int = 2, draws: int = 1000, warm_up: int = 500) -> Draws:
     """The same posterior by NumPyro's own NUTS on all rows, as it comes: the check, and what speeds are compared with.
 
-    It starts at the tables' values. `centred`: groups as the model has them, which suits many rows of each; otherwise
-    by `LocScaleReparam`, which suits few.
+    It starts at the tables' values.
     """
-    infer, reparam = needs("numpyro.infer"), needs("numpyro.infer.reparam")
-    model = kernel_model
+    infer = needs("numpyro.infer")
     value, sd = (jnp.asarray(a) for a in tabular(m.table))
     start = {
         "mean": value,
@@ -221,10 +217,8 @@ def numpyro_nuts(
         "df": jnp.asarray(8.0),
     }
     start["theta"] = jnp.tile(value, (m.groups, 1)) if m.groups else value
-    if m.groups and not centred:
-        model = needs("numpyro.handlers").reparam(kernel_model, config={"theta": reparam.LocScaleReparam(0)})
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        kernel = infer.NUTS(model, init_strategy=infer.init_to_value(values=start))
+        kernel = infer.NUTS(kernel_model, init_strategy=infer.init_to_value(values=start))
         sampler = infer.MCMC(
             kernel, num_warmup=warm_up, num_samples=draws, num_chains=chains, chain_method="sequential",
             progress_bar=False,
@@ -232,5 +226,4 @@ def numpyro_nuts(
         sampler.run(key, m, extra_fields=("diverging", "num_steps"))
         sites = {k: np.asarray(v) for k, v in sampler.get_samples(group_by_chain=True).items()}
         extra = sampler.get_extra_fields(group_by_chain=True)
-    sites = {k: v for k, v in sites.items() if not k.startswith("theta_")}
     return _named(m, sites, np.asarray(extra["diverging"]), extra["num_steps"], "NumPyro NUTS")

@@ -30,9 +30,10 @@ class Spread:
 
     A row is off by a Student t of `freedom` degrees whose scale s is √(`scale`² + (`growth`·predicted)²), in the
     target's unit. The sum of a trip's rows, each weighed by w, has the variance `together`·Σw²s² + (`level`·Σws)²: what
-    goes from row to row, and what all rows of a trip share. It is known to `total_freedom` degrees of freedom, one for
-    each training trip, predicted by a fit without it. Rows last about `row_s`. `open_times`: how much more the
-    coefficients leave open, as a variance, than the fit's covariance says whose blocks of one trip err together.
+    goes from row to row, and what all rows of a trip share. It is known to `total_freedom` degrees of freedom: one for
+    each training trip, predicted by a fit without it, and fewer where trips differ in variance. Rows last about
+    `row_s`. `open_times`: how much more the coefficients leave open, as a variance, than the fit's covariance says
+    whose blocks of one trip err together.
     """
 
     scale: float
@@ -98,7 +99,7 @@ def left_out(
     # of one row the coefficients leave next to nothing open beside its noise
     spread = spread_of(error, fit.predicted, weight, clusters, open_sd, np.zeros(n), row_s=row_s, robust=robust)
     if clusters.kind == "block" and fit.table.free:  # as the inflation of the fit's covariance, at their full length
-        lasting = _times(error / np.sqrt(_square(spread.scale, spread.growth, fit.predicted)), clusters)
+        lasting = _times(error / np.sqrt(_square(spread.scale, spread.growth, fit.predicted)), clusters)[0]
         spread = replace(spread, open_times=max(lasting / fit.inflation, 1.0))
     return spread, clusters
 
@@ -139,7 +140,7 @@ def spread_of(
     scale, growth, freedom, loss = _of_rows(error, np.zeros(len(error)), open_row)
     grown = _of_rows(error, predicted, open_row)
     # rows that go together tell less: in a short drive the noise is soon larger by chance where the energy is
-    if (loss - grown[3]) * len(error) / _times(error / scale, clusters) > GROWS:
+    if (loss - grown[3]) * len(error) / _times(error / scale, clusters)[0] > GROWS:
         scale, growth, freedom, _ = grown
     square = _square(scale, growth, predicted)
     if robust:
@@ -149,7 +150,7 @@ def spread_of(
     told = clusters.sums(z**2)
     known = 2.0 * np.sum(told) ** 2 / max(len(told) * float(np.var(told, ddof=1)), 1e-12) if len(told) > 1 else 2.1
     freedom = 1.0 / (1.0 / freedom + 1.0 / max(float(known), 2.1))
-    times = _times(z, clusters)
+    times, squares = _times(z, clusters)
     if clusters.kind == "block":
         worth = float(np.clip(len(z) / times, 1.0, clusters.count))
         return Spread(scale, growth, freedom, float(np.mean(z**2)) * times, 0.0, worth, row_s)
@@ -168,12 +169,30 @@ def spread_of(
     # what rows of a trip have in common beyond their correlation from row to row grows with the trip
     together = min(whole, float(np.mean(z**2)) * times)
     level = np.sqrt((whole - together) * float(np.sum(alone)) / float(np.sum(shared)))
-    return Spread(scale, growth, freedom, together, float(level), float(np.sum(seen)), row_s)
+    total_freedom = 1.0 / (1.0 / float(np.sum(seen)) + 1.0 / _mixed(z, clusters, squares))
+    return Spread(scale, growth, freedom, together, float(level), total_freedom, row_s)
 
 
-def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> float:
+def _mixed(z: Float[np.ndarray, " row"], clusters: Clusters, squares: float) -> float:
+    """Degrees of freedom of a Student t with the kurtosis of normals whose variance differs from trip to trip.
+
+    Variances whose squared coefficient of variation is h, beyond what chance makes of rows whose squares go together
+    `squares` times: kurtosis 3·(1 + h), a t of 4 + 2/h degrees. Levels of trips are taken off: they are no variance.
+    """
+    count = np.bincount(clusters.ids)
+    square = (z - (clusters.sums(z) / count)[clusters.ids]) ** 2
+    each, mean = clusters.sums(square) / count, float(np.mean(square))
+    if len(count) < 2 or not mean > 0:
+        return np.inf
+    inside = float(np.mean((square - each[clusters.ids]) ** 2))
+    h = (float(np.var(each, ddof=1)) - inside * squares * float(np.mean(1.0 / count))) / mean**2
+    return 4.0 + 2.0 / h if h > 0 else np.inf
+
+
+def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> tuple[float, float]:
     """How much wider a sum is, as a variance, than of independent rows, by the correlation from row to row: no block of
     a trip is long enough to show it. An AR(1) with white noise on it, correlations A·ρᵏ: 1 − A + A·(1 + ρ)/(1 − ρ).
+    And the same of a sum of squares, whose correlations are A²·ρ²ᵏ where rows are normal (Isserlis 1918).
 
     Correlations of a short series come out too small, by what its mean is uncertain (Kendall 1954): added again. Of
     several trips the mean of each, its level, is taken off.
@@ -184,17 +203,18 @@ def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> float:
     n, square = len(z) / (ids[-1] + 1), float(np.mean(z**2))
     lags = np.arange(1, min(MOST_LAG, int(n) // 5) + 1)
     if not len(lags) or not square > 0:
-        return 1.0
+        return 1.0, 1.0
     seen = np.array([np.mean((z[:-k] * z[k:])[ids[:-k] == ids[k:]]) for k in lags]) / square
-    powers, times = DECAYS[:, None] ** lags, 1.0
+    powers, times, squares = DECAYS[:, None] ** lags, 1.0, 1.0
     for _ in range(4):
         r = (seen + times / n) / (1.0 + times / n)
         if r[0] < 2.0 / np.sqrt(len(z)):
-            return 1.0
+            return 1.0, 1.0
         share = np.clip(powers @ r / np.sum(powers**2, axis=1), 0.0, 1.0)
         best = int(np.argmin(np.sum((r - share[:, None] * powers) ** 2, axis=1)))
-        times = 1.0 + float(share[best]) * 2.0 * float(DECAYS[best] / (1.0 - DECAYS[best]))
-    return times
+        a, rho = float(share[best]), float(DECAYS[best])
+        times, squares = 1.0 + 2.0 * a * rho / (1.0 - rho), 1.0 + 2.0 * a**2 * rho**2 / (1.0 - rho**2)
+    return times, squares
 
 
 def _of_rows(error: np.ndarray, predicted: np.ndarray, open_row: np.ndarray) -> tuple[float, float, float, float]:
