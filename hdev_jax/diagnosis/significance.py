@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-__all__ = ["adjusted", "clusters_needed", "effective_number", "wald"]
+__all__ = ["adjusted", "clusters_needed", "clusters_to_tell", "effective_number", "wald"]
 
 
 def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
@@ -32,6 +32,14 @@ def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None
     more = np.arange(clusters, 20 * clusters + 1)
     enough = stats.f.sf(statistic * more / clusters, k, more - k) <= level
     return int(more[np.argmax(enough)]) if enough.any() else None
+
+
+def clusters_to_tell(share: float, k: int, level: float, most: int = 1000) -> int | None:
+    """With how many clusters `k` numbers that hold this share of what clusters differ by are told from chance at
+    `level`: F of a regression of the clusters' levels on them. None where `most` would not do."""
+    n = np.arange(k + 2, most + 1)
+    enough = stats.f.sf(share / (1.0 - share) * (n - k - 1) / k, k, n - k - 1) <= level
+    return int(n[np.argmax(enough)]) if enough.any() else None
 
 
 def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:

@@ -17,6 +17,7 @@ __all__ = ["FAR", "baseline_block", "summarise"]
 
 ODD_SHARE = 0.2
 SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
+MOST_HINTED = 3
 DOUBTFUL = 0.5  # q from which on the clusters speak against it
 FAR = 2.0  # tabular standard deviations beyond which a coefficient has moved suspiciously far
 
@@ -155,19 +156,16 @@ def summarise(
 
 
 def _not_decidable(verdicts: Sequence[Verdict], left: Remainder) -> list[dict[str, Any]]:
-    """What more trips (or stretches of driving) would tell, the nearest first, three at most.
+    """What more trips (or stretches of driving) would tell, the nearest of each kind first.
 
-    Either rows speak for it and clusters not yet, or trips differ in level and it is a cause that differs by trip: of
-    that a log knows no more than it has trips.
+    Either rows speak for it and clusters not yet, three at most; or trips differ in level, and it is a cause that
+    differs by trip: of any such a log knows no more than it has trips.
     """
     levels = left.significant and "trip_id" in left.depends_on
-    able = [
-        v for v in verdicts
-        if v.needed is not None
-        and ((levels and v.between) or (v.q_value < DOUBTFUL and (v.score or 0.0) > SUSPICIOUS))
-    ]  # fmt: skip
-    able.sort(key=lambda v: v.needed or 0)
-    return [{"id": v.id, "clusters_needed": v.needed, "why_not": v.why_not} for v in able[:3]]
+    able = sorted((v for v in verdicts if v.needed is not None), key=lambda v: v.needed or 0)
+    hinted = [v for v in able if v.q_value < DOUBTFUL and (v.score or 0.0) > SUSPICIOUS][:MOST_HINTED]
+    told = [*hinted, *(v for v in able if levels and v.between and v not in hinted)]
+    return [{"id": v.id, "clusters_needed": v.needed, "why_not": v.why_not} for v in told]
 
 
 def _fitted(state: Search) -> int:

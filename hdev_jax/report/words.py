@@ -26,6 +26,7 @@ NBSP = "\u00a0"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _DASH = "–"
+MOST_SUSPECTS = 3
 
 
 def _finite(*values: Any) -> bool:
@@ -182,7 +183,9 @@ def _suspects(data: ReportData) -> str:
     there = clusters.get("trips", count) if by_trip else count  # many trips share clusters
     unit = "trips" if by_trip else "stretches of driving"
     needed = [(names.effect(c["id"]), math.ceil(c["clusters_needed"] * there / count)) for c in able]
-    named = [f"{name} (about {many} {unit} like these would tell)" for name, many in needed]
+    named = [f"{name} (about {many} {unit} like these would tell)" for name, many in needed[:MOST_SUSPECTS]]
+    if len(needed) > MOST_SUSPECTS:
+        named.append(f"{len(needed) - MOST_SUSPECTS} more that act between {unit} alone")
     return f"with {there} {unit} for training this log cannot decide on {names.verbose_join(named)}"
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -9,9 +10,9 @@ from scipy import stats
 from hdev_jax.diagnosis import look as looks
 from hdev_jax.diagnosis.look import Verdict
 from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.refit import _contradicted
+from hdev_jax.diagnosis.refit import _contradicted, as_known
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import clusters_needed, effective_number
+from hdev_jax.diagnosis.significance import clusters_needed, clusters_to_tell, effective_number
 from hdev_jax.diagnosis.summary import _not_decidable, _sized
 from hdev_jax.diagnosis.sums import Sums, evidence_of
 from hdev_jax.diagnosis.unexplained import Remainder
@@ -21,10 +22,10 @@ from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 
 
-def calibrated(folder, seed: int):
+def calibrated(folder, seed: int, noise: str = "ar1"):
     """A log with slow noise and nothing missing, its loop, and the truth's values of what is calibrated."""
-    log = synthetic_log(seed=seed, trips=10, rows_per_trip=120, noise="ar1", ar_coefficient=0.97, noise_level=0.1)
-    files = log.write(folder / str(seed), truth=False)
+    log = synthetic_log(seed=seed, trips=10, rows_per_trip=120, noise=noise, ar_coefficient=0.97, noise_level=0.1)
+    files = log.write(folder / f"{noise}{seed}", truth=False)
     problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
     rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
     fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
@@ -43,6 +44,31 @@ def test_whitened_rows_know_coefficients_better_than_plain_ones(tmp_path):
         white.append((settled.values - true) / true)
         assert np.all(np.abs(settled.values - true) < 5 * error + 1e-3 * np.abs(true))
     assert np.mean(np.square(white)) < 0.5 * np.mean(np.square(plain))
+
+
+def test_the_final_model_takes_what_whitened_rows_know(tmp_path):
+    """Declared coefficients come as near to the truth as those of whitened rows, and the errors say how near; where
+    noise is white, equal weights know as much and nothing changes."""
+    off = {"plain": [], "known": []}
+    for seed in range(6):
+        loop, fit, true = calibrated(tmp_path, seed)
+        known = as_known(loop, fit)
+        assert all(c.borrowed for c in known.table.free)
+        assert np.all(known.sd < 0.5 * fit.sd)
+        assert np.all(np.abs(known.values - true) < 5 * known.sd + 1e-3 * np.abs(true))
+        off["plain"].append((fit.values - true) / true)
+        off["known"].append((known.values - true) / true)
+    assert np.mean(np.square(off["known"])) < 0.25 * np.mean(np.square(off["plain"]))
+    loop, fit, _ = calibrated(tmp_path, 0, noise="white")
+    assert as_known(loop, fit) is fit
+
+
+def test_equal_weights_keep_what_they_contradict(tmp_path):
+    """A specification test: what is missing pulls both, but not to the same place."""
+    loop, fit, _ = calibrated(tmp_path, 0)
+    far = replace(fit, values=fit.values + 6.0 * fit.sd)
+    far = replace(far, vehicle=far.table.insert(far.vehicle, jnp.asarray(far.values)))
+    assert as_known(loop, far) is far
 
 
 def test_where_it_settles_no_step_is_left(tmp_path):
@@ -120,11 +146,30 @@ def test_a_slow_size_of_which_the_rows_rule_out_a_quarter_is_contradicted(white,
     assert not _contradicted(np.array([0.34]), np.array([-0.01]), np.array([0.1]))  # they could not have seen it
 
 
+def test_enough_clusters_tell_half_of_what_they_differ_by():
+    """By simulation: as many as are said find it in about half of the logs (the median F), far fewer do not."""
+    n = clusters_to_tell(0.5, 1, 1e-3)
+    assert n is not None
+    rng = np.random.default_rng(0)
+
+    def found(count: int) -> float:
+        x, e = rng.standard_normal((2, 4000, count))
+        r = np.array([np.corrcoef(a, a + b)[0, 1] for a, b in zip(x, e, strict=True)])
+        return float(np.mean(stats.f.sf(r**2 / (1 - r**2) * (count - 2), 1, count - 2) <= 1e-3))
+
+    assert found(n) == pytest.approx(0.5, abs=0.1)
+    assert found(n // 2) < 0.25
+    assert clusters_to_tell(0.5, 1, 1e-6) > n
+    assert clusters_to_tell(1e-6, 1, 1e-3) is None
+
+
 def test_between_trips_a_log_knows_no_more_than_it_has_trips():
     left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, np.zeros(3))
     hinted = Verdict("hvac_power", 2.0, 1.0, "not significant", needed=40, between=True)
     inside = Verdict("headwind", 2.0, 1.0, "not significant", needed=30)
-    strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=14)
-    said = _not_decidable([hinted, inside, strong], left)
-    assert [(s["id"], s["clusters_needed"]) for s in said] == [("wet_road", 14), ("hvac_power", 40)]
-    assert [s["id"] for s in _not_decidable([hinted, inside, strong], replace(left, depends_on=()))] == ["wet_road"]
+    strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=50)
+    others = [Verdict(f"effect_{k}", 0.1, 1.0, "not significant", needed=45 + k, between=True) for k in range(4)]
+    every = [inside, *others, strong, hinted]
+    said = [(s["id"], s["clusters_needed"]) for s in _not_decidable(every, left)]
+    assert said == [("wet_road", 50), ("hvac_power", 40), *((f"effect_{k}", 45 + k) for k in range(4))]
+    assert [s["id"] for s in _not_decidable(every, replace(left, depends_on=()))] == ["wet_road"]
