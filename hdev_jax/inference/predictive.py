@@ -169,24 +169,23 @@ def spread_of(
     # what rows of a trip have in common beyond their correlation from row to row grows with the trip
     together = min(whole, float(np.mean(z**2)) * times)
     level = np.sqrt((whole - together) * float(np.sum(alone)) / float(np.sum(shared)))
-    total_freedom = 1.0 / (1.0 / float(np.sum(seen)) + 1.0 / _mixed(z, clusters, squares))
+    # squares of n normal sums tell a variance to n degrees; where theirs differ, by a squared coefficient of variation
+    # of h, their own is (2 + 3h)·mean² (Satterthwaite 1946). What goes from row to row alone differs like that.
+    unlike = _unlike(z, clusters, squares) * (together / whole) ** 2
+    total_freedom = float(np.sum(seen)) / (1.0 + 1.5 * unlike)
     return Spread(scale, growth, freedom, together, float(level), total_freedom, row_s)
 
 
-def _mixed(z: Float[np.ndarray, " row"], clusters: Clusters, squares: float) -> float:
-    """Degrees of freedom of a Student t with the kurtosis of normals whose variance differs from trip to trip.
-
-    Variances whose squared coefficient of variation is h, beyond what chance makes of rows whose squares go together
-    `squares` times: kurtosis 3·(1 + h), a t of 4 + 2/h degrees. Levels of trips are taken off: they are no variance.
-    """
+def _unlike(z: Float[np.ndarray, " row"], clusters: Clusters, squares: float) -> float:
+    """By how much trips differ in the variance of their rows, beyond what chance makes of rows whose squares go
+    together `squares` times: squared coefficient of variation. Levels of trips are taken off: they are no variance."""
     count = np.bincount(clusters.ids)
     square = (z - (clusters.sums(z) / count)[clusters.ids]) ** 2
     each, mean = clusters.sums(square) / count, float(np.mean(square))
     if len(count) < 2 or not mean > 0:
-        return np.inf
+        return 0.0
     inside = float(np.mean((square - each[clusters.ids]) ** 2))
-    h = (float(np.var(each, ddof=1)) - inside * squares * float(np.mean(1.0 / count))) / mean**2
-    return 4.0 + 2.0 / h if h > 0 else np.inf
+    return max((float(np.var(each, ddof=1)) - inside * squares * float(np.mean(1.0 / count))) / mean**2, 0.0)
 
 
 def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> tuple[float, float]:
