@@ -156,6 +156,9 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "something_false": sum(scores.false(t["effects"], r["named"]) for t, r in group) / n,
         "furthest_coefficient_sd": float(np.median(far)) if case.asked == "absorbed" else None,
         "called_not_decidable": sum(bool(r["not_decidable"]) and not r["named"] for _, r in group) / n,
+        "names_not_decidable": (
+            float(np.mean([len(r["not_decidable"]) for _, r in group])) if case.asked == "not_decidable" else None
+        ),
         "clusters": float(np.median([r["clusters"] for _, r in group])) if case.asked == "not_decidable" else None,
         "clusters_needed": float(np.median(needed)) if needed and case.asked == "not_decidable" else None,
         "called_unexplained": unexplained / n,

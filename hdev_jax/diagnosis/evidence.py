@@ -198,17 +198,21 @@ class Evidence:
         return float(np.min(0.5 * self.totals()[:, -1, -1] + self.cost))
 
     def step(self) -> tuple[np.ndarray, np.ndarray]:
-        """The base columns' own Gauss-Newton step, and its standard errors from clusters left out in turn.
+        """The base columns' own Gauss-Newton step, and the covariance of where it leads.
 
-        They are no smaller than the working model's: what a single cluster tells, the others leave as it is.
+        Standard errors are from clusters left out in turn, and no smaller than the working model's: what a single
+        cluster tells, the others leave as it is. Correlations are the working model's.
         """
         none, totals = np.empty(0, int), self.totals()
         likelihood, x = self._fit(totals, none)
         v, g = int(np.argmax(likelihood)), self.count
         normal = self._normal(totals, none)[0][v]
         d = np.sqrt(np.diag(normal))
-        model = np.diag(np.linalg.pinv(normal / np.outer(d, d), rcond=1e-12)) / d**2
-        return x[v], np.sqrt(np.maximum(model, (g - 1) / g * np.sum((self._jackknife(none, v) - x[v]) ** 2, axis=0)))
+        model = np.linalg.pinv(normal / np.outer(d, d), rcond=1e-12) / np.outer(d, d)
+        own = np.sqrt(np.diag(model))
+        error = np.maximum(own, np.sqrt((g - 1) / g * np.sum((self._jackknife(none, v) - x[v]) ** 2, axis=0)))
+        scale = np.divide(error, own, out=np.ones_like(own), where=own > 0)
+        return x[v], model * np.outer(scale, scale)
 
     def plain_score(self, candidate: Candidate) -> Score:
         """A candidate's tests where rows are as they were measured and only clusters count as independent.

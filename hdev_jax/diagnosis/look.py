@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.facts import Facts, facts_of
 from hdev_jax.diagnosis.ranking import LEFT_OUT, best_of, plausible
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import adjusted, clusters_needed, clusters_to_tell
+from hdev_jax.diagnosis.significance import adjusted, clusters_needed, clusters_to_tell, ruled_out
 from hdev_jax.diagnosis.sums import Ground, both_looks
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
@@ -53,7 +53,7 @@ class Verdict:
     """A candidate that was not chosen, and why.
 
     `needed`: with how many clusters like these it could be told from chance; `between`: only trips can tell it, and
-    `needed` is then what would do for half of what they differ by, where nothing hints at it.
+    where nothing hints at it `needed` is what would do for half of what they differ by.
     """
 
     id: str
@@ -183,15 +183,19 @@ class View:
         return bool(self.slow[list(candidate.columns)].all())
 
     def _needed(self, s: Score, fdr: float) -> int | None:
-        """Clusters that would do for a candidate that looks right but is not told from chance by those there are, or
-        that trips alone can tell and that would hold half of what they differ by."""
-        id_, k = s.candidate.id, len(s.beta)
-        if self.q[id_] <= fdr or id_ in self.reasons or id_ in self.absorbed_by:
+        """Clusters that would do for a candidate that looks right but is not told from chance by those there are; or
+        trips, for one that they alone tell, and that may hold half of what they differ by for all that these say."""
+        id_, k, count = s.candidate.id, len(s.beta), self.evidence.count
+        if self.q[id_] <= fdr or id_ in self.reasons or id_ in self.absorbed_by or not plausible(s):
             return None
         level = fdr / (2.0 * len(self.best) * self.ways[id_])  # before it is corrected as q is
-        if s.p <= HINT and plausible(s):
-            return clusters_needed(max(s.p_model, s.p_cluster), k, self.evidence.count, level)
-        return clusters_to_tell(0.5, k, level) if self.between(s.candidate) else None
+        p = max(s.p_model, s.p_cluster)
+        if s.p <= HINT:
+            return clusters_needed(p, k, count, level)
+        if self.ground.clusters.kind != "trip" or not self.between(s.candidate) or ruled_out(0.5, p, k, count):
+            return None
+        needed = clusters_to_tell(0.5, k, level)
+        return needed if needed is not None and needed > count else None
 
 
 def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:

@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.ranking import best_of, plausible
 from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.sums import both_looks, distance_from_table, evidence_of
 from hdev_jax.diagnosis.whiten import Noise
-from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian
+from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian, predict
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
@@ -91,35 +91,43 @@ def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
 
 
-def as_known(problem: Loop, fit: Calibration) -> Calibration:
-    """The fit of a vehicle whose effects are chosen, with what whitened rows say of its declared coefficients.
+def as_known(problem: Loop, state: Search) -> Calibration:
+    """The fit of the state, whose effects are chosen, as whitened rows have it: declared coefficients too.
 
-    Where errors are slow they know them several times as well as rows of equal weight, as long as both agree (Hausman,
-    Econometrica 46, 1978). Before the effects are there, weights that suit the noise would only serve what is missing.
+    Where errors are slow these know a declared coefficient several times as well as rows of equal weight, as long as
+    both agree on every coefficient (Hausman, Econometrica 46, 1978). Before the effects are there, or beside something
+    unexplained, weights that suit the noise would only serve what is missing.
 
-    **Returns:** the fit itself where whitened rows know no declared coefficient better, or one is contradicted. In the
-    table of the other, declared coefficients are borrowed.
+    **Returns:** the state's fit itself where whitened rows know no declared coefficient better, know one worse,
+    contradict equal weights, or where trips alone tell an effect, which they drown. All coefficients of the other are
+    borrowed.
     """
-    settled, error = settle(problem.ground(fit, problem.noise(fit)))
+    fit, found = state.fit, [f.score for f in state.found]
     declared = np.array([not c.path.startswith("effects.") for c in fit.table.free], dtype=bool)
-    apart = float(stats.t.ppf(AGREES, max(problem.clusters.count - 1, 1)))
-    agree = np.abs(settled.values - fit.values) <= apart * fit.sd
-    better = declared & (KNOWN * error <= fit.sd)
-    if not better.any() or not np.all(agree[declared]):
+    if not declared.any() or any(s.plain or any(g is not None for g in s.candidate.groups) for s in found):
+        return fit
+    settled, covariance = settle(problem.ground(fit, problem.noise(fit)))
+    error = np.sqrt(np.diag(covariance))
+    one = (1.0 - AGREES) / len(fit.values)
+    agree = np.abs(settled.values - fit.values) <= stats.t.isf(one, max(problem.clusters.count - 1, 1)) * fit.sd
+    gained = fit.sd[declared] / error[declared]
+    if not (np.all(agree) and np.min(gained) >= 1.0 and np.max(gained) >= KNOWN):
         return fit
     told = {(c.path, c.group): (float(x), float(e))
-            for c, x, e, b in zip(fit.table.free, settled.values, error, better, strict=True) if b}  # fmt: skip
-    return calibrate(fit.vehicle, _lent(fit.table, told), problem.rows, problem.target, problem.clusters)
+            for c, x, e in zip(fit.table.free, settled.values, error, strict=True)}  # fmt: skip
+    predicted = np.asarray(predict(settled.vehicle, problem.rows.segments, problem.target))[: problem.rows.rows]
+    known = replace(
+        settled, table=_lent(fit.table, told), sd=error, covariance=covariance, predicted=predicted,
+        sigma=float(np.sqrt(np.mean((problem.measured - predicted) ** 2))),
+    )  # fmt: skip
+    return known if all(_in_range(known, s.candidate) and _present(known, s.candidate) for s in found) else fit
 
 
 def _lent(table: ParameterTable, told: Mapping[tuple[str, int | None], tuple[float, float]]) -> ParameterTable:
     """The table with these values and standard errors of borrowed coefficients, by path and group."""
-    rows = []
-    for c in table.rows:
-        if (told_of := told.get((c.path, c.group))) is not None:
-            c = replace(c, value=told_of[0], sd=told_of[1], borrowed=True)
-        rows.append(c)
-    return ParameterTable(tuple(rows))
+    none = (None, None)
+    both = [(c, *told.get((c.path, c.group), none)) for c in table.rows]
+    return ParameterTable(tuple(c if x is None else replace(c, value=x, sd=e, borrowed=True) for c, x, e in both))
 
 
 def without(problem: Loop, state: Search, effect_id: str) -> Search:
@@ -140,7 +148,8 @@ def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | No
     start = replace(
         state.fit, vehicle=state.vehicle, table=state.table, values=values, sd=np.diag(nothing), covariance=nothing
     )
-    fit, error = settle(problem.ground(start, noise))
+    fit, covariance = settle(problem.ground(start, noise))
+    error = np.sqrt(np.diag(covariance))
     told = {(c.path, c.group): (float(x), float(e))
             for c, x, e in zip(state.table.free, fit.values, error, strict=True) if c.borrowed}  # fmt: skip
     if not all(np.isfinite(e) for _, e in told.values()):

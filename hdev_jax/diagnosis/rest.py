@@ -37,7 +37,8 @@ def told_apart(
     """What is left told apart from what was found.
 
     **Returns:** the state without effects that only stood in for what is left; the declared model's fit and that with
-    each effect in turn; their predictions on all rows; and what is left.
+    each effect in turn, the last as whitened rows know it where nothing is left (`as_known`); their predictions on all
+    rows; and what is left.
     """
     train, first = problem.rows(split.train), {}
 
@@ -66,6 +67,11 @@ def told_apart(
             break
         tell(f"taking {shadow} out: what is left is larger than what it explains")
         state = _gone(loop, state, shadow)
+    if state.found and not left.significant:
+        known = as_known(loop, state)
+        steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
+        test = problem.rows(split.test)
+        left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
     return state, steps, predicted, left
 
 
@@ -140,8 +146,7 @@ def _gone(loop: Loop, state: Search, effect_id: str) -> Search:
 
 
 def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:
-    """The declared model, then with each effect in the order found, each fitted to all training rows; the last as well
-    as its rows know it."""
+    """The declared model, then with each effect in the order found, each fitted to all training rows."""
     rows, clusters = loop.rows, loop.clusters
     fits = [calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)]
     for k in range(1, len(state.found)):
@@ -155,7 +160,7 @@ def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:
             fits.append(replace(fits[0], vehicle=table.insert(vehicle, jnp.asarray(values)), table=table))
         else:
             fits.append(calibrate(vehicle, table, rows, problem.target, clusters))
-    return [*fits, as_known(loop, state.fit)] if state.found else fits
+    return [*fits, state.fit] if state.found else fits
 
 
 def _features(problem: Problem, predicted: np.ndarray, declared: np.ndarray) -> tuple[np.ndarray, list[str]]:

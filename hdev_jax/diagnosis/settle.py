@@ -15,17 +15,18 @@ SETTLED = 0.05  # standard errors that the last step may move by
 EDGE = 1e-3  # of a support that is bounded on both sides
 
 
-def settle(ground: Ground) -> tuple[Calibration, Float[np.ndarray, " free"]]:
+def settle(ground: Ground) -> tuple[Calibration, Float[np.ndarray, "free free"]]:
     """Gauss-Newton on whitened rows from the ground's fit, every free coefficient moving.
 
     Rows of equal weight leave a size uncertain where errors are slow; what they miss of it would look like another
     effect to whitened rows, which see it far better.
 
-    **Returns:** the fit with these values in place of its own, and their standard errors. The fit itself, with errors
-    that are infinite, where the steps do not settle or do not lower the misfit. `predicted` stays the fit's own.
+    **Returns:** the fit with these values in place of its own, and their covariance. The fit itself, with variances
+    that are infinite, where the steps do not settle or do not lower the misfit. `predicted`, `sd` and `covariance` stay
+    the fit's own.
     """
     fit = ground.fit
-    failed = fit, np.full(len(fit.values), np.inf)
+    failed = fit, np.diag(np.full(len(fit.values), np.inf))
     if not len(fit.values):
         return failed
     here, first = fit, np.inf
@@ -37,12 +38,12 @@ def settle(ground: Ground) -> tuple[Calibration, Float[np.ndarray, " free"]]:
             first = misfit
         if not (np.isfinite(misfit) and misfit <= first + 1e-6 * abs(first)):
             return failed
-        step, error = evidence.step()
+        step, covariance = evidence.step()
         if not np.all(np.isfinite(step)):
             return failed
         there = _at(here, here.values + step)  # a coefficient at its bound stays there, and the others go on
-        if np.max(np.abs(there.values - here.values) / np.maximum(error, 1e-300)) < SETTLED:
-            return here, error
+        if np.max(np.abs(there.values - here.values) / np.maximum(np.sqrt(np.diag(covariance)), 1e-300)) < SETTLED:
+            return here, covariance
         here = there
     return failed
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-__all__ = ["adjusted", "clusters_needed", "clusters_to_tell", "effective_number", "wald"]
+__all__ = ["adjusted", "clusters_needed", "clusters_to_tell", "effective_number", "ruled_out", "wald"]
 
 
 def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
@@ -35,11 +35,23 @@ def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None
 
 
 def clusters_to_tell(share: float, k: int, level: float, most: int = 1000) -> int | None:
-    """With how many clusters `k` numbers that hold this share of what clusters differ by are told from chance at
-    `level`: F of a regression of the clusters' levels on them. None where `most` would not do."""
+    """How many clusters tell `k` numbers that hold this share of what clusters differ by from chance at `level`.
+
+    The F of a regression of the clusters' levels on them, in about half of the logs. None where `most` would not do.
+    """
     n = np.arange(k + 2, most + 1)
     enough = stats.f.sf(share / (1.0 - share) * (n - k - 1) / k, k, n - k - 1) <= level
     return int(n[np.argmax(enough)]) if enough.any() else None
+
+
+def ruled_out(share: float, p: float, k: int, clusters: int, level: float = 0.05) -> bool:
+    """Whether a test of `k` numbers with this p would be rarer than `level` if they held such a share of what clusters
+    differ by: a noncentral F, over what a normal column of so many clusters amounts to by chance."""
+    free = clusters - k - 1
+    if free < 1:
+        return False
+    amounts = stats.chi2.ppf((np.arange(50) + 0.5) / 50, clusters - 1) * share / (1.0 - share)
+    return float(np.mean(stats.ncf.cdf(stats.f.isf(p, k, free), k, free, amounts))) < level
 
 
 def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:

@@ -149,6 +149,7 @@ def summarise(
         "notes": [
             *problem.notes,
             *_warnings(steps, state),
+            *_known(problem, state, steps[-1], test, rmse[-1]),
             *_by_trip(problem, state),
             *_odd_rows(problem, predicted[0]),
         ],
@@ -207,6 +208,17 @@ def _warnings(steps: list[Calibration], state: Search) -> list[str]:
             held = f"; on this log it cannot be told from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
             out.append(f"{name} moved {p['prior_z']:+.1f} tabular sd to fit the declared model{held}")
     return out
+
+
+def _known(problem: Problem, state: Search, last: Calibration, test: np.ndarray, rmse: float) -> list[str]:
+    """What of the error after is no effect's: where its coefficients come from."""
+    if last is state.fit or not state.found:
+        return []
+    plain = np.sqrt(np.mean((problem.measured - problem.predict(state.fit.vehicle))[test] ** 2))
+    return [
+        "coefficients of the model with the effects are of whitened rows, which know them better: test RMSE "
+        f"{rmse:.4g} {problem.unit}; {plain:.4g} with those of rows of equal weight, as the declared model has them"
+    ]
 
 
 def _by_trip(problem: Problem, state: Search) -> list[str]:

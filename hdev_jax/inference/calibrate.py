@@ -191,7 +191,7 @@ def calibrate(
     sigma, inflation, tail = 1.0, 1.0, np.ones(rows)
     message, converged, steps = "", False, 0
     predicted = np.zeros(rows)
-    covariance = np.zeros((len(free), len(free)))
+    covariance = np.diag(prior_sd**2)  # of a fit that ends before it has looked
     for sweep in range(8 if noise == "student_t" else 3):
         if sweep == 0:  # the first sweep only looks for σ: the prior weighs as against a perfect log
             p = np.asarray(predict(insert(vehicle, structure, jnp.asarray(theta)), fit.segments, target))[:rows]

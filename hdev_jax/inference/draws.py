@@ -81,9 +81,10 @@ class Draws:
                     bulk.append(float(az.ess(column, method="bulk")))
                     tail.append(float(az.ess(column, method="tail")))
         chains, draws = next(iter(self.values.values())).shape[:2]
-        smallest = min([*bulk, *tail], default=0.0)
+        # NaN where one of them has none, which min and max would pass over
+        r_hat, ess, ess_bulk = np.max(r_hats), np.min([*bulk, *tail] or [0.0]), np.min(bulk or [0.0])
         return {
-            "r_hat": max(r_hats), "ess": smallest, "ess_bulk": min(bulk, default=0.0), "divergent": self.divergent,
+            "r_hat": float(r_hat), "ess": float(ess), "ess_bulk": float(ess_bulk), "divergent": self.divergent,
             "draws": chains * draws, "chains": chains,
         }  # fmt: skip
 

@@ -74,6 +74,7 @@ def _of_one(
             out.append(f"{names[members[0]]} is not identified by this log: its value is the table's")
         else:
             out.append(f"{which} cannot be told apart by this log: how they share what is known is the tables' word")
+    out = list(dict.fromkeys(out))  # two directions of the same members are one sentence
     step, covariance, _ = least_squares(data)
     told = [k for k in range(len(step)) if k not in untold]
     for k in told:

@@ -98,7 +98,8 @@ def left_out(
         error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])
     # of one row the coefficients leave next to nothing open beside its noise
     spread = spread_of(error, fit.predicted, weight, clusters, open_sd, np.zeros(n), row_s=row_s, robust=robust)
-    if clusters.kind == "block" and fit.table.free:  # as the inflation of the fit's covariance, at their full length
+    told = all(c.borrowed for c in fit.table.free)  # by whitened rows, whose errors hold what goes together
+    if clusters.kind == "block" and not told:  # as the inflation of the fit's covariance, at their full length
         lasting = _times(error / np.sqrt(_square(spread.scale, spread.growth, fit.predicted)), clusters)[0]
         spread = replace(spread, open_times=max(lasting / fit.inflation, 1.0))
     return spread, clusters

@@ -12,7 +12,7 @@ from hdev_jax.diagnosis.look import Verdict
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.refit import _contradicted, as_known
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import clusters_needed, clusters_to_tell, effective_number
+from hdev_jax.diagnosis.significance import clusters_needed, clusters_to_tell, effective_number, ruled_out
 from hdev_jax.diagnosis.summary import _not_decidable, _sized
 from hdev_jax.diagnosis.sums import Sums, evidence_of
 from hdev_jax.diagnosis.unexplained import Remainder
@@ -20,6 +20,7 @@ from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
 
 
 def calibrated(folder, seed: int, noise: str = "ar1"):
@@ -38,7 +39,8 @@ def test_whitened_rows_know_coefficients_better_than_plain_ones(tmp_path):
     plain, white = [], []
     for seed in range(6):
         loop, fit, true = calibrated(tmp_path, seed)
-        settled, error = settle(loop.ground(fit, loop.noise(fit)))
+        settled, covariance = settle(loop.ground(fit, loop.noise(fit)))
+        error = np.sqrt(np.diag(covariance))
         assert np.all(error < fit.sd)
         plain.append((fit.values - true) / true)
         white.append((settled.values - true) / true)
@@ -46,37 +48,45 @@ def test_whitened_rows_know_coefficients_better_than_plain_ones(tmp_path):
     assert np.mean(np.square(white)) < 0.5 * np.mean(np.square(plain))
 
 
+def ended(loop, fit):
+    """Where a search ends that has found nothing."""
+    return looks.Search(fit.vehicle, fit.table, fit, finished=True)
+
+
 def test_the_final_model_takes_what_whitened_rows_know(tmp_path):
-    """Declared coefficients come as near to the truth as those of whitened rows, and the errors say how near; where
-    noise is white, equal weights know as much and nothing changes."""
-    off = {"plain": [], "known": []}
+    """Declared coefficients come as near to the truth as those of whitened rows, and the covariance says how near;
+    where noise is white, equal weights know as much and nothing changes."""
+    plain, known = [], []
     for seed in range(6):
         loop, fit, true = calibrated(tmp_path, seed)
-        known = as_known(loop, fit)
-        assert all(c.borrowed for c in known.table.free)
-        assert np.all(known.sd < 0.5 * fit.sd)
-        assert np.all(np.abs(known.values - true) < 5 * known.sd + 1e-3 * np.abs(true))
-        off["plain"].append((fit.values - true) / true)
-        off["known"].append((known.values - true) / true)
-    assert np.mean(np.square(off["known"])) < 0.25 * np.mean(np.square(off["plain"]))
+        found = as_known(loop, ended(loop, fit))
+        assert all(c.borrowed for c in found.table.free)
+        assert np.all(found.sd < 0.5 * fit.sd)
+        np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), found.sd)
+        off = (found.values - true) - 1e-3 * np.clip((found.values - true) / 1e-3, -true, true)  # what truth leaves out
+        assert off @ np.linalg.solve(found.covariance, off) < 4.0**2
+        plain.append((fit.values - true) / true)
+        known.append((found.values - true) / true)
+    assert np.mean(np.square(known)) < 0.25 * np.mean(np.square(plain))
     loop, fit, _ = calibrated(tmp_path, 0, noise="white")
-    assert as_known(loop, fit) is fit
+    assert as_known(loop, ended(loop, fit)) is fit
 
 
-def test_equal_weights_keep_what_they_contradict(tmp_path):
+@pytest.mark.parametrize("sds", [0.0, 6.0])
+def test_equal_weights_keep_what_they_contradict(tmp_path, sds):
     """A specification test: what is missing pulls both, but not to the same place."""
     loop, fit, _ = calibrated(tmp_path, 0)
-    far = replace(fit, values=fit.values + 6.0 * fit.sd)
-    far = replace(far, vehicle=far.table.insert(far.vehicle, jnp.asarray(far.values)))
-    assert as_known(loop, far) is far
+    values = fit.values + sds * fit.sd
+    moved = replace(fit, values=values, vehicle=fit.table.insert(fit.vehicle, jnp.asarray(values)))
+    assert (as_known(loop, ended(loop, moved)) is moved) == (sds > 0)
 
 
 def test_where_it_settles_no_step_is_left(tmp_path):
     loop, fit, _ = calibrated(tmp_path, 1)
     noise = loop.noise(fit)
-    settled, error = settle(loop.ground(fit, noise))
+    settled, covariance = settle(loop.ground(fit, noise))
     step, _ = evidence_of(loop.ground(settled, noise)).step()
-    assert np.all(np.abs(step) < 0.05 * error)
+    assert np.all(np.abs(step) < 0.05 * np.sqrt(np.diag(covariance)))
     assert np.all(np.isfinite(settled.predicted))
 
 
@@ -84,9 +94,9 @@ def test_a_fit_of_nothing_settles_as_it_is(tmp_path):
     loop, fit, _ = calibrated(tmp_path, 1)
     table = fit.table.with_free(**{c.name: False for c in fit.table.free})
     held = replace(fit, table=table, values=np.zeros(0), sd=np.zeros(0), covariance=np.zeros((0, 0)))
-    settled, error = settle(loop.ground(held, loop.noise(fit)))
+    settled, covariance = settle(loop.ground(held, loop.noise(fit)))
     assert settled is held
-    assert error.shape == (0,)
+    assert covariance.shape == (0, 0)
 
 
 def test_what_one_cluster_tells_is_no_better_known_than_its_rows_allow():
@@ -96,8 +106,8 @@ def test_what_one_cluster_tells_is_no_better_known_than_its_rows_allow():
     column = np.where(ids == 3, rng.normal(size=400), 1e-9 * rng.normal(size=400))
     sums = Sums(2, 8, 8)
     sums.add(np.c_[column, 2.0 * column + rng.normal(size=400)], ids)
-    _, error = sums.evidence(1, moved=np.zeros(1), prior_sd=np.array([1e3])).step()
-    assert error[0] >= 0.99 / np.sqrt(np.sum(column**2))
+    _, covariance = sums.evidence(1, moved=np.zeros(1), prior_sd=np.array([1e3])).step()
+    assert covariance[0, 0] >= 0.98 / np.sum(column**2)
 
 
 @pytest.mark.parametrize("k", [1, 2])
@@ -161,6 +171,41 @@ def test_enough_clusters_tell_half_of_what_they_differ_by():
     assert found(n // 2) < 0.25
     assert clusters_to_tell(0.5, 1, 1e-6) > n
     assert clusters_to_tell(1e-6, 1, 1e-3) is None
+
+
+def test_what_would_show_by_now_is_ruled_out():
+    """By simulation: of logs in which it holds half of what trips differ by, one in twenty says that it does not."""
+    rng, count, n = np.random.default_rng(1), 8, 2000
+    x, e = rng.standard_normal((2, n, count))
+    r = np.array([np.corrcoef(a, a + b)[0, 1] for a, b in zip(x, e, strict=True)])
+    p = stats.f.sf(r**2 / (1 - r**2) * (count - 2), 1, count - 2)
+    out = float(np.mean([ruled_out(0.5, float(v), 1, count) for v in p]))
+    assert 0.02 < out < 0.09
+    assert ruled_out(0.5, 0.5, 1, 40)
+    assert not ruled_out(0.5, 0.5, 1, 6)
+    assert not ruled_out(0.5, 0.9, 2, 3)
+
+
+@pytest.mark.parametrize("kind", ["trip", "block"])
+def test_only_trips_tell_what_lives_between_them(tmp_path, kind):
+    """A load that a log of few trips with levels of their own neither shows nor rules out; stretches of a trip, which
+    share its level, are no trips."""
+    loop, fit, _ = calibrated(tmp_path, 3, noise="trip_levels")
+    loop = replace(
+        loop, effects=[LIBRARY["hvac_power"], LIBRARY["headwind"]], clusters=replace(loop.clusters, kind=kind)
+    )
+    view = looks.look(loop, ended(loop, fit))
+    score = replace(view.best["hvac_power"], p_model=0.3, p_cluster=0.3)
+    score = replace(score, beta=np.full(len(score.beta), 300.0))
+    view.best["hvac_power"] = score
+    view.q["hvac_power"] = 1.0
+    view.slow = np.ones_like(view.slow)
+    needed = view._needed(score, 0.05)
+    assert (needed is None) == (kind == "block")
+    assert kind == "block" or needed > loop.clusters.count
+    assert view._needed(replace(score, beta=-score.beta), 0.05) is None
+    view.slow = np.zeros_like(view.slow)
+    assert view._needed(score, 0.05) is None
 
 
 def test_between_trips_a_log_knows_no_more_than_it_has_trips():
