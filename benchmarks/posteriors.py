@@ -221,7 +221,7 @@ def _kept() -> dict[str, list[str]]:
             sections[line.removeprefix("## ")] = [line]
         elif sections:
             sections[next(reversed(sections))].append(line)
-    return sections
+    return {name: ["\n".join(lines).rstrip(), ""] for name, lines in sections.items()}
 
 
 def main(argv: list[str] | None = None) -> int:
