@@ -1,5 +1,7 @@
 """Draws: the fleet's on statistics against a dense derivation and by ranks; NUTS against both; what is refused."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,10 @@ import pytest
 from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, PRIOR, PRIOR_SD, driving, tabular, truck
 from scipy import stats
 
+import hdev_jax
 from experiments import ranks
 from experiments.config import CONFIGS, resolve, typed
+from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Rows, linear_fit, padded
 from hdev_jax.inference.design import tabular as tabular_of
 from hdev_jax.inference.draws import Draws
@@ -143,6 +147,39 @@ def test_nuts_agrees_with_the_closed_form_of_one_vehicle(tmp_path):
         assert np.std(ours) == pytest.approx(sd, rel=0.1)
     long.write(tmp_path / "posterior.nc")
     assert long.idata().sample_stats["diverging"].shape == (4, 1000)
+
+
+DRIFT = {
+    "rolling_temperature": {"per_k": (-6e-5, -5e-5, 5e-5)},
+    "tyre_warmup": {"excess": (0.4, 0.3, 0.3), "distance_m": (7000.0, 5000.0, 3000.0)},
+}  # planted, and the sheet's value and sd
+
+
+@pytest.mark.slow
+def test_rolling_that_drifts_along_the_route_is_held_by_its_posterior(tmp_path):
+    """By temperature and as tyres warm up, sampled through the kernel under Student-t noise: what was planted within
+    three sds, and a smaller error on trips that were not fitted than of one number for the whole route."""
+    planted = {k: {n: v[0] for n, v in p.items()} for k, p in DRIFT.items()}
+    log = synthetic_log(seed=11, trips=10, rows_per_trip=150, effects=planted, noise="white", noise_level=0.05)
+    files = log.write(tmp_path, truth=False)
+    effects = [
+        line for k, p in DRIFT.items()
+        for line in (f"[effects.{k}]", *(f"{n} = {{ value = {v}, sd = {sd} }}" for n, (_, v, sd) in p.items()))
+    ]  # fmt: skip
+    drifting = tmp_path / "drifting.toml"
+    drifting.write_text("\n".join([files["sheet"].read_text(), *effects, ""]))
+    told, rmse = {}, {}
+    for name, sheet in (("constant", files["sheet"]), ("drifting", drifting)):
+        out = tmp_path / name
+        hdev_jax.calibrate([files["log"]], sheet, method="nuts", noise="student_t", out=out)
+        found = json.loads((out / "calibration.json").read_text())
+        told, rmse[name] = found["baseline"]["parameters"], found["before"]["test"]["rmse"]
+    for k, parameters in planted.items():
+        for n, true in parameters.items():
+            assert abs(told[f"effects.{k}.{n}"]["value"] - true) < 3 * told[f"effects.{k}.{n}"]["sd"]
+    assert abs(told["road.c_rr"]["value"] - log.vehicle.c_rr) < 3 * told["road.c_rr"]["sd"]
+    assert told["effects.rolling_temperature.per_k"]["sd"] < 0.2 * 5e-5  # the log speaks, not the table
+    assert rmse["drifting"] < 0.9 * rmse["constant"]
 
 
 @pytest.mark.slow
