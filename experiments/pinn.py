@@ -6,7 +6,6 @@ diagnosed effects) one vehicle. Networks that differ in seed and loss weights al
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from typing import Any, Literal
 
 import numpy as np
@@ -17,20 +16,22 @@ from experiments.config import Strict
 from experiments.data import MissingDataError, fingerprint
 from experiments.pinn_buses import bus_sources
 from experiments.pinn_data import Data, load
-from experiments.pinn_models import bayesian, boosted, diagnosed, kernel, names_of, networks, said, sized
+from experiments.pinn_diagnosed import diagnosed, found_effects
+from experiments.pinn_models import bayesian, boosted, kernel, names_of, said
+from experiments.pinn_networks import trained
 from experiments.pinn_scores import scores
-from hdev_jax import progress
 from hdev_jax.errors import InputError
-from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
+from hdev_jax.learn.pinn import Choices
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
-from hdev_jax.learn.pinn_rows import energy
-from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
 from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
-SOURCES = ("pinn.py", "pinn_data.py", "pinn_models.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py")
+SOURCES = (
+    "pinn.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_models.py", "pinn_networks.py", "pinn_scores.py",
+    "pinn_buses.py", "paper1_halves.py",
+)  # fmt: skip
 
 
 # frozen as `Choices` is: by the setting of `Strict`, which a type checker does not see
@@ -45,7 +46,8 @@ class Model(Strict, Choices):  # pyright: ignore[reportGeneralTypeIssues]
     units: tuple[int, ...] = Field(Choices.units, strict=False)
     dropout: float = Field(Choices.dropout, ge=0, lt=1)
     stretch: int = Field(Choices.stretch, ge=1)
-    effects: bool = False  # those of the config
+    # as physics: those of the config, or what the diagnosis of its `diagnosed` vehicles finds
+    effects: bool | Literal["diagnosed"] = False
     weights: tuple[float, float, float] = Field(PAPER_WEIGHTS, strict=False)
     members: int = Field(1, ge=1)  # of an ensemble
     rate: float = Field(0.005, gt=0)
@@ -130,6 +132,9 @@ def _checked(config: Config) -> None:
         known = [p.name for p in LIBRARY[id].parameters]
         if odd := set(shapes) - set(known):
             raise InputError(f"config, key effects.{id}: {sorted(odd)[0]!r} is none of {', '.join(known)}")
+    named = [n for n, m in chosen(config).items() if m.effects == "diagnosed"]
+    if named and not config.diagnosed:
+        raise InputError(f"config: model {named[0]!r} has the effects of a diagnosis, key diagnosed names no vehicle")
     if config.data == "ztbus":
         if config.held_variants or config.warmer_than_c is not None or config.diagnosed:
             raise InputError("config: held_variants, warmer_than_c and diagnosed are of the fleet, data is ztbus")
@@ -168,11 +173,13 @@ def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> 
     if model.kind == "vehicles":
         for vehicle in _vehicles(config):
             known = config.diagnosed == ["all"] or (config.data == "fleet" and _id(config, vehicle) in config.diagnosed)
-            yield {**task, "vehicle": vehicle, "effects": config.effects if model.effects else {},
+            yield {**task, "vehicle": vehicle, "effects": config.effects if model.effects is True else {},
                    "diagnosed_routes": config.diagnosed_routes if known else 0}  # fmt: skip
         return
     plan = {"epochs": config.epochs, "patience": config.patience, "stop_after": config.stop_after}
-    task |= {**plan, "effects": config.effects if model.effects else {}}
+    task |= {**plan, "effects": config.effects if model.effects is True else {}}
+    if model.effects == "diagnosed":
+        task |= {"diagnosed": config.diagnosed, "diagnosed_routes": config.diagnosed_routes}
     for seed in config.seeds:
         for weights in _weights(config, model) if model.kind == "network" else [[]]:
             yield {**task, "seed": seed, "weights": list(weights)}
@@ -212,6 +219,8 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     data = load(d["kind"], d["seed"], d["routes"], tuple(d["held"]), d["share"], d["warmer_than"], d["fold"],
                 tuple(d["variants"]))  # fmt: skip
     effects = data.shown(task.get("effects", {}))
+    if "diagnosed" in task:
+        effects = found_effects(data, task["diagnosed"], task["diagnosed_routes"])
     tasks = [{**t, "effects": effects} for t in tasks]
     task = tasks[0]
     if task["model"]["kind"] == "vehicles":
@@ -219,7 +228,7 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     rows, use = data.rows(names_of(task["model"]["features"], data), tuple(task["effects"]))
     if task["model"]["kind"] == "lightgbm":
         return [{"lightgbm": scores(data, use, boosted(rows, use, t["seed"])), "counts": data.counts()} for t in tasks]
-    return _networks(data, rows, use, tasks)
+    return trained(data, rows, use, tasks, Model(**task["model"]))
 
 
 def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
@@ -244,87 +253,6 @@ def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
         car, out["found"], out["coefficients"] = diagnosed(m, task["diagnosed_routes"], seed=0)
         out["diagnosed"] = scores(data, m.use, said(car, m), only=k)
     return out
-
-
-def _networks(data: Data, rows: Any, use: np.ndarray, tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    spec = Model(**tasks[0]["model"])
-    choices = {f.name: getattr(spec, f.name) for f in fields(Choices)}
-    recipe = Recipe(features=names_of(spec.features, data), **choices)
-    plan = Plan(tasks[0]["epochs"], spec.batch, 0.5, tasks[0]["patience"], stop_after=tasks[0]["stop_after"])
-    members = [(t["seed"] * 1000 + k, t["weights"]) for t in tasks for k in range(spec.members)]
-    try:
-        ensemble = networks(
-            rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=sized(tasks[0]["effects"])
-        )
-    except DivergedError as e:
-        progress.step(f"{tasks[0]['name']}: {e}")
-        return [{"diverged": True} for _ in tasks]
-    shown = np.isin(use, (2, 3))
-    picked, uses = rows.take(shown), use[shown]
-    every = ensemble.predict(picked)
-    out = []
-    for i, _ in enumerate(tasks):
-        at = range(i * spec.members, (i + 1) * spec.members)
-        own = [every[j] for j in at if not ensemble.diverged[j]]
-        if not own:
-            out.append({"diverged": True})
-            continue
-        out.append(_scored(data, use, shown, picked, uses, own, recipe))
-        ends = ensemble.trained.scores.reshape(len(members), -1)[i * spec.members]
-        out[-1] |= {
-            "counts": data.counts(),
-            "effects": list(tasks[0]["effects"]),
-            "epochs": int(np.isfinite(ends).sum()),
-        }
-    return out
-
-
-def _scored(
-    data: Data, use: np.ndarray, shown: np.ndarray, picked: Any, uses: np.ndarray, own: Sequence[Any], recipe: Recipe
-) -> dict[str, Any]:
-    """Of an ensemble: its prediction, its physics alone; how near the bounds its coefficients are."""
-
-    def whole(x: np.ndarray) -> np.ndarray:
-        full = np.full(len(use), np.nan)
-        full[shown] = x
-        return full
-
-    mean = {k: np.mean([np.asarray(getattr(p, k), float) for p in own], axis=0)
-            for k in ("energy_wh", "physics_wh", "c_rr", "cda_m2")}  # fmt: skip
-    noise = np.mean([np.asarray(p.sd_wh, float) ** 2 for p in own], axis=0)
-    sd = np.sqrt(noise + np.var([p.energy_wh for p in own], axis=0))
-    out: dict[str, Any] = {}
-    both: dict[str, Any] = {"c_rr": whole(mean["c_rr"]), "cda_m2": whole(mean["cda_m2"])}
-    if recipe.coefficients == "table":
-        both = {}
-    out["network"] = scores(data, use, whole(mean["energy_wh"]), sd_wh=whole(sd), **both)
-    if recipe.coefficients != "table" or recipe.predicted != "alone":
-        physics = mean["physics_wh"] if recipe.physics == "battery" else _at_battery(picked, mean)
-        out["physics"] = scores(data, use, whole(physics), **both)
-    if recipe.coefficients == "bounded" and np.any(uses == 2):
-        out["at_bound"] = _at_bound(recipe, np.asarray(picked.cda_m2), own, uses == 2)
-    return out
-
-
-def _at_bound(recipe: Recipe, table: np.ndarray, own: Sequence[Any], at: np.ndarray) -> dict[str, int]:
-    """Of the rows `at`, over all members: how many predictions there are, and how many are within 1 % of the range of
-    either bound of each coefficient."""
-    ranges = {"c_rr": (0.0, C_RR_LIMIT), "cda_m2": (1.0 - recipe.clamp, 1.0 + recipe.clamp)}
-    out = {"rows": len(own) * int(at.sum()), "c_rr": 0, "cda_m2": 0}
-    for p in own:
-        for name, x in (("c_rr", np.asarray(p.c_rr)), ("cda_m2", np.asarray(p.cda_m2) / table)):
-            low, high = ranges[name]
-            near = 0.01 * (high - low)
-            out[name] += int(np.sum((x[at] <= low + near) | (x[at] >= high - near)))
-    return out
-
-
-def _at_battery(rows: Any, mean: dict[str, np.ndarray]) -> np.ndarray:
-    """Battery energy with coefficients that were learned against the energy at the wheels."""
-    from hdev_jax.learn.pinn_rows import with_coefficients
-
-    car = with_coefficients(rows.car, np.asarray(mean["c_rr"], np.float32), np.asarray(mean["cda_m2"], np.float32))
-    return np.asarray(energy(car, rows.segments), float)
 
 
 def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:

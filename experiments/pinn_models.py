@@ -1,10 +1,6 @@
 """What is compared on the same rows: tables, the paper's regression, trees, networks, the kernel with found effects."""
 
-import dataclasses
-import tempfile
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -17,10 +13,9 @@ from hdev_jax.learn.pinn_fit import Ensemble, fit
 from hdev_jax.learn.pinn_fit import Member as Seed
 from hdev_jax.learn.pinn_rows import FEATURES, Rows
 from hdev_jax.learn.train import Plan
-from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle, at_null
 
-__all__ = ["bayesian", "boosted", "diagnosed", "kernel", "names_of", "networks", "said", "sized"]
+__all__ = ["bayesian", "boosted", "kernel", "names_of", "networks", "said", "sized"]
 
 
 def names_of(features: str, data: Data) -> tuple[str, ...]:
@@ -72,37 +67,6 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Vehicle:
     train = m.where(0)
     one = fitted(car, table, m.segments.take(train), m.energy_wh[train], "energy_wh", paper=True)
     return table.insert(car, one.values)
-
-
-def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
-    """The vehicle with the effects that the diagnosis finds on its first training routes, what these are, and what the
-    declared coefficients became. The whole loop, as `hdev diagnose` runs it."""
-    from hdev_jax import progress
-    from hdev_jax.diagnosis.diagnose import diagnose
-    from hdev_jax.diagnosis.problem import prepare
-    from hdev_jax.diagnosis.split import split_trips
-    from hdev_jax.fleet import FleetConfig
-    from hdev_jax.fleet.sheets import write_sheet
-    from hdev_jax.inference.sheet import read_sheet
-
-    known = np.unique(m.routes[m.where(0)])[: routes + 1]
-    with tempfile.TemporaryDirectory() as folder:
-        write_sheet(m.variant, FleetConfig(), Path(folder))
-        problem = prepare(_log_of(m, known), read_sheet(Path(folder) / f"{m.id}.toml"))
-        # one route more than is learnt from: the loop wants a test trip, and what it says of that is not used
-        split = split_trips(problem.log, None, [problem.log.trip_names[-1]])
-        done = diagnose(problem, split, LIBRARY, seed=seed, tell=progress.step)
-    found = {e["id"]: {k: p["value"] for k, p in e["parameters"].items()} for e in done.summary["effects"]}
-    values = {c.name: float(x) for c, x in zip(done.fit.table.free, done.fit.values, strict=True)}
-    return done.after, found, values
-
-
-def _log_of(m: Member, routes: np.ndarray) -> Log:
-    """The log of these routes of a vehicle."""
-    at = np.flatnonzero(np.isin(m.routes, routes))
-    names, trip = np.unique(m.routes[at], return_inverse=True)
-    segments = dataclasses.replace(m.segments.take(at), trip=trip, vehicle=np.zeros(len(at), int))
-    return Log(segments, {"energy_wh": m.energy_wh[at]}, tuple(map(str, names)), (m.id,))
 
 
 def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:

@@ -24,8 +24,8 @@ __all__ = ["coefficients", "grid", "shares", "table"]
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
         "kernel": "physics, effects by closed form", "diagnosed": "physics, as diagnosed"}  # fmt: skip
-GIVEN = ("ours and the closed form are given the list of effects that the fleet hides, limits apart; what a diagnosis "
-         "names by itself: `--set 'diagnosed=[\"A\"]'`")  # fmt: skip
+GIVEN = ("ours and the closed form are given the list of effects that the fleet hides, limits apart; what diagnoses of "
+         "training routes name by themselves is in models that say so")  # fmt: skip
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
@@ -110,7 +110,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     if effects:
         write_tables(run, "effects", effects, "What the diagnosis found, by vehicle: how often, and its median size")
     model_bars(run, gathered, data)
-    used = (r["effects"] for t, r in results if t["name"] == OURS and "effects" in r)
+    used = {t["name"]: r["effects"] for t, r in results if r.get("effects")}
     return {
         "artefact": config.artefact, "data": data, "synthetic": config.data == "fleet", "rows": rows,
         "better_than_paper": 0, "of": 0, "headline": "rmse", "missed": _missed(config, gathered, at_bound),
@@ -123,7 +123,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "errors of coefficients: median of predicted over true, less one; spray counts as air",
             *_lost(results),
             *([GIVEN] if config.data == "fleet" else []),
-            "effects in ours: " + ", ".join(next(used, ["none"])),
+            *(f"effects in {name}: {', '.join(effects)}" for name, effects in used.items()),
         ],
     }  # fmt: skip
 

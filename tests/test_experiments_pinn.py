@@ -6,6 +6,7 @@ import pytest
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn import Config, chosen, tasks, together
 from experiments.pinn_data import load
+from experiments.pinn_diagnosed import united
 from experiments.pinn_scores import pooled, scores
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
@@ -100,3 +101,20 @@ def test_scores_are_those_of_all_rows_and_add_up_over_vehicles():
     assert whole["pe_percent"] == pytest.approx(100 * (told[at].sum() / y[at].sum() - 1), rel=1e-9)
     trips = [100 * (told[route == t].sum() / y[route == t].sum() - 1) for t in np.unique(route[at])]
     assert whole["trip_pe_median"] == pytest.approx(np.median(np.abs(trips)), abs=1e-3)
+
+
+def test_effects_of_several_diagnoses_are_one_list():
+    """The commonest first, shapes at their median, sizes left open; nothing across rows, no limit."""
+    found = [
+        {"tyre_warmup": {"excess": 0.3, "distance_m": 4000.0}, "grade_lag": {"lag_s": 0.5}, "headwind": {"scale": 1.0}},
+        {"tyre_warmup": {"excess": 0.5, "distance_m": 8000.0}, "regen_limit": {"power_w": 9e4}},
+    ]
+    assert united(found) == {"tyre_warmup": {"distance_m": 6000.0}, "headwind": {}}
+    assert united([]) == {}
+
+
+def test_effects_as_diagnosed_ask_for_vehicles_to_diagnose():
+    with pytest.raises(InputError, match="'ours, effects as diagnosed' has the effects of a diagnosis"):
+        list(tasks(config("paper1/table2", "diagnosed=[]")))
+    task = next(t for t in tasks(config("paper1/table2")) if t["name"] == "ours, effects as diagnosed")
+    assert (task["effects"], task["diagnosed"], task["diagnosed_routes"]) == ({}, ["A", "B", "C", "D"], 12)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import pinn, pinn_figures, pinn_pages
+from experiments import pinn, pinn_figures, pinn_networks, pinn_pages
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn_data import Data, Member
 from experiments.pinn_scores import pooled, scores
@@ -214,7 +214,9 @@ def test_both_bounds_of_both_coefficients_count_in_every_member():
         SimpleNamespace(c_rr=np.array([0.0199, 0.0001, 0.0100, 0.0100]), cda_m2=np.array([3.0, 9.0, 6.0, 3.0])),
         SimpleNamespace(c_rr=np.array([0.0197, 0.0003, 0.0100, 0.0199]), cda_m2=np.array([3.1, 8.9, 8.97, 6.0])),
     ]
-    found = pinn._at_bound(Recipe(features=(), clamp=0.5), np.full(4, 6.0), near, np.array([True, True, True, False]))
+    found = pinn_networks._at_bound(
+        Recipe(features=(), clamp=0.5), np.full(4, 6.0), near, np.array([True, True, True, False])
+    )
     assert found == {"rows": 6, "c_rr": 2, "cda_m2": 3}
 
 
@@ -222,7 +224,8 @@ def test_a_training_that_diverges_is_a_result(monkeypatch):
     def diverges(*_, **__):
         raise DivergedError("training: the loss or its slope is not finite")
 
-    monkeypatch.setattr(pinn, "networks", diverges)
-    monkeypatch.setattr(pinn, "names_of", lambda *_: ("slope",))
+    monkeypatch.setattr(pinn_networks, "networks", diverges)
+    monkeypatch.setattr(pinn_networks, "names_of", lambda *_: ("slope",))
     whole = json.loads(json.dumps({**next(t for t in pinn.tasks(config()) if t["name"] == "paper"), "effects": {}}))
-    assert pinn._networks(four_rows(), None, USE, [whole, whole]) == [{"diverged": True}] * 2
+    spec = pinn.Model(**whole["model"])
+    assert pinn_networks.trained(four_rows(), None, USE, [whole, whole], spec) == [{"diverged": True}] * 2
