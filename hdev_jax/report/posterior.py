@@ -7,6 +7,7 @@ import numpy as np
 from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, axis_label, figure, tidy
 from hdev_jax.report.data import ReportData
+from hdev_jax.report.words import number
 
 __all__ = ["likelihood_of", "prior_likelihood_posterior"]
 
@@ -66,6 +67,9 @@ def prior_likelihood_posterior(data: ReportData) -> Any | None:
         words, unit = names.coefficient(name)
         ax.set_xlabel(axis_label(words, parameters[name].get("unit") or unit))
         ax.set_yticks([])
+        ax.locator_params(axis="x", nbins=4)
+        least = 1e-6 * (high - low)  # a tick at 0 is not exactly there
+        ax.xaxis.set_major_formatter(lambda v, _, least=least: number(v if abs(v) > least else 0.0, 2))
         tidy(ax, grid="x")
     handles, labels = fig.axes[0].get_legend_handles_labels()
     synthetic = "synthetic data" if data.synthetic else None
