@@ -13,7 +13,7 @@ from hdev_jax.learn.pinn_rows import row_wise
 from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle
 
-__all__ = ["diagnosed", "found_effects"]
+__all__ = ["diagnosed", "found_effects", "united"]
 
 _kept: dict[tuple[int, tuple[str, ...], int], dict[str, dict[str, float]]] = {}  # of data that `load` keeps
 

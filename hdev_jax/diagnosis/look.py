@@ -31,6 +31,7 @@ __all__ = [
     "scored",
 ]
 
+HELD = 0.5  # of what trips differ by: what a cause that they alone tell is asked to hold
 HINT = 0.1  # p, before any correction, from which on a candidate is not even hinted at
 
 
@@ -192,9 +193,9 @@ class View:
         p = max(s.p_model, s.p_cluster)
         if s.p <= HINT:
             return clusters_needed(p, k, count, level)
-        if self.ground.clusters.kind != "trip" or not self.between(s.candidate) or ruled_out(0.5, p, k, count):
+        if self.ground.clusters.kind != "trip" or not self.between(s.candidate) or ruled_out(HELD, p, k, count):
             return None
-        needed = clusters_to_tell(0.5, k, level)
+        needed = clusters_to_tell(HELD, k, level)
         return needed if needed is not None and needed > count else None
 
 
