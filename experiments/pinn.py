@@ -220,7 +220,7 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 tuple(d["variants"]))  # fmt: skip
     effects = data.shown(task.get("effects", {}))
     if "diagnosed" in task:
-        effects = found_effects(data, task["diagnosed"], task["diagnosed_routes"])
+        effects = found_effects(data, tuple(task["diagnosed"]), task["diagnosed_routes"])
     tasks = [{**t, "effects": effects} for t in tasks]
     task = tasks[0]
     if task["model"]["kind"] == "vehicles":

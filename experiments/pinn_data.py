@@ -47,7 +47,7 @@ class Member:
         return np.flatnonzero(self.use == use)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # the same data is the same object: `load` keeps it
 class Data:
     """Vehicles, those that are trained on first; `trained` is how many these are."""
 

@@ -3,6 +3,7 @@
 import dataclasses
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +16,16 @@ from hdev_jax.physics import LIBRARY, Vehicle
 
 __all__ = ["diagnosed", "found_effects", "united"]
 
-_kept: dict[tuple[int, tuple[str, ...], int], dict[str, dict[str, float]]] = {}  # of data that `load` keeps
 
-
-def found_effects(data: Data, vehicles: Sequence[str], routes: int) -> dict[str, dict[str, float]]:
+@cache
+def found_effects(data: Data, vehicles: tuple[str, ...], routes: int) -> dict[str, dict[str, float]]:
     """Effects that the diagnoses of these vehicles find on so many of their training routes, in the order of how often,
     with the median of each shape; sizes are left open.
 
     Those that act across rows are no part of it, nor limits, whose size is their threshold.
     """
-    key = (id(data), tuple(vehicles), routes)
-    if key not in _kept:
-        chosen = [m for m in data.vehicles if (m.id in vehicles or vehicles == ["all"]) and len(m.where(0))]
-        _kept[key] = united([diagnosed(m, routes, seed=0)[1] for m in chosen])
-    return _kept[key]
+    chosen = [m for m in data.vehicles if (m.id in vehicles or vehicles == ("all",)) and len(m.where(0))]
+    return united([diagnosed(m, routes, seed=0)[1] for m in chosen])
 
 
 def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:

@@ -1,9 +1,10 @@
 """Joint refits: the vehicle with a candidate, every free coefficient fitted anew, and whether it stands."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import FIXED, Candidate, finer, plan_of, realised
@@ -113,21 +114,22 @@ def as_known(problem: Loop, state: Search) -> Calibration:
     gained = fit.sd[declared] / error[declared]
     if not (np.all(agree) and np.min(gained) >= 1.0 and np.max(gained) >= KNOWN):
         return fit
-    told = {(c.path, c.group): (float(x), float(e))
-            for c, x, e in zip(fit.table.free, settled.values, error, strict=True)}  # fmt: skip
     predicted = np.asarray(predict(settled.vehicle, problem.rows.segments, problem.target))[: problem.rows.rows]
+    table = _lent(fit.table, settled.values, error, every=True)
     known = replace(
-        settled, table=_lent(fit.table, told), sd=error, covariance=covariance, predicted=predicted,
+        settled, table=table, sd=error, covariance=covariance, predicted=predicted,
         sigma=float(np.sqrt(np.mean((problem.measured - predicted) ** 2))),
     )  # fmt: skip
     return known if all(_in_range(known, s.candidate) and _present(known, s.candidate) for s in found) else fit
 
 
-def _lent(table: ParameterTable, told: Mapping[tuple[str, int | None], tuple[float, float]]) -> ParameterTable:
-    """The table with these values and standard errors of borrowed coefficients, by path and group."""
-    none = (None, None)
-    both = [(c, *told.get((c.path, c.group), none)) for c in table.rows]
-    return ParameterTable(tuple(c if x is None else replace(c, value=x, sd=e, borrowed=True) for c, x, e in both))
+def _lent(
+    table: ParameterTable, values: Float[np.ndarray, " free"], error: Float[np.ndarray, " free"], *, every: bool
+) -> ParameterTable:
+    """The table with these values and standard errors of what it borrows; of every free coefficient, borrowed now."""
+    told = {(c.path, c.group): {"value": float(x), "sd": float(e), "borrowed": True}
+            for c, x, e in zip(table.free, values, error, strict=True) if every or c.borrowed}  # fmt: skip
+    return ParameterTable(tuple(replace(c, **told.get((c.path, c.group), {})) for c in table.rows))
 
 
 def without(problem: Loop, state: Search, effect_id: str) -> Search:
@@ -150,11 +152,9 @@ def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | No
     )
     fit, covariance = settle(problem.ground(start, noise))
     error = np.sqrt(np.diag(covariance))
-    told = {(c.path, c.group): (float(x), float(e))
-            for c, x, e in zip(state.table.free, fit.values, error, strict=True) if c.borrowed}  # fmt: skip
-    if not all(np.isfinite(e) for _, e in told.values()):
+    if not all(np.isfinite(e) for c, e in zip(state.table.free, error, strict=True) if c.borrowed):
         return None
-    return _lent(state.table, told)
+    return _lent(state.table, fit.values, error, every=False)
 
 
 def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) -> tuple[Coefficient, ...]:

@@ -214,7 +214,8 @@ def _known(problem: Problem, state: Search, last: Calibration, test: np.ndarray,
     """What of the error after is no effect's: where its coefficients come from."""
     if last is state.fit or not state.found:
         return []
-    plain = np.sqrt(np.mean((problem.measured - problem.predict(state.fit.vehicle))[test] ** 2))
+    said = problem.predict(state.fit.vehicle)[test]
+    plain = metrics(problem.measured[test], said, problem.weight()[test])["rmse"]
     return [
         "coefficients of the model with the effects are of whitened rows, which know them better: test RMSE "
         f"{rmse:.4g} {problem.unit}; {plain:.4g} with those of rows of equal weight, as the declared model has them"

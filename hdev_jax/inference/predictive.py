@@ -180,13 +180,16 @@ def spread_of(
 def _unlike(z: Float[np.ndarray, " row"], clusters: Clusters, squares: float) -> float:
     """By how much trips differ in the variance of their rows, beyond what chance makes of rows whose squares go
     together `squares` times: squared coefficient of variation. Levels of trips are taken off: they are no variance."""
-    count = np.bincount(clusters.ids)
-    square = (z - (clusters.sums(z) / count)[clusters.ids]) ** 2
+    count, square = np.bincount(clusters.ids), _without_means(z, clusters) ** 2
     each, mean = clusters.sums(square) / count, float(np.mean(square))
     if len(count) < 2 or not mean > 0:
         return 0.0
     inside = float(np.mean((square - each[clusters.ids]) ** 2))
     return max((float(np.var(each, ddof=1)) - inside * squares * float(np.mean(1.0 / count))) / mean**2, 0.0)
+
+
+def _without_means(z: Float[np.ndarray, " row"], clusters: Clusters) -> Float[np.ndarray, " row"]:
+    return z - (clusters.sums(z) / np.bincount(clusters.ids))[clusters.ids]
 
 
 def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> tuple[float, float]:
@@ -199,7 +202,7 @@ def _times(z: Float[np.ndarray, " row"], clusters: Clusters) -> tuple[float, flo
     """
     ids = clusters.ids if clusters.kind == "trip" else np.zeros(len(z), dtype=int)
     if clusters.kind == "trip":
-        z = z - (clusters.sums(z) / np.bincount(ids))[ids]
+        z = _without_means(z, clusters)
     n, square = len(z) / (ids[-1] + 1), float(np.mean(z**2))
     lags = np.arange(1, min(MOST_LAG, int(n) // 5) + 1)
     if not len(lags) or not square > 0:
