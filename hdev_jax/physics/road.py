@@ -116,10 +116,9 @@ def _wind_along(row: Segments) -> Any:
 
 
 def _extra_drag(row: Segments, car: Vehicle, wind_mps: Any) -> Any:
-    """Drag at air speed v + w less drag at v, with the sign of the air speed."""
-    v = row.speed_mps
-    air = v + wind_mps
-    return car.drag() * (air * jnp.abs(air) - v * v)
+    """Drag at air speed v + w less drag at v, with the sign of the air speed: the mean of both ends, as in `Aero`."""
+    ends = [v + wind_mps for v in (row.speed_start_mps, row.speed_end_mps)]
+    return car.drag() * (0.5 * sum(air * jnp.abs(air) for air in ends) - mean_square_speed(row))
 
 
 class ConstantHeadwind(Effect):

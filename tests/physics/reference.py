@@ -71,8 +71,10 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
     force = car["rotating"] * m * a + m * G * math.sin(theta) + m * G * car["c_rr"] * math.cos(theta)
     force += 0.5 * RHO0 * car["cda_m2"] * square
     if p := effects.get("headwind"):
-        air = v + p["scale"] * r["wind_speed_mps"] * math.cos(r["wind_from_rad"] - r["heading_rad"])
-        force += 0.5 * RHO0 * car["cda_m2"] * (math.copysign(air**2, air) - v**2)
+        wind = p["scale"] * r["wind_speed_mps"] * math.cos(r["wind_from_rad"] - r["heading_rad"])
+        for end in (v0, v1):  # the mean of both, as without wind
+            air = end + wind
+            force += 0.25 * RHO0 * car["cda_m2"] * (math.copysign(air**2, air) - end**2)
     if p := effects.get("rolling_temperature"):
         force += m * G * math.cos(theta) * p["per_k"] * (r["ambient_temp_c"] - 20)
     if p := effects.get("tyre_warmup"):

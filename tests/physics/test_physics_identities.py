@@ -70,6 +70,9 @@ def test_paper_2_equation_2(wind: float) -> None:
     same(car.force(row), [M * G * 0.006 * np.cos(0.01) + M * G * np.sin(0.01) + drag])
     faster = made.one_row(speed_start_mps=9.0, speed_end_mps=11.0)
     same(made.single(Inertia(made.arr(1.05))).force(faster), [1.05 * M * 2.0 / 10.0])
+    # while speed changes the air's is squared at both ends, as equation 4 of paper 1 has it without wind
+    both = 0.25 * RHO * 5.6 * ((9.0 + wind) ** 2 + (11.0 + wind) ** 2)
+    same(made.single(Aero(made.arr(5.6))).plus(ConstantHeadwind(made.arr(wind))).force(faster), [both])
 
 
 @pytest.mark.parametrize("up", [True, False])
