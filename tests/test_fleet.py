@@ -106,21 +106,42 @@ def test_baseline_is_equations_3_to_5_in_a_plain_loop():
     assert abs(v.cda_m2 - 5.6) <= 1.5 * 0.5
 
 
+def beyond_over_noise(log, column):
+    """RMS of a column after projecting off the baseline's Jacobian, over that of the noise."""
+    names = ("c_rr", "cda_m2") if log.entry == "road" else ("motoring_efficiency", "regenerating_efficiency")
+    unit = log.drive.columns["duration_s"] / 3600 if log.drive.mode == "segments" else 1e-3
+    base, jacobian = log.truth["baseline"].to_numpy(), []
+    for name in names:  # one-sided, with another step than the generator's own
+        moved = replace(log.vehicle, **{name: getattr(log.vehicle, name) * 1.00001})
+        jacobian.append(power_w(log.drive, moved, log.entry, {}) * unit - base)
+    q, _ = np.linalg.qr(np.stack(jacobian, axis=1))
+    beyond = column - q @ (q.T @ column)
+    return np.sqrt(np.mean(beyond**2) / np.mean(log.truth["noise"].to_numpy() ** 2))
+
+
+@pytest.mark.parametrize(
+    "effects", [("mass_scale", "hvac_power"), ("headwind", "hvac_power"), ("headwind", "wet_road", "cornering")]
+)
+def test_each_of_several_has_the_asked_ratio(effects):
+    """Whether the effects or the noise give way, and where the noise can be matched to one of them alone."""
+    log = synthetic_log(**SMALL | {"rows_per_trip": 160}, effects={k: {} for k in effects}, ratio=0.5)
+    for k in effects:
+        np.testing.assert_allclose(beyond_over_noise(log, log.truth[f"effect:{k}"].to_numpy()), 0.5, rtol=2e-3)
+
+
+def test_an_effect_that_jumps_is_no_weaker_than_asked():
+    log = synthetic_log(**SMALL | {"rows_per_trip": 160}, effects={"rolling_speed": {}, "regen_cutoff": {}}, ratio=0.5)
+    weak, strong = sorted(beyond_over_noise(log, log.truth[f"effect:{k}"].to_numpy()) for k in log.vehicle.effects)
+    np.testing.assert_allclose(weak, 0.5, rtol=2e-3)
+    assert strong > 0.55
+
+
 @pytest.mark.parametrize(("entry", "mode", "effect"), CASES)
 def test_size_is_the_asked_ratio_after_projection(entry, mode, effect):
     rows = 160 if mode == "segments" else 500
     log = synthetic_log(**SMALL | {"rows_per_trip": rows}, effects={effect: {}}, ratio=0.8, entry=entry, mode=mode)
-    names = ("c_rr", "cda_m2") if entry == "road" else ("motoring_efficiency", "regenerating_efficiency")
-    unit = log.drive.columns["duration_s"] / 3600 if mode == "segments" else 1e-3
-    base, jacobian = log.truth["baseline"].to_numpy(), []
-    for name in names:  # one-sided, with another step than the generator's own
-        moved = replace(log.vehicle, **{name: getattr(log.vehicle, name) * 1.00001})
-        jacobian.append(power_w(log.drive, moved, entry, {}) * unit - base)
     column = (log.truth["noise_free"] - log.truth["baseline"]).to_numpy()
-    q, _ = np.linalg.qr(np.stack(jacobian, axis=1))
-    beyond = column - q @ (q.T @ column)
-    noise = log.truth["noise"].to_numpy()
-    np.testing.assert_allclose(np.sqrt(np.mean(beyond**2) / np.mean(noise**2)), 0.8, rtol=2e-3)
+    np.testing.assert_allclose(beyond_over_noise(log, column), 0.8, rtol=2e-3)
     np.testing.assert_allclose(log.ratio, 0.8, rtol=1e-6)
     np.testing.assert_allclose(column, log.truth[f"effect:{effect}"], atol=1e-9)
 

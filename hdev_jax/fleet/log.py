@@ -95,6 +95,9 @@ def _scaled(truth: Truth, effect: str, parameters: Mapping[str, float], factor: 
     return scaled
 
 
+_NOTHING = "{} changes nothing in this log: other parameters, or more rows"
+
+
 def size_effect(
     drive: Drive, truth: Truth, effect: str, parameters: Mapping[str, float], *, rms: float, entry: str = "road"
 ) -> dict[str, float]:
@@ -102,7 +105,7 @@ def size_effect(
 
     **Arguments:** `rms` in the target's unit; `parameters` give the direction (signs, time constants) of the search.
     **Raises:** `ValueError` where no size within a factor of 300 reaches it, or the energy jumps over it
-    (`regen_cutoff`): match the noise to the effect instead.
+    (`regen_cutoff`): the noise is matched to the effect instead.
     """
     jacobian, base = _jacobian(drive, truth, entry), _target(drive, truth, entry, {})
 
@@ -117,15 +120,40 @@ def size_effect(
     if not len(above) or above[0] == 0:
         raise ValueError(
             f"{effect}: RMS {rms:.4g} beyond the baseline is out of reach ({values.min():.4g} to {values.max():.4g}); "
-            "choose other starting parameters, or match the noise to the effect with adjust='noise'"
+            "choose other starting parameters"
         )
     low, high = grid[above[0] - 1], grid[above[0]]
     for _ in range(45):
         mid = 0.5 * (low + high)
         low, high = (mid, high) if reached(mid) < rms else (low, mid)
     if abs(reached(high) / rms - 1) > 1e-6:
-        raise ValueError(f"{effect}: its energy jumps over RMS {rms:.4g}; match the noise with adjust='noise'")
+        raise ValueError(f"{effect}: its energy jumps over RMS {rms:.4g}")
     return _scaled(truth, effect, parameters, float(np.exp(high)), entry)
+
+
+def _matched(
+    drive: Drive, truth: Truth, wanted: Mapping[str, Mapping[str, float]], ratio: float, rms: float, entry: str
+) -> tuple[dict[str, Mapping[str, float]], float]:
+    """Effects and the noise's RMS such that each effect has `ratio` times it: see `synthetic_log`."""
+    jacobian, base = _jacobian(drive, truth, entry), _target(drive, truth, entry, {})
+    kept = {
+        k: root_mean_square(_beyond(jacobian, _target(drive, truth, entry, {k: p}) - base))
+        for k, p in wanted.items()
+        if PLANTABLE[k].match == "noise"
+    }
+    if nothing := [k for k, size in kept.items() if not size > 0]:
+        raise ValueError(_NOTHING.format(", ".join(nothing)))
+    rms = min(kept.values()) / ratio if kept else rms
+    sized: dict[str, Mapping[str, float]] = {}
+    for k, p in wanted.items():
+        try:
+            alone = k in kept and kept[k] <= ratio * rms * (1 + 1e-9)
+            sized[k] = p if alone else size_effect(drive, truth, k, p, rms=ratio * rms, entry=entry)
+        except ValueError:
+            if k not in kept:
+                raise
+            sized[k] = p
+    return sized, rms
 
 
 def _instruments(drive: Drive, truth: Truth, rng: np.random.Generator) -> None:
@@ -177,12 +205,11 @@ def _sheet(entry: str, sd: Mapping[str, float]) -> str:
     )
 
 
-def _check(entry: str, mode: str, noise: str, adjust: str, trips: int, rows: int, effects: Mapping) -> None:
+def _check(entry: str, mode: str, noise: str, trips: int, rows: int, effects: Mapping) -> None:
     for name, value, allowed in (
         ("entry", entry, ENTRIES),
         ("mode", mode, tuple(_KINEMATICS)),
         ("noise", noise, NOISES),
-        ("adjust", adjust, ("auto", "effect", "noise")),
     ):
         if value not in allowed:
             raise ValueError(f"{name}: expected one of {', '.join(allowed)}; got {value!r}")
@@ -206,7 +233,6 @@ def synthetic_log(
     rows_per_trip: int | None = None,
     effects: Mapping[str, Mapping[str, float | int]] | None = None,
     ratio: float | int | None = None,
-    adjust: str = "auto",
     noise: str = "ar1",
     noise_level: float | int = 0.04,
     noise_rms: float | int | None = None,
@@ -225,9 +251,9 @@ def synthetic_log(
       segments, 1200 of samples by default).
     - `effects`: id → parameters. `{}` plants the default size; time constants and the like left out have defaults
       (a step comes after 42 % of the trips).
-    - `ratio`: RMS of what is planted, after projecting off the baseline's Jacobian, over that of the noise.
-      `adjust="effect"` sizes each effect to it, `"noise"` keeps the effects and sizes the noise, `"auto"` takes what
-      `PLANTABLE[id].match` says.
+    - `ratio`: RMS of each planted effect, after projecting off the baseline's Jacobian, over that of the noise. What
+      `PLANTABLE[id].match` says gives way: the effect, or the noise, to the weakest of the effects that it is matched
+      to; stronger ones are made as weak, or stay as they are where their energy jumps.
     - `noise`, `ar_coefficient`: colour (`NOISES`), and lag-1 correlation from row to row. `noise_level` is relative to
       the RMS of the baseline's target; `noise_rms` is absolute (Wh a row, or kW) and wins.
     - `entry`: road (slope and speed), shaft (torque and motor speed measured) or wheel (traction force measured).
@@ -240,7 +266,7 @@ def synthetic_log(
     """
     wanted = {k: {n: float(x) for n, x in v.items()} for k, v in (effects or {}).items()}
     rows_per_trip = rows_per_trip or (250 if mode == "segments" else 1200)
-    _check(entry, mode, noise, adjust, trips, rows_per_trip, wanted)
+    _check(entry, mode, noise, trips, rows_per_trip, wanted)
     if unknown := set(table_sd or {}) - set(_SD):
         raise ValueError(f"table_sd: unknown {', '.join(sorted(unknown))}; known: {', '.join(_SD)}")
     table_sd = {**_SD, **(table_sd or {})}
@@ -253,8 +279,6 @@ def synthetic_log(
         if effect == "step_change":
             defaults["trip"] = float(int(0.42 * trips))
         wanted[effect] = {**defaults, **parameters}
-    if adjust == "auto":
-        adjust = "noise" if any(PLANTABLE[k].match == "noise" for k in wanted) else "effect"
     route, weather, vehicle, cycles, noises = (np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5))
 
     lengths = np.floor(rows_per_trip * route.uniform(0.7, 1.3, trips)).astype(int)
@@ -268,15 +292,13 @@ def synthetic_log(
 
     baseline = _target(drive, truth, entry, {})
     rms = noise_rms if noise_rms is not None else noise_level * root_mean_square(baseline)
-    if wanted and ratio is not None and adjust == "effect":
-        wanted = {k: size_effect(drive, truth, k, p, rms=ratio * rms, entry=entry) for k, p in wanted.items()}
+    if wanted and ratio is not None:
+        wanted, rms = _matched(drive, truth, wanted, ratio, rms, entry)
     truth = replace(truth, effects=wanted)
     clean = _target(drive, truth, entry)
     beyond = root_mean_square(_beyond(_jacobian(drive, truth, entry), clean - baseline))
     if wanted and not beyond > 0:
-        raise ValueError(f"{', '.join(wanted)} changes nothing in this log: other parameters, or more rows")
-    if wanted and ratio is not None and adjust == "noise":
-        rms = beyond / ratio
+        raise ValueError(_NOTHING.format(", ".join(wanted)))
     error = rms * noise_of_one(noises, lengths, noise, ar_coefficient)
 
     target = "energy_wh" if mode == "segments" else "battery_power_kw"
