@@ -12,6 +12,7 @@ from hdev_jax.diagnosis.next_drive import advise
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.rest import told_apart
 from hdev_jax.diagnosis.select import search
+from hdev_jax.diagnosis.shapes import left_open
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.summary import summarise
 from hdev_jax.errors import InputError
@@ -78,7 +79,8 @@ def diagnose(
     loop = Loop(rows, problem.target, cluster_rows(real), effects, fdr, np.random.default_rng([seed, 999]), gears)
     state, steps, predicted, left = told_apart(problem, split, state, loop, seed=seed, tell=tell, checkpoint=checkpoint)
     base = steps[0]
-    summary = summarise(problem, split, state, steps, predicted, left)
+    open_ = {f.id: left_open(loop, state, f.score) for f in state.found}
+    summary = summarise(problem, split, state, steps, predicted, left, open_)
     rivals = [(f.id, library[t]) for f in state.found for t in f.twins if t in library]
     if rivals:
         tell("what to measure next: drives that would tell the rest apart")

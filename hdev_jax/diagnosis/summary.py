@@ -9,6 +9,7 @@ from scipy import stats
 from hdev_jax.diagnosis.look import Found, Search, Verdict
 from hdev_jax.diagnosis.metrics import metrics
 from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.shapes import Open
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder
 from hdev_jax.inference import Calibration, Coefficient, cluster_rows
@@ -52,18 +53,25 @@ def _error(row: Coefficient, error: float) -> float:
     return max(error, row.sd) if row.borrowed and row.sd is not None else error
 
 
-def _effect_block(f: Found, fit: Calibration, before: float, after: float, clusters: int) -> dict[str, Any]:
+def _effect_block(
+    f: Found, fit: Calibration, left: Mapping[str, Open], before: float, after: float, clusters: int
+) -> dict[str, Any]:
     c = f.score.candidate
     prefix = f"effects.{f.id}."
-    parameters = {
-        row.name.removeprefix(prefix): {**_sized(float(v), _error(row, float(s)), clusters), "unit": row.unit}
-        for row, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
-        if row.path.startswith(prefix)
-    }
-    held = {p.name: p for p in c.effect.parameters if p.name not in parameters}
+    rows = [r for r in zip(fit.table.free, fit.values, fit.sd, strict=True) if r[0].path.startswith(prefix)]
+    fitted = {row.path.removeprefix(prefix) for row, _, _ in rows}
+    parameters = {}
+    for row, value, sd in rows:
+        name, error = row.name.removeprefix(prefix), _error(row, float(sd))
+        if name in left:  # fitted at shapes that are held, or with them
+            held = fitted <= set(c.sizes)
+            error = left[name].error(error) if held else max(error, left[name].error(None))
+        parameters[name] = {**_sized(float(value), error, clusters), "unit": row.unit}
     for name, value in c.shapes:
-        if name in held:
-            parameters[name] = {"value": float(value), "sd": 0.0, "unit": held[name].unit}
+        parameter = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
+        if parameter:
+            told = _sized(value, left[name].error(None), clusters) if name in left else {"value": value, "sd": 0.0}
+            parameters[name] = {**told, "unit": parameter.unit}
     return {
         "id": f.id,
         "stage": c.effect.stage,
@@ -87,7 +95,9 @@ def summarise(
     steps: list[Calibration],
     predicted: list[np.ndarray],
     left: Remainder,
+    open_: Mapping[str, Mapping[str, Open]],
 ) -> dict[str, Any]:
+    """The contract's diagnosis.json. `open_`: by effect and parameter, what its shapes leave open."""
     weight, y = problem.weight(), problem.measured
     train, test = problem.rows(split.train), problem.rows(split.test)
 
@@ -102,7 +112,7 @@ def summarise(
     rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
     clusters = cluster_rows(problem.segments.take(train))
     effects = [
-        {**_effect_block(f, steps[-1], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
+        {**_effect_block(f, steps[-1], open_[f.id], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
         for k, f in enumerate(state.found)
     ]
     verdict = {
