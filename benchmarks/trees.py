@@ -3,7 +3,7 @@
     python benchmarks/trees.py [--rows 1000000] [--routes 280] [--repeats 5] [--json FILE]
 
 The model is a row of the accuracy table of `configs/paper1/fig5.toml`, catboost/relative, with the settings that its
-search found (`--trees`, `--depth`, `--rate`, `--balance`); LightGBM's on the same features and rows tells all twelve
+search found (`--trees`, `--depth`, `--rate`, `--l2`); LightGBM's on the same features and rows tells all twelve
 gears, as in peers.md. Each predicts the same rows with as many threads as there are cores; what is printed is the
 median, and ratios within this run are what to trust. Compiling is timed apart. One row: a call from Python with one row
 of features. Accuracies are of routes that were not trained on.
@@ -37,11 +37,10 @@ def models(rows: Any, fit: np.ndarray, given: argparse.Namespace) -> dict[str, C
     cores = os.cpu_count() or 1
     gear, gears = rows.gear[fit], tuple(range(1, int(rows.gear[fit].max()) + 1))
     away = gear - rows.x[fit, EVERY.index("reference_gear")].astype(int)
-    weight = (np.bincount(gear) / len(gear))[gear] ** -given.balance
     cat = CatBoostClassifier(
         iterations=given.trees, depth=given.depth, learning_rate=given.rate, l2_leaf_reg=given.l2, border_count=254,
         random_seed=0, thread_count=cores, verbose=0, allow_writing_files=False,
-    ).fit(columns(rows, "relative")[fit], away - away.min(), sample_weight=weight / weight.mean())  # fmt: skip
+    ).fit(columns(rows, "relative")[fit], away - away.min())  # fmt: skip
     fixed = {
         "objective": "multiclass", "num_class": len(gears), "max_depth": 6, "num_leaves": 31, "learning_rate": 0.1,
         "min_sum_hessian_in_leaf": 1.0, "lambda_l2": 1.0, "verbosity": -1, "num_threads": cores, "seed": 0,
@@ -49,8 +48,8 @@ def models(rows: Any, fit: np.ndarray, given: argparse.Namespace) -> dict[str, C
     light = lgb.train(fixed, lgb.Dataset(columns(rows, "sheet")[fit], gear - 1), given.lightgbm_rounds)
     told = tuple(range(int(away.min()), int(away.max()) + 1))
     return {
-        "catboost": Classifier("catboost", cat, told, FEATURES["relative"], {}, 0.0),
-        "lightgbm": Classifier("lightgbm", light, gears, FEATURES["sheet"], {}, 0.0),
+        "catboost": Classifier("catboost", cat, told, FEATURES["relative"], {}, 0.0, 0.0),
+        "lightgbm": Classifier("lightgbm", light, gears, FEATURES["sheet"], {}, 0.0, 0.0),
     }
 
 
@@ -78,7 +77,6 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--depth", type=int, default=5)
     parser.add_argument("--rate", type=float, default=0.2256)
     parser.add_argument("--l2", type=float, default=1.402)
-    parser.add_argument("--balance", type=float, default=0.417)
     parser.add_argument("--lightgbm-rounds", type=int, default=100)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args(argv)

@@ -94,21 +94,18 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     p[test] = told_at(test)
     told = 1 + np.argmax(p, axis=1)
     out = {
-        "scores": scores(rows, told), "confusion": _confusion(rows, told), "settings": model.settings,
+        "scores": scores(rows, p, model.common), "confusion": _confusion(rows, told), "settings": model.settings,
         "fit_seconds": seconds, "train_rows": len(fit), "speed": _speed(model, x[test]),
         "energy": energy_cost(rows, np.where(p.sum(axis=1, keepdims=True) > 0, p, 1.0), fleet),
         "sample": _sample(rows, told),
     }  # fmt: skip
     if task["previous"]:
-        remembered = 1 + np.argmax(_chain(rows, test, x, reference, told_at), axis=1)
-        out["memory"] = scores(rows, remembered)
-        out["sample"]["filter"] = _sample(rows, remembered)["told"]
+        after = _chain(rows, test, x, reference, told_at)
     else:
         seen = fit[:: max(1, len(fit) // 20_000)]
-        share = told_at(seen)
-        remembered = 1 + np.argmax(_filter(rows, p, test, seen, share), axis=1)
-        out["memory"] = scores(rows, remembered)
-        out["sample"]["filter"] = _sample(rows, remembered)["told"]
+        after = _filter(rows, p, test, seen, told_at(seen))
+    out["memory"] = scores(rows, after, model.common)
+    out["sample"]["filter"] = _sample(rows, 1 + np.argmax(after, axis=1))["told"]
     return out
 
 

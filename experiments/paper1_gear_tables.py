@@ -83,7 +83,10 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "filter: a hidden Markov filter over the row-by-row probabilities; previous_gear: the measured one as a "
             "feature; chain: that classifier with the previous gear known only from its own telling",
             f"searches: Optuna, {config.trials} trials, {config.folds} folds of whole routes, on at most "
-            f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy; class weights are searched",
+            f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
+            "balanced: the same probabilities, told as the likeliest gear where each is as common as any other in "
+            "training (weights of classes in the decision, not in the fit); gears rarer than a share that the search "
+            "chooses count as that common",
         ],
     }  # fmt: skip
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.fleet import Fleet, simulate
-from hdev_jax.learn.classifiers import balanced_accuracy, route_folds
+from hdev_jax.learn.classifiers import alike, balanced_accuracy, route_folds
 from hdev_jax.learn.gears import EVERY, MOST_GEARS, Gearbox, features
 
 __all__ = ["GROUPS", "Rows", "box_of", "fleet_rows", "scores", "the_fleet"]
@@ -88,14 +88,20 @@ def fleet_rows(fleet: tuple[int, int, tuple[str, ...]], held: tuple[str, ...], l
     )  # fmt: skip
 
 
-def scores(rows: Rows, told: np.ndarray) -> dict[str, float]:
-    """Accuracies of a prediction of every row, by group of gearboxes, on unseen routes and on unseen variants."""
+def scores(rows: Rows, p: np.ndarray, common: float) -> dict[str, float]:
+    """Accuracies by group of gearboxes, on unseen routes and on unseen variants, of probabilities [row, gear].
+
+    Of the likeliest gear; balanced, of the likeliest where each gear of the group is as common as any other (`alike`).
+    """
+    told = 1 + np.argmax(p, axis=1)
     out: dict[str, float] = {}
     for name in GROUPS:
         end = "" if name == "all" else "_" + name.replace(" ", "_")
+        count = np.bincount(rows.gear[rows.where(rows.group(name), rows.train)], minlength=p.shape[1] + 1)[1:]
+        rare = 1 + alike(p, count / max(count.sum(), 1), common)
         for split in ("unseen_routes", "unseen_variants"):
             at = rows.where(rows.group(name), getattr(rows, split))
             if len(at):
                 out[f"accuracy_{split}{end}"] = float(np.mean(told[at] == rows.gear[at]))
-                out[f"balanced_{split}{end}"] = balanced_accuracy(rows.gear[at], told[at])
+                out[f"balanced_{split}{end}"] = balanced_accuracy(rows.gear[at], rare[at])
     return out

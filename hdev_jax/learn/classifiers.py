@@ -14,14 +14,15 @@ from hdev_jax.errors import InputError
 from hdev_jax.learn.tree_files import read_trees
 from hdev_jax.learn.trees import Trees
 
-__all__ = ["CLASSIFIERS", "Classifier", "balanced_accuracy", "route_folds", "search_classifier"]
+__all__ = ["CLASSIFIERS", "Classifier", "alike", "balanced_accuracy", "route_folds", "search_classifier"]
 
-Fit = Callable[[np.ndarray, np.ndarray, np.ndarray], Any]  # features, classes from 0, weights of rows
+Fit = Callable[[np.ndarray, np.ndarray], Any]  # features, classes from 0
+COMMON = (0.0, 0.001, 0.003, 0.01, 0.03)  # shares that rarer gears are taken to have
 
 
 @dataclass(frozen=True)
 class Classifier:
-    """A fitted classifier; `gears` are what its classes stand for."""
+    """A fitted classifier; `gears` are what its classes stand for, `common` is what `alike` takes."""
 
     kind: str
     model: Any
@@ -29,6 +30,7 @@ class Classifier:
     features: tuple[str, ...]
     settings: dict[str, Any]
     score: float
+    common: float
 
     def probabilities(self, x: Float[np.ndarray, "row feature"]) -> Float[np.ndarray, "row gear"]:
         """Probability of each of `gears`, by the library's own predictor."""
@@ -61,7 +63,7 @@ def _decision_tree(trial: Any, seed: int) -> Fit:
         min_samples_leaf=trial.suggest_int("min_samples_leaf", 2, 100, log=True),
         random_state=seed,
     )
-    return lambda x, y, w: model.fit(x, y, sample_weight=w)
+    return model.fit
 
 
 def _knn(trial: Any, seed: int) -> Fit:
@@ -71,7 +73,7 @@ def _knn(trial: Any, seed: int) -> Fit:
 
     count = trial.suggest_int("neighbours", 1, 40, log=True)
     model = make_pipeline(StandardScaler(), KNeighborsClassifier(count, weights="distance"))
-    return lambda x, y, w: model.fit(x, y)  # neighbours have no class weights
+    return model.fit
 
 
 def _random_forest(trial: Any, seed: int) -> Fit:
@@ -84,7 +86,7 @@ def _random_forest(trial: Any, seed: int) -> Fit:
         random_state=seed,
         n_jobs=1,
     )
-    return lambda x, y, w: model.fit(x, y, sample_weight=w)
+    return model.fit
 
 
 def _lightgbm(trial: Any, seed: int) -> Fit:
@@ -106,11 +108,11 @@ def _lightgbm(trial: Any, seed: int) -> Fit:
         "max_bin": 127,
     }
 
-    def fit(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Any:
+    def fit(x: np.ndarray, y: np.ndarray) -> Any:
         import lightgbm as lgb
 
         classes = {"objective": "multiclass", "num_class": int(y.max()) + 1}
-        return lgb.train({**fixed, **classes, **settings}, lgb.Dataset(x, y, weight=w), rounds)
+        return lgb.train({**fixed, **classes, **settings}, lgb.Dataset(x, y), rounds)
 
     return fit
 
@@ -125,7 +127,7 @@ def _catboost(trial: Any, seed: int) -> Fit:
         l2_leaf_reg=trial.suggest_float("l2_leaf_reg", 1.0, 10.0, log=True),
         border_count=254, random_seed=seed, thread_count=1, verbose=0, allow_writing_files=False,
     )  # fmt: skip
-    return lambda x, y, w: model.fit(x, y, sample_weight=w)
+    return model.fit
 
 
 CLASSIFIERS: dict[str, Callable[[Any, int], Fit]] = {
@@ -144,6 +146,18 @@ def balanced_accuracy(gear: Int[np.ndarray, " row"], told: Int[np.ndarray, " row
 
 def _balanced(right: np.ndarray, by: np.ndarray) -> float:
     return float(np.mean([np.mean(right[by == g]) for g in np.unique(by)]))
+
+
+def alike(
+    p: Float[np.ndarray, "row gear"], share: Float[np.ndarray, "*row gear"], common: float
+) -> Int[np.ndarray, " row"]:
+    """The place of the gear that is likeliest where each gear is as common as any other: what balanced accuracy asks.
+
+    Weights of classes in the decision, not in the fit, whose probabilities stay those of the road. `share` is how
+    common each gear was in training. One of a few rows cannot be told as well as that would have it: rarer ones than
+    `common` count as that common, one that training never showed is not told.
+    """
+    return np.argmax(np.where(share > 0, p / np.maximum(share, max(common, 1e-12)), 0.0), axis=1)
 
 
 def route_folds(route: Int[np.ndarray, " row"], count: int, seed: int) -> Iterator[np.ndarray]:
@@ -172,9 +186,9 @@ def search_classifier(
     **Arguments:** `gear`, what is told, 1 and up; `by`: what rows are balanced by where that is another thing (the
     gear, where its distance from another is told).
 
-    Rows are weighted by the frequency of their gear to the power −`balance`, which is searched too (0: none, 1:
-    balanced). The score is the mean of accuracy and balanced accuracy. Of more than `search_rows` rows the search sees
-    whole routes, as many as make up so many.
+    The score is the mean of the accuracy of the likeliest gear and the balanced accuracy of what `alike` tells, at the
+    best of a few values of its `common`. Of more than `search_rows` rows the search sees whole routes, as many as make
+    up so many.
 
     **Raises:** `InputError` for an unknown kind, and where a gear below the highest is missing from the rows.
     """
@@ -190,30 +204,38 @@ def search_classifier(
         )
     by = gear if by is None else by
     share = np.bincount(by) / len(by)
+    # how common what each class stands for is, by row
+    stands = np.clip((by - gear)[:, None] + every, 0, len(share))
+    shares = np.append(share, 0.0)[stands]
 
     def fitted(trial: Any, rows: np.ndarray) -> Any:
-        weight = share[by[rows]] ** -trial.suggest_float("balance", 0.0, 1.0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return CLASSIFIERS[kind](trial, seed)(x[rows], gear[rows] - 1, weight / weight.mean())
+            return CLASSIFIERS[kind](trial, seed)(x[rows], gear[rows] - 1)
 
-    def made(model: Any, settings: dict[str, Any], score: float) -> Classifier:
-        return Classifier(kind, model, tuple(int(g) for g in every), tuple(features), settings, score)
+    def made(model: Any, settings: dict[str, Any], score: float, common: float) -> Classifier:
+        return Classifier(kind, model, tuple(int(g) for g in every), tuple(features), settings, score, common)
 
     used = _some_routes(route, search_rows, seed)
 
     def objective(trial: Any) -> float:
-        scores = []
+        scores, balanced = [], []
         for left_out in route_folds(route, folds, seed):
             # what few rows have is in all of them that are not left out
             rare = ~np.isin(gear, np.unique(gear[used & ~left_out]))
             rows = (used | rare) & ~left_out
             if len(np.unique(gear[rows])) < len(every):
                 continue  # a fold that holds all rows of a gear says nothing
-            told = 1 + np.argmax(made(fitted(trial, rows), {}, 0.0).probabilities(x[used & left_out]), axis=1)
-            right = told == gear[used & left_out]
-            scores.append(0.5 * np.mean(right) + 0.5 * _balanced(right, by[used & left_out]))
-        return float(np.mean(scores)) if scores else 0.0
+            seen = used & left_out
+            p = made(fitted(trial, rows), {}, 0.0, 0.0).probabilities(x[seen])
+            scores.append(np.mean(1 + np.argmax(p, axis=1) == gear[seen]))
+            told = [1 + alike(p, shares[seen], c) for c in COMMON]
+            balanced.append([_balanced(t == gear[seen], by[seen]) for t in told])
+        if not scores:
+            return 0.0
+        best = int(np.argmax(np.mean(balanced, axis=0)))
+        trial.set_user_attr("common", COMMON[best])
+        return float(0.5 * np.mean(scores) + 0.5 * np.mean(balanced, axis=0)[best])
 
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -228,7 +250,8 @@ def search_classifier(
     finally:
         optuna.logging.set_verbosity(verbosity)
     model = fitted(optuna.trial.FixedTrial(study.best_params), np.ones(len(gear), dtype=bool))
-    return made(model, dict(study.best_params), float(study.best_value))
+    common = study.best_trial.user_attrs["common"]
+    return made(model, {**study.best_params, "common": common}, float(study.best_value), common)
 
 
 def _some_routes(route: np.ndarray, rows: int, seed: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 
 from experiments.paper1_gear_tables import equation_1, macro_f1
 from hdev_jax.errors import InputError
-from hdev_jax.learn.classifiers import balanced_accuracy, route_folds, search_classifier
+from hdev_jax.learn.classifiers import alike, balanced_accuracy, route_folds, search_classifier
 from hdev_jax.learn.gears import (
     EVERY,
     FEATURES,
@@ -192,6 +192,28 @@ def test_accuracies_by_hand():
     gear = np.repeat([1, 2, 3], 10)
     told = np.concatenate([np.repeat(np.arange(1, 4), r) for r in table])
     assert balanced_accuracy(gear, told) == pytest.approx(23 / 30)
+
+
+def test_gears_taken_as_equally_common():
+    p = np.array([[0.7, 0.3, 0.0], [0.95, 0.05, 0.0], [0.6, 0.0, 0.4]])
+    np.testing.assert_array_equal(alike(p, np.array([0.9, 0.1, 0.0]), 0.0), [1, 0, 0])  # the third was never seen
+    np.testing.assert_array_equal(alike(p, np.array([0.9, 0.1, 0.0]), 0.5), [0, 0, 0])
+    by_row = np.array([[0.9, 0.1, 0.1], [0.9, 0.01, 0.1], [0.1, 0.1, 0.9]])
+    np.testing.assert_array_equal(alike(p, by_row, 0.0), [1, 1, 0])
+
+
+def test_gears_taken_as_equally_common_have_the_best_balanced_accuracy():
+    """Where the probabilities are right, no other decision is better but by chance: Bayes' rule."""
+    rng = np.random.default_rng(3)
+    share = np.array([0.9, 0.08, 0.02])
+    gear = rng.choice(3, 40_000, p=share)
+    x = gear + rng.normal(size=len(gear))
+    p = share * np.exp(-0.5 * (x[:, None] - np.arange(3)) ** 2)
+    p /= p.sum(axis=1, keepdims=True)
+    likeliest, best = balanced_accuracy(gear, np.argmax(p, axis=1)), balanced_accuracy(gear, alike(p, share, 0.0))
+    # a row of each gear alone: Φ(½), 2Φ(½) − 1, Φ(½)
+    assert best == pytest.approx((2 * 0.69146 + 0.38292) / 3, abs=0.02)
+    assert best > likeliest + 0.1
 
 
 @pytest.mark.parametrize("kind", ["decision_tree", "catboost", "lightgbm"])
