@@ -10,13 +10,14 @@ accuracy is never above the Bayes bound but by chance: the bound may lie somewha
 import numpy as np
 
 from experiments.paper1_gears import GROUPS, Rows
-from hdev_jax.learn.classifiers import balanced_accuracy
+from hdev_jax.learn.classifiers import balanced_accuracy, scored
 
 __all__ = ["bounds"]
 
 
 def bounds(rows: Rows, seed: int) -> dict[str, float]:
-    """Accuracy and balanced accuracy of that guess, by group and split, and the share of rows in the band."""
+    """Accuracy and balanced accuracy of that guess, by group and split, the share of rows in the band, and how many rows
+    are of gears too rare to be scored."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
     band = rows.lowest < rows.highest
@@ -37,5 +38,6 @@ def bounds(rows: Rows, seed: int) -> dict[str, float]:
             rare = np.where(upper / share[rows.highest] > (1 - upper) / share[rows.lowest], rows.highest, rows.lowest)
             out[f"accuracy_{split}{end}"] = float(np.mean(plain[at] == rows.gear[at]))
             out[f"balanced_{split}{end}"] = balanced_accuracy(rows.gear[at], rare[at])
+            out[f"rare_rows_{split}{end}"] = float(np.sum(~scored(rows.gear[at])))
             out[f"in_band_{split}{end}"] = float(np.mean(band[at]))
     return out

@@ -7,6 +7,7 @@ import numpy as np
 
 from experiments.figures import save_figure, styled
 from experiments.tables import write_tables
+from hdev_jax.learn.classifiers import LEAST_ROWS
 from hdev_jax.rundir import Run
 
 __all__ = ["collect", "equation_1", "macro_f1"]
@@ -86,9 +87,16 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
             "balanced: the same probabilities, told as the likeliest gear where each is as common as any other in "
             "training (weights of classes in the decision, not in the fit); gears rarer than a share that the search "
-            "chooses count as that common",
+            f"chooses count as that common; gears of fewer than {LEAST_ROWS} rows in what is scored are left out, of bounds "
+            f"too ({_rare(bound)})",
         ],
     }  # fmt: skip
+
+
+def _rare(bound: Mapping[str, float]) -> str:
+    """How many rows of each split are of gears too rare to be scored."""
+    counts = {k.replace("_", " "): bound.get(f"rare_rows_{k}") for k in POINTS}
+    return ", ".join(f"{n:.0f} rows of {k}" for k, n in counts.items() if n is not None) or "bounds not run"
 
 
 _ENERGY = (

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 
 from experiments.paper1_gear_tables import equation_1, macro_f1
 from hdev_jax.errors import InputError
-from hdev_jax.learn.classifiers import alike, balanced_accuracy, route_folds, search_classifier
+from hdev_jax.learn.classifiers import alike, balanced_accuracy, route_folds, scored, search_classifier
 from hdev_jax.learn.gears import (
     EVERY,
     FEATURES,
@@ -192,6 +192,13 @@ def test_accuracies_by_hand():
     gear = np.repeat([1, 2, 3], 10)
     told = np.concatenate([np.repeat(np.arange(1, 4), r) for r in table])
     assert balanced_accuracy(gear, told) == pytest.approx(23 / 30)
+
+
+def test_gears_of_a_few_rows_are_not_scored():
+    gear, told = np.repeat([1, 2, 3], [60, 29, 30]), np.repeat([1, 1, 3], [60, 29, 30])
+    assert balanced_accuracy(gear, told) == 1.0
+    np.testing.assert_array_equal(scored(gear), gear != 2)
+    assert balanced_accuracy(gear[50:70], told[50:70]) == 0.5, "no gear has enough rows"
 
 
 def test_gears_taken_as_equally_common():
