@@ -87,8 +87,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
             "balanced: the same probabilities, told as the likeliest gear where each is as common as any other in "
             "training (weights of classes in the decision, not in the fit); gears rarer than a share that the search "
-            f"chooses count as that common; gears of fewer than {LEAST_ROWS} rows in what is scored are left out, of bounds "
-            f"too ({_rare(bound)})",
+            f"chooses count as that common; gears of fewer than {LEAST_ROWS} rows in what is scored are left out, of "
+            f"bounds too ({_rare(bound)})",
         ],
     }  # fmt: skip
 
