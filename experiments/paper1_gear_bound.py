@@ -16,7 +16,7 @@ __all__ = ["bounds"]
 
 
 def bounds(rows: Rows, seed: int) -> dict[str, float]:
-    """By group and split: accuracy and balanced accuracy of that guess, the share of rows in the band, and how many rows
+    """By group and split: both accuracies of that guess, the share of rows in the band, and how many rows
     are of gears too rare to be scored."""
     from sklearn.ensemble import HistGradientBoostingClassifier
 
