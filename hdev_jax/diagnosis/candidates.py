@@ -15,7 +15,7 @@ from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unava
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["FIXED", "Candidate", "Column", "Plan", "Source", "columns", "finer", "plan_of", "realised"]
+__all__ = ["FIXED", "Candidate", "Column", "Plan", "Source", "beyond", "columns", "finer", "plan_of", "realised"]
 
 FIXED = ("shape", "choice")  # what has no column of its own
 TOGETHER = 6  # effects in one program: more of them run slower, fewer take longer to compile
@@ -74,9 +74,8 @@ class Column:
 
 
 def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
-    """Whether a shape acts on these sizes; hvac's two thresholds belong to one size each."""
-    owner = {"heat_c": "below_w_per_k", "cool_c": "above_w_per_k"}.get(shape.name)
-    return owner is None or owner in sizes
+    """Whether a shape acts on these sizes."""
+    return not shape.of or shape.of in sizes
 
 
 Grids = Mapping[str, tuple[float, ...]]
@@ -129,14 +128,19 @@ def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int
             grids[name] = (at,)
             continue
         k = int(np.argmin(np.abs(np.array(grid) - at)))
-        below = grid[k - 1] if k > 0 else at - (grid[k + 1] - at)
-        above = grid[k + 1] if k + 1 < len(grid) else at + (at - grid[k - 1])
+        below = grid[k - 1] if k > 0 else beyond(grid[k + 1], at)
+        above = grid[k + 1] if k + 1 < len(grid) else beyond(grid[k - 1], at)
         near = np.r_[
             np.linspace(at + reach * (below - at), at, points // 2 + 1),
             np.linspace(at, at + reach * (above - at), points // 2 + 1),
         ]
         grids[name] = tuple(float(x) for x in np.unique(np.clip(near, p.lower, p.upper)))
     return grids
+
+
+def beyond(from_: float, at: float) -> float:
+    """One more step in the same direction; by ratio where both are positive, since a time constant stays so."""
+    return at * at / from_ if min(from_, at) > 0 else 2.0 * at - from_
 
 
 def _row_level(effect: Effect) -> bool:

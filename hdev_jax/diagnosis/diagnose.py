@@ -14,7 +14,7 @@ from hdev_jax.diagnosis.rest import told_apart
 from hdev_jax.diagnosis.select import search
 from hdev_jax.diagnosis.shapes import left_open
 from hdev_jax.diagnosis.split import Split
-from hdev_jax.diagnosis.summary import summarise
+from hdev_jax.diagnosis.summary import parameters_of, summarise
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, cluster_rows, padded
 from hdev_jax.physics import Effect, Vehicle, most_group
@@ -86,9 +86,9 @@ def diagnose(
         tell("what to measure next: drives that would tell the rest apart")
         drives = checkpoint("next", lambda: [asdict(a) for a in advise(problem, state, rows, rivals)])
         summary["next_drives"] = drives
-    found = {
-        e["id"]: {k: (p["value"], p["sd"], p["unit"]) for k, p in e["parameters"].items()} for e in summary["effects"]
-    }
+    # a sheet's numbers belong together: sizes as they are known at the shapes that it holds
+    sheet = {f.id: parameters_of(f, steps[-1], {}, summary["clusters"]["count"]) for f in state.found}
+    found = {k: {n: (p["value"], p["sd"], p["unit"]) for n, p in v.items()} for k, v in sheet.items()}
     return Diagnosis(
         problem, split, summary, base.vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
     )

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
@@ -292,6 +292,24 @@ class Evidence:
             other = small.flipped(candidate, sign)
             out[i] = other.plain_score(candidate).gain if s.plain else other.gain(other.totals(), candidate.columns)[0]
         return out
+
+    def moved(self, step: Float[np.ndarray, " base"]) -> "Evidence":
+        """The evidence from where the base columns' coefficients are after this step, by their columns as they are."""
+        to = np.r_[step, np.zeros(self.grams.shape[-1] - self.base)]
+        grams, levels = self.grams.copy(), self.levels.copy()
+        grams[:, :, -1] -= self.grams @ to
+        grams[:, -1, :] = grams[:, :, -1]
+        grams[:, -1, -1] = self.grams[:, -1, -1] - 2.0 * (self.grams @ to)[:, -1] + to @ (self.grams @ to).T
+        levels[:, -1] -= self.levels @ to
+        return replace(self, grams=grams, levels=levels, pull=self.pull + self.precision * step)
+
+    def holding(self, held: Bool[np.ndarray, " base"]) -> "Evidence":
+        """The same evidence with some of the base columns' coefficients held where they are."""
+        kept = np.r_[~held, np.ones(self.grams.shape[-1] - self.base, dtype=bool)]
+        return replace(
+            self, grams=self.grams[:, kept][:, :, kept], levels=self.levels[:, kept], base=int(np.sum(~held)),
+            precision=self.precision[~held], pull=self.pull[~held],
+        )  # fmt: skip
 
     def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:
         """Evidence of one candidate alone, and the candidate with its columns' places in it."""

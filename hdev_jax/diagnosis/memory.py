@@ -35,7 +35,10 @@ def to_plain(state: Search) -> dict[str, Any]:
 
 def from_plain(plain: Mapping[str, Any], declared: Vehicle, library: Mapping[str, type[Effect]], gears: int) -> Search:
     """The state again, its vehicle being the declared one with the effects found so far."""
-    table = ParameterTable(tuple(Coefficient(**row) for row in plain["table"]))
+    told = [None if row["told"] is None else tuple(map(float, row["told"])) for row in plain["table"]]
+    table = ParameterTable(
+        tuple(Coefficient(**{**row, "told": t}) for row, t in zip(plain["table"], told, strict=True))
+    )
     found = [_score(f, library) for f in plain["found"]]
     vehicle = declared.plus(*[realised(f.score.candidate, f.score.beta, gears=gears) for f in found])
     fit = dict(plain["fit"])

@@ -45,7 +45,8 @@ def best_of(
     tried: dict[str, int] = {}
     ranked: dict[str, list[tuple[float, Candidate]]] = {}
     for c in candidates:
-        if min(totals[0, evidence.base + k, evidence.base + k] for k in c.columns) <= 1e-20:
+        squares = totals[0, evidence.base + np.asarray(c.columns), evidence.base + np.asarray(c.columns)]
+        if not np.all(np.isfinite(squares) & (squares > 1e-20)):
             continue
         gain, _ = evidence.gain(totals, c.columns, before)
         tried[c.id] = tried.get(c.id, 0) + 1

@@ -1,6 +1,6 @@
 """Joint refits: the vehicle with a candidate, every free coefficient fitted anew, and whether it stands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Set
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_co
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
-__all__ = ["as_known", "grow", "is_size", "joined", "refit", "sharpened", "without"]
+__all__ = ["as_known", "grow", "is_size", "joined", "refit", "refitted", "sharpened", "without"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
 AGREES = 0.9878  # of Student's distribution between what plain rows say of a size and what whitened ones do: 2.25 sd
@@ -75,11 +75,11 @@ def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
     table = told = None
     for shapes in (True, False)[: 2 if noise is not None else 1]:
         rows = _coefficients(c, effect, shapes=shapes)
-        if noise is not None:
-            rows = tuple(replace(r, borrowed=r.free) for r in rows)
         table = state.table.plus(*rows)
-        if any(r.borrowed for r in table.free):
-            told = _borrowed(problem, replace(state, vehicle=vehicle, table=table), noise or problem.noise(state.fit))
+        lent = {r.name for r in table.free if r.told or (noise is not None and r in rows)}
+        if lent:
+            now = replace(state, vehicle=vehicle, table=table)
+            told = _borrowed(problem, now, noise or problem.noise(state.fit), lent)
         if told is not None or not any(r.free and _is_shape(c, r) for r in rows):
             break
     if told is None and noise is not None:
@@ -101,7 +101,7 @@ def as_known(problem: Loop, state: Search) -> Calibration:
 
     **Returns:** the state's fit itself where whitened rows know no declared coefficient better, know one worse,
     contradict equal weights, or where trips alone tell an effect, which they drown. All coefficients of the other are
-    borrowed.
+    told.
     """
     fit, found = state.fit, [f.score for f in state.found]
     declared = np.array([not c.path.startswith("effects.") for c in fit.table.free], dtype=bool)
@@ -115,7 +115,7 @@ def as_known(problem: Loop, state: Search) -> Calibration:
     if not (np.all(agree) and np.min(gained) >= 1.0 and np.max(gained) >= KNOWN):
         return fit
     predicted = np.asarray(predict(settled.vehicle, problem.rows.segments, problem.target))[: problem.rows.rows]
-    table = _lent(fit.table, settled.values, error, every=True)
+    table = _lent(fit.table, settled.values, error, {c.name for c in fit.table.free})
     known = replace(
         settled, table=table, sd=error, covariance=covariance, predicted=predicted,
         sigma=float(np.sqrt(np.mean((problem.measured - predicted) ** 2))),
@@ -124,24 +124,36 @@ def as_known(problem: Loop, state: Search) -> Calibration:
 
 
 def _lent(
-    table: ParameterTable, values: Float[np.ndarray, " free"], error: Float[np.ndarray, " free"], *, every: bool
+    table: ParameterTable, values: Float[np.ndarray, " free"], error: Float[np.ndarray, " free"], names: Set[str]
 ) -> ParameterTable:
-    """The table with these values and standard errors of what it borrows; of every free coefficient, borrowed now."""
-    told = {(c.path, c.group): {"value": float(x), "sd": float(e), "borrowed": True}
-            for c, x, e in zip(table.free, values, error, strict=True) if every or c.borrowed}  # fmt: skip
-    return ParameterTable(tuple(replace(c, **told.get((c.path, c.group), {})) for c in table.rows))
+    """The table with these values and standard errors told of its free coefficients of these names, of no others."""
+    told = {c.name: (float(x), float(e)) for c, x, e in zip(table.free, values, error, strict=True) if c.name in names}
+    return ParameterTable(tuple(replace(c, told=told.get(c.name)) for c in table.rows))
 
 
 def without(problem: Loop, state: Search, effect_id: str) -> Search:
     """The state with one effect taken out again and the rest refitted."""
     table, vehicle = state.table.minus(effect_id), state.fit.vehicle.minus(effect_id)
-    fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
+    fit = refitted(problem, replace(state, vehicle=vehicle, table=table))
     found = [f for f in state.found if f.id != effect_id]
-    return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found)
+    return replace(state, vehicle=fit.vehicle, table=fit.table, fit=fit, found=found)
 
 
-def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | None:
-    """The state's table with what whitened rows say of its borrowed coefficients, all others fitted beside them.
+def refitted(problem: Loop, state: Search) -> Calibration:
+    """A fit of the state's vehicle by its table, where what was borrowed beside other effects is borrowed anew.
+
+    A borrowed value is tight; that of a model with an effect more or less would hold its own where it no longer is.
+    Without one where whitened rows do not settle it.
+    """
+    table = state.table
+    if lent := {c.name for c in table.free if c.told}:
+        told = _borrowed(problem, state, problem.noise(state.fit), lent)
+        table = told or ParameterTable(tuple(replace(c, told=None) for c in table.rows))
+    return calibrate(state.vehicle, table, problem.rows, problem.target, problem.clusters)
+
+
+def _borrowed(problem: Loop, state: Search, noise: Noise, names: Set[str]) -> ParameterTable | None:
+    """The state's table with what whitened rows say of these coefficients, all others fitted beside them.
 
     One linear step is not enough: the coefficients that it starts from may have been fitted without the effect. None
     where the steps do not settle.
@@ -152,9 +164,9 @@ def _borrowed(problem: Loop, state: Search, noise: Noise) -> ParameterTable | No
     )
     fit, covariance = settle(problem.ground(start, noise))
     error = np.sqrt(np.diag(covariance))
-    if not all(np.isfinite(e) for c, e in zip(state.table.free, error, strict=True) if c.borrowed):
+    if not all(np.isfinite(e) for c, e in zip(state.table.free, error, strict=True) if c.name in names):
         return None
-    return _lent(state.table, fit.values, error, every=False)
+    return _lent(state.table, fit.values, error, names)
 
 
 def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) -> tuple[Coefficient, ...]:
@@ -278,7 +290,7 @@ def grow(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search | 
             if _left(problem, vehicle, table, paths) < ABSORBED:
                 continue
             tell(f"refitting {f.id} with {', '.join(new)}")
-            fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
+            fit = refitted(problem, replace(state, vehicle=vehicle, table=table))
             at = [k for k, r in enumerate(fit.table.free) if r.path in paths]
             p = 2 * stats.t.sf(np.abs(fit.values[at] / fit.sd[at]), max(problem.clusters.count - 1, 1))
             if fit.converged and _in_range(fit, wider) and np.all(p < GROWN):
@@ -288,7 +300,7 @@ def grow(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search | 
                 found = [replace(g, score=score) if g is f else g for g in state.found]
                 # fits on the way here had the effect without the new size: they are run again where they are asked for
                 trail = {k: v for k, v in state.trail.items() if f.id not in k.split(",")}
-                return replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=found, trail=trail)
+                return replace(state, vehicle=fit.vehicle, table=fit.table, fit=fit, found=found, trail=trail)
     return None
 
 

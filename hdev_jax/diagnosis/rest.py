@@ -15,7 +15,7 @@ import numpy as np
 from hdev_jax.diagnosis.expression import Factor, find_expression
 from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.refit import as_known, without
+from hdev_jax.diagnosis.refit import as_known, refitted, without
 from hdev_jax.diagnosis.select import prune
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.standins import beside, stand_ins
@@ -67,7 +67,7 @@ def told_apart(
             break
         tell(f"taking {shadow} out: what is left is larger than what it explains")
         state = _gone(loop, state, shadow)
-    if state.found and not left.significant:
+    if state.found and not left.rms:  # of training rows alone: what test rows say of the rest is no choice
         known = as_known(loop, state)
         steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
         test = problem.rows(split.test)
@@ -159,7 +159,7 @@ def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:
         if values is not None:  # fitted when it was found
             fits.append(replace(fits[0], vehicle=table.insert(vehicle, jnp.asarray(values)), table=table))
         else:
-            fits.append(calibrate(vehicle, table, rows, problem.target, clusters))
+            fits.append(refitted(loop, replace(state, vehicle=vehicle, table=table)))
     return [*fits, state.fit] if state.found else fits
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from hdev_jax.diagnosis.evidence import Evidence
 from hdev_jax.diagnosis.sums import Ground, distance_from_table, evidence_of
 from hdev_jax.inference import Calibration
 
@@ -16,7 +17,8 @@ EDGE = 1e-3  # of a support that is bounded on both sides
 
 
 def settle(ground: Ground) -> tuple[Calibration, Float[np.ndarray, "free free"]]:
-    """Gauss-Newton on whitened rows from the ground's fit, every free coefficient moving.
+    """Gauss-Newton on whitened rows from the ground's fit, every free coefficient moving. One that would leave its
+    support stays at its bound, and the others go where they are best beside it.
 
     Rows of equal weight leave a size uncertain where errors are slow; what they miss of it would look like another
     effect to whitened rows, which see it far better.
@@ -38,14 +40,35 @@ def settle(ground: Ground) -> tuple[Calibration, Float[np.ndarray, "free free"]]
             first = misfit
         if not (np.isfinite(misfit) and misfit <= first + 1e-6 * abs(first)):
             return failed
-        step, covariance = evidence.step()
+        step, covariance = _step(evidence, here)
         if not np.all(np.isfinite(step)):
             return failed
-        there = _at(here, here.values + step)  # a coefficient at its bound stays there, and the others go on
+        there = _at(here, here.values + step)
         if np.max(np.abs(there.values - here.values) / np.maximum(np.sqrt(np.diag(covariance)), 1e-300)) < SETTLED:
             return here, covariance
         here = there
     return failed
+
+
+def _step(evidence: Evidence, here: Calibration) -> tuple[np.ndarray, np.ndarray]:
+    """The step of all coefficients, and their covariance. What leads out of the support is held at its bound, with the
+    variance that it has by itself."""
+    step, covariance = evidence.step()
+    held = np.zeros(len(step), dtype=bool)
+    for _ in range(len(step)):
+        inside = _at(here, here.values + step).values
+        out = ~held & (np.abs(inside - (here.values + step)) > 1e-9 * np.sqrt(np.diag(covariance)))
+        if not np.any(out) or not np.all(np.isfinite(step)):
+            break
+        held |= out
+        step[held] = (inside - here.values)[held]
+        if np.all(held):
+            break
+        rest = ~held
+        moved = evidence.moved(step * held).holding(held)
+        step[rest], covariance[np.ix_(rest, rest)] = moved.step()
+        covariance[np.ix_(rest, held)] = covariance[np.ix_(held, rest)] = 0.0
+    return step, covariance
 
 
 def _at(fit: Calibration, values: Float[np.ndarray, " free"]) -> Calibration:

@@ -4,13 +4,17 @@ A fit knows a size at the shapes where it stands, or at best near them. A log of
 well, a limit of heating anywhere between two trips' temperatures, with quite another size at each.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
+from scipy import stats
 
-from hdev_jax.diagnosis.candidates import Candidate, plan_of
+from hdev_jax.diagnosis.candidates import Candidate, beyond, plan_of
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import Loop, Search
+from hdev_jax.diagnosis.ranking import plausible
 from hdev_jax.diagnosis.sums import both_looks
 from hdev_jax.inference import Calibration
 
@@ -23,50 +27,87 @@ NEGLIGIBLE = 1e-3  # likelihood over the best one's
 
 @dataclass(frozen=True)
 class Open:
-    """Of one parameter: `spread` over the shapes that the log allows, and for a size its standard error (`inside`) at
-    the shapes that were found. In the parameter's unit."""
+    """Of one parameter: how far `away` it would be at each set of shapes that the log allows, how likely these are
+    (`share`), and for a size its standard error (`inside`) at the shapes that were found. In the parameter's unit."""
 
-    spread: float
+    away: Float[np.ndarray, " set"]
+    share: Float[np.ndarray, " set"]
     inside: float = 0.0
 
-    def error(self, fitted: float | None) -> float:
-        """The standard error in all: of a size that was fitted at these shapes, or of one with them (None: held)."""
-        return float(np.hypot(self.inside if fitted is None else fitted, self.spread))
+    def error(self, inside: float | None = None) -> float:
+        """The root mean square of what it may be off by, `inside` in place of its own where that is given."""
+        inside = self.inside if inside is None else inside
+        return float(np.hypot(inside, np.sqrt(np.sum(self.share * self.away**2))))
+
+    def interval(self, level: float, freedom: int, inside: float | None = None) -> tuple[float, float]:
+        """How far below and above the central interval reaches: of Student's t at each set of shapes, mixed."""
+        inside = self.inside if inside is None else inside
+        wide = max(inside, 1e-6 * float(np.ptp(self.away)), 1e-300)
+
+        def at(share: float) -> float:
+            each = self.away + wide * float(stats.t.ppf(share, freedom))  # the mixture's lies between these
+            low, high = float(each.min()), float(each.max())
+
+            def beyond_it(x: float) -> float:
+                return float(np.sum(self.share * stats.t.cdf((x - self.away) / wide, freedom))) - share
+
+            return _passes(beyond_it, low, high)
+
+        return at(0.5 - 0.5 * level), at(0.5 + 0.5 * level)
+
+
+def _passes(rises: Callable[[float], float], low: float, high: float) -> float:
+    """Where a function that rises from at most 0 at `low` to at least 0 at `high` passes 0."""
+    for _ in range(60):
+        mid = 0.5 * (low + high)
+        low, high = (mid, high) if rises(mid) < 0 else (low, mid)
+    return 0.5 * (low + high)
 
 
 def left_open(problem: Loop, state: Search, s: Score) -> dict[str, Open]:
-    """Sizes and shapes of a found effect over a grid of its shapes, each as likely as the rows say.
+    """Sizes and shapes of a found effect over a grid of its shapes, as likely as rows and usual values make them.
 
     All other coefficients are fitted at every point. Rows and noise are those that found it: whitened ones, or trips
     alone. Empty for effects without such shapes, for switches, and for what is sought elsewhere than on a grid.
 
     **Returns:** what is open, by parameter.
     """
-    c = s.candidate
-    names = shapes_of(c)
+    c, names = s.candidate, shapes_of(s.candidate)
     if not names:
         return {}
     facts = problem.facts
     effect = state.fit.vehicle.effect(c.id)
     here = {n: float(np.asarray(getattr(effect, n))) for n in names}
     grids = {n: _wide(c, n, here[n], facts.row_s) for n in names}
-    grids |= {n: (v,) for n, v in c.shapes if n not in names}
-    plan = plan_of(state.fit.vehicle.minus(c.id), [c.effect], facts, problem.target, grids)
+    cells = {n: dict(zip(g, np.gradient(g) if len(g) > 1 else [1.0], strict=True)) for n, g in grids.items()}
+    plan = plan_of(state.fit.vehicle.minus(c.id), [c.effect], facts, problem.target,
+                   grids | {n: (v,) for n, v in c.shapes if n not in names})  # fmt: skip
     same = [k for k in plan.candidates if (k.sizes, k.groups) == (c.sizes, c.groups)]
-    white, plain, _ = both_looks(problem.ground(_without(state.fit, c.id), problem.noise(state.fit)), plan)
+    ground = problem.ground(_without(state.fit, c.id), problem.noise(state.fit))
+    with_it = float(np.mean((problem.measured - state.fit.predicted) ** 2))
+    white, plain, _ = both_looks(ground, plan, variance=with_it)
     evidence = plain if s.plain else white
     totals = evidence.totals()
-    gains = np.array([evidence.gain(totals, k.columns)[0] for k in same])
-    weight = np.exp(gains - np.max(gains))
-    at = next(i for i, k in enumerate(same) if all(dict(k.shapes)[n] == here[n] for n in names))
-    kept = np.flatnonzero(weight > NEGLIGIBLE)
-    sizes = np.array([evidence.estimate(same[i])[0] for i in kept])
-    found, error = evidence.estimate(same[at])
-    shapes = np.array([[dict(same[i].shapes)[n] for n in names] for i in kept])
-    away = np.concatenate([sizes - found, shapes - np.array([here[n] for n in names])], axis=1)
-    spread = np.sqrt(np.average(away**2, axis=0, weights=weight[kept]))
-    inside = [*error, *(0.0 for _ in names)]
-    return {n: Open(float(x), float(e)) for n, x, e in zip((*c.sizes, *names), spread, inside, strict=True)}
+    points = []
+    for k in same:
+        gain, beta = evidence.gain(totals, k.columns)
+        shapes = np.array([dict(k.shapes)[n] for n in names])
+        stands = all(x == here[n] for n, x in zip(names, shapes, strict=True))
+        if stands:
+            found, inside = beta, evidence.estimate(k)[1]
+        if np.isfinite(gain) and np.all(np.isfinite(beta)) and plausible(replace(s, candidate=k, beta=beta)):
+            usual = [(x - c.parameter(n).null) / c.parameter(n).scale for n, x in zip(names, shapes, strict=True)]
+            cell = [np.log(cells[n][x]) for n, x in zip(names, shapes, strict=True)]
+            points.append((gain - 0.5 * float(np.sum(np.square(usual))) + float(np.sum(cell)), beta, shapes))
+    if not points or not np.all(np.isfinite([*found, *inside])):
+        return {}
+    likely = np.array([p[0] for p in points])
+    share = np.exp(likely - likely.max())
+    kept = share > NEGLIGIBLE
+    share = share[kept] / share[kept].sum()
+    away = np.array([[*(p[1] - found), *(p[2] - [here[n] for n in names])] for p in points])[kept]
+    inside = [*inside, *(0.0 for _ in names)]
+    return {n: Open(away[:, k], share, float(inside[k])) for k, n in enumerate((*c.sizes, *names))}
 
 
 def shapes_of(c: Candidate) -> list[str]:
@@ -82,11 +123,10 @@ def _wide(c: Candidate, name: str, here: float, row_s: float) -> tuple[float, ..
     grid = np.array(p.grid) * (row_s if p.in_rows else 1.0)
     if len(grid) < 2:
         return (here,)
-    steps = np.interp(np.arange(0, len(grid) - 1 + 1e-9, 1 / BETWEEN), np.arange(len(grid)), grid)
-    below = steps[0] - (steps[1] - steps[0]) * np.arange(1, BEYOND + 1)
-    above = steps[-1] + (steps[-1] - steps[-2]) * np.arange(1, BEYOND + 1)
-    every = np.clip(np.concatenate([below, steps, above]), p.lower, p.upper)
-    return tuple(float(x) for x in np.unique([*every, here]))
+    steps = [*np.interp(np.arange(0, len(grid) - 1 + 1e-9, 1 / BETWEEN), np.arange(len(grid)), grid)]
+    for _ in range(BEYOND):
+        steps = [beyond(steps[1], steps[0]), *steps, beyond(steps[-2], steps[-1])]
+    return tuple(float(x) for x in np.unique([*np.clip(steps, p.lower, p.upper), here]))
 
 
 def _without(fit: Calibration, effect_id: str) -> Calibration:

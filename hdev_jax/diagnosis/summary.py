@@ -13,8 +13,9 @@ from hdev_jax.diagnosis.shapes import Open
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder
 from hdev_jax.inference import Calibration, Coefficient, cluster_rows
+from hdev_jax.physics import Parameter
 
-__all__ = ["FAR", "baseline_block", "summarise"]
+__all__ = ["FAR", "baseline_block", "parameters_of", "summarise"]
 
 ODD_SHARE = 0.2
 SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
@@ -42,41 +43,78 @@ def _sized(value: float, error: float, clusters: int) -> dict[str, Any]:
     **Returns:** `value`, the distribution's standard deviation `sd` (wider than the standard error; of three degrees
     of freedom where there are fewer, which have none) and the central `interval_90`.
     """
-    freedom = max(clusters - 1, 1)
-    sd = error * float(np.sqrt(max(freedom, 3) / (max(freedom, 3) - 2)))
-    half = error * float(stats.t.ppf(0.95, freedom))
-    return {"value": value, "sd": sd, "interval_90": [value - half, value + half]}
+    half = error * float(stats.t.ppf(0.95, _freedom(clusters)))
+    return {"value": value, "sd": error * _heavier(clusters), "interval_90": [value - half, value + half]}
+
+
+def _freedom(clusters: int) -> int:
+    return max(clusters - 1, 1)
+
+
+def _heavier(clusters: int) -> float:
+    """Standard deviation of Student's t over its scale."""
+    freedom = max(_freedom(clusters), 3)
+    return float(np.sqrt(freedom / (freedom - 2)))
+
+
+def _opened(told: dict[str, Any], p: Parameter, left: Open, error: float | None, clusters: int) -> dict[str, Any]:
+    """What is known of a parameter with what its effect's shapes leave open of it, inside its plausible range.
+
+    `error`: its standard error where the shapes are held; None where it was fitted with them or is one of them, and
+    what was `told` of it is widened where that is too narrow.
+    """
+    low, high = (told["value"] + x for x in left.interval(0.9, _freedom(clusters), error))
+    inner = told.get("interval_90", [told["value"]] * 2) if error is None else [low, high]
+    sd = max(told["sd"], left.error(error) * _heavier(clusters))
+    within = np.clip([min(low, inner[0]), max(high, inner[1])], p.lower, p.upper).tolist()
+    return {
+        "value": told["value"],
+        "sd": sd,
+        "interval_90": [min(within[0], told["value"]), max(within[1], told["value"])],
+    }
 
 
 def _error(row: Coefficient, error: float) -> float:
     """A standard error; of what was borrowed no smaller than where it comes from, since both are the same rows."""
-    return max(error, row.sd) if row.borrowed and row.sd is not None else error
+    return max(error, row.told[1]) if row.told else error
+
+
+def parameters_of(f: Found, fit: Calibration, left: Mapping[str, Open], clusters: int) -> dict[str, dict[str, Any]]:
+    """A found effect's parameters, each with value, sd, unit and, unless it is a choice, its 90 % interval.
+
+    What was held has an sd of 0 by the fit alone, `left` empty: the sheet's numbers, which belong together. With what
+    its shapes leave open every number stands for itself.
+    """
+    c = f.score.candidate
+    prefix = f"effects.{f.id}."
+    rows = [r for r in zip(fit.table.free, fit.values, fit.sd, strict=True) if r[0].path.startswith(prefix)]
+    fitted = {row.path.removeprefix(prefix) for row, _, _ in rows}
+    held = fitted <= set(c.sizes)
+    parameters: dict[str, dict[str, Any]] = {}
+    for row, value, sd in rows:
+        name, error = row.name.removeprefix(prefix), _error(row, float(sd))
+        told = _sized(float(value), error, clusters)
+        if name in left:
+            told = _opened(told, c.parameter(name), left[name], error if held else None, clusters)
+        parameters[name] = {**told, "unit": row.unit}
+    for name, value in c.shapes:
+        p = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
+        if p:
+            told = {"value": value, "sd": 0.0}
+            told = _opened(told, p, left[name], None, clusters) if name in left else told
+            parameters[name] = {**told, "unit": p.unit}
+    return parameters
 
 
 def _effect_block(
     f: Found, fit: Calibration, left: Mapping[str, Open], before: float, after: float, clusters: int
 ) -> dict[str, Any]:
     c = f.score.candidate
-    prefix = f"effects.{f.id}."
-    rows = [r for r in zip(fit.table.free, fit.values, fit.sd, strict=True) if r[0].path.startswith(prefix)]
-    fitted = {row.path.removeprefix(prefix) for row, _, _ in rows}
-    parameters = {}
-    for row, value, sd in rows:
-        name, error = row.name.removeprefix(prefix), _error(row, float(sd))
-        if name in left:  # fitted at shapes that are held, or with them
-            held = fitted <= set(c.sizes)
-            error = left[name].error(error) if held else max(error, left[name].error(None))
-        parameters[name] = {**_sized(float(value), error, clusters), "unit": row.unit}
-    for name, value in c.shapes:
-        parameter = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
-        if parameter:
-            told = _sized(value, left[name].error(None), clusters) if name in left else {"value": value, "sd": 0.0}
-            parameters[name] = {**told, "unit": parameter.unit}
     return {
         "id": f.id,
         "stage": c.effect.stage,
         "verdict": "one_of_class" if f.twins else "found",
-        "parameters": parameters,
+        "parameters": parameters_of(f, fit, left, clusters),
         "equation": c.effect.equation,
         "separated_by": c.effect.separated_by,
         "q_value": f.q_value,

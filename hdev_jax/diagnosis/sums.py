@@ -111,10 +111,10 @@ class Sums:
 def distance_from_table(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
     """How far the fitted coefficients are from their tables, and the tables' standard deviations.
 
-    What was borrowed from the log itself is no table's: it is as open as a coefficient without one.
+    What was borrowed from the log itself is no table's.
     """
     prior = np.array([c.value for c in fit.table.free])
-    sd = np.array([WEAK * c.scale if c.sd is None or c.borrowed else c.sd for c in fit.table.free])
+    sd = np.array([WEAK * c.scale if c.sd is None else c.sd for c in fit.table.free])
     return fit.values - prior, sd
 
 
@@ -135,8 +135,11 @@ def evidence_of(ground: Ground, width: int = 0, write: Write = lambda out, chunk
     return sums.evidence(len(sd), moved=moved, prior_sd=sd, level_sd=ground.noise.level_sd)
 
 
-def both_looks(ground: Ground, source: Source) -> tuple[Evidence, Evidence, Bool[np.ndarray, " column"]]:
-    """Evidence from whitened rows, and from rows as they are, each worth 1/inflation of its own variance.
+def both_looks(
+    ground: Ground, source: Source, variance: float | None = None
+) -> tuple[Evidence, Evidence, Bool[np.ndarray, " column"]]:
+    """Evidence from whitened rows, and from rows as they are, each worth 1/inflation of its own `variance` (of what the
+    ground's fit leaves, if none is given).
 
     Third, which columns hardly change inside a trip: those that only trips can tell.
     """
@@ -155,10 +158,11 @@ def both_looks(ground: Ground, source: Source) -> tuple[Evidence, Evidence, Bool
     total = np.einsum("gii->i", plain.grams)
     # a log that is met exactly has no variance; nothing is worth more than a part in 10¹² of what was predicted
     least = 1e-24 * float(np.mean(np.square(ground.fit.predicted)))
-    variance = max(float(total[-1]) / rows_in_all, least, 1e-300) * ground.fit.inflation
+    own = float(total[-1]) / rows_in_all if variance is None else variance
+    counted = max(own, least, 1e-300) * ground.fit.inflation
     return (
         white.evidence(base, moved=moved, prior_sd=sd, level_sd=ground.noise.level_sd),
-        plain.evidence(base, moved=moved, prior_sd=sd, variance=variance),
+        plain.evidence(base, moved=moved, prior_sd=sd, variance=counted),
         between > 0.5 * total[base:-1],
     )
 

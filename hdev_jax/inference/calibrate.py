@@ -19,6 +19,7 @@ from hdev_jax.segments import Segments
 
 __all__ = [
     "STUDENT_DF", "WEAK", "Calibration", "Fit", "calibrate", "inside", "jacobian", "padded", "padded_rows", "predict",
+    "tabular",
 ]  # fmt: skip
 
 STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
@@ -58,6 +59,14 @@ class Calibration:
         prior = np.array([c.value for c in self.table.free])
         sd = np.array([np.nan if c.sd is None else c.sd for c in self.table.free], dtype=float)
         return (self.values - prior) / sd
+
+
+def tabular(table: ParameterTable) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Values and sds that the free coefficients have before the log (`Coefficient.prior`); without an sd, `WEAK` of
+    their scales."""
+    priors = [(*c.prior, c.scale) for c in table.free]
+    sd = [WEAK * scale if sd is None else sd for _, sd, scale in priors]
+    return np.array([value for value, _, _ in priors], dtype=float), np.array(sd, dtype=float)
 
 
 def padded_rows(n: int) -> int:
@@ -183,8 +192,7 @@ def calibrate(
         return Calibration(vehicle, table, theta, theta, none, predicted, sigma, 1.0, True, "nothing to estimate", 0)
 
     scale = np.array([c.scale for c in free])
-    prior = np.array([c.value for c in free])
-    prior_sd = np.array([c.sd if c.sd is not None else WEAK * c.scale for c in free])
+    prior, prior_sd = tabular(table)
     theta = np.array([inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
     structure = table.structure
 

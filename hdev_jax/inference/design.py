@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hdev_jax.inference.calibrate import STUDENT_DF, WEAK, Calibration, Fit, inside
+from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, inside, tabular
 from hdev_jax.inference.clusters import clustered
 from hdev_jax.inference.linear import LEAST_ROWS, Posterior, Prior, Statistics, posterior, statistics
 from hdev_jax.inference.parameters import ParameterTable, insert, insert_by
@@ -100,13 +100,6 @@ class LinearFit:
             fitted, self.table, self.values, self.sd, self.covariance, predicted, sigma, self.inflation,
             self.converged, message, self.passes,
         )  # fmt: skip
-
-
-def tabular(table: ParameterTable) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Values and sds of the free coefficients as their tables have them; without an sd, `WEAK` of their scales."""
-    free = table.free
-    sd = [c.sd if c.sd is not None else WEAK * c.scale for c in free]
-    return np.array([c.value for c in free], dtype=float), np.array(sd, dtype=float)
 
 
 @eqx.filter_jit

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from hdev_jax.inference.calibrate import Fit
-from hdev_jax.inference.design import GROUP, tabular
+from hdev_jax.inference.calibrate import Fit, tabular
+from hdev_jax.inference.design import GROUP
 from hdev_jax.inference.draws import needs
 from hdev_jax.inference.linear import LEAST_ROWS
 from hdev_jax.inference.parameters import ParameterTable, insert, insert_by

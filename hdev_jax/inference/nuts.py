@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from hdev_jax.inference.calibrate import STUDENT_DF
-from hdev_jax.inference.design import design, tabular
+from hdev_jax.inference.calibrate import STUDENT_DF, tabular
+from hdev_jax.inference.design import design
 from hdev_jax.inference.draws import Draws, needs
 from hdev_jax.inference.linear import Statistics, statistics
 from hdev_jax.inference.models import Model, kernel_model, log_density

@@ -28,8 +28,8 @@ class Coefficient:
 
     `path` as in the sheet (`road.c_rr`, `effects.headwind.scale`); `group` is the place in a coefficient that has one
     value per vehicle or gear, `label` its name. `lower` and `upper` are the support; `scale` conditions the solver.
-    `borrowed`: value and sd are no table's but what whitened rows of the same log say. A calibration on rows of equal
-    weight takes them; evidence from whitened rows must not count them a second time.
+    `told`: value and sd that whitened rows of the same log say. A calibration on rows of equal weight takes them in
+    place of the table's (`prior`); evidence from whitened rows must not count them a second time.
     """
 
     path: str
@@ -42,7 +42,12 @@ class Coefficient:
     free: bool = True
     group: int | None = None
     label: str = ""
-    borrowed: bool = False
+    told: tuple[float, float] | None = None
+
+    @property
+    def prior(self) -> tuple[float, float | None]:
+        """Value and sd that a calibration starts from: what whitened rows told, or the table's."""
+        return self.told or (self.value, self.sd)
 
     @property
     def name(self) -> str:

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, special, stats
 
-from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, jacobian
+from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, jacobian, tabular
 from hdev_jax.inference.clusters import LEAST_RATIO, Clusters, clusters_of
-from hdev_jax.inference.design import tabular
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
@@ -98,7 +97,7 @@ def left_out(
         error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])
     # of one row the coefficients leave next to nothing open beside its noise
     spread = spread_of(error, fit.predicted, weight, clusters, open_sd, np.zeros(n), row_s=row_s, robust=robust)
-    told = all(c.borrowed for c in fit.table.free)  # by whitened rows, whose errors hold what goes together
+    told = all(c.told for c in fit.table.free)  # by whitened rows, whose errors hold what goes together
     if clusters.kind == "block" and not told:  # as the inflation of the fit's covariance, at their full length
         lasting = _times(error / np.sqrt(_square(spread.scale, spread.growth, fit.predicted)), clusters)[0]
         spread = replace(spread, open_times=max(lasting / fit.inflation, 1.0))

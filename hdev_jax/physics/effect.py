@@ -45,6 +45,7 @@ class Parameter:
     least: float = 0.0
     by: Literal["", "gear", "road_surface"] = ""
     smooth: bool = False  # a limit whose difference grows about in proportion: a fraction of a grid step is as good
+    of: str = ""  # a shape's: the only size that it acts on
     in_rows: bool = False  # `grid` and `scale` count rows of the log; multiplied by its median duration
 
 

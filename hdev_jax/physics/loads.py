@@ -62,9 +62,15 @@ class HvacPower(Effect):
     parameters: ClassVar = (
         Parameter("below_w_per_k", "W/K", 0.0, 100.0, 0.0, 5e3, least=1.0),
         Parameter("above_w_per_k", "W/K", 0.0, 100.0, 0.0, 5e3, least=1.0),
-        Parameter("heat_c", "°C", HEATING_BELOW_C, 4.0, -5.0, 26.0, kind="shape", grid=(10.0, 14.0, 18.0, 22.0)),
-        Parameter("cool_c", "°C", COOLING_ABOVE_C, 4.0, 14.0, 34.0, kind="shape", grid=(18.0, 22.0, 26.0)),
-    )
+        Parameter(
+            "heat_c", "°C", HEATING_BELOW_C, 4.0, -5.0, 26.0, kind="shape", grid=(10.0, 14.0, 18.0, 22.0),
+            of="below_w_per_k",
+        ),
+        Parameter(
+            "cool_c", "°C", COOLING_ABOVE_C, 4.0, 14.0, 34.0, kind="shape", grid=(18.0, 22.0, 26.0),
+            of="above_w_per_k",
+        ),
+    )  # fmt: skip
     variants: ClassVar = (("below_w_per_k",), ("above_w_per_k",), ("below_w_per_k", "above_w_per_k"))
     mistaken_for: ClassVar = ("rolling_temperature", "air_density")
     separated_by: ClassVar = "standing still on hot and cold days"

@@ -189,7 +189,7 @@ def state(problem, rows, gathered) -> Search:
 
 
 def test_a_class_is_told_with_its_size_before_it_was_cut(state):
-    block = _effect_block(state.found[0], state.fit, 2.0, 1.0, 8)
+    block = _effect_block(state.found[0], state.fit, {}, 2.0, 1.0, 8)
     assert block["indistinguishable_from"] == ["headwind"]
     assert block["class_size"] == 8
 

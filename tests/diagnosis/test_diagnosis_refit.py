@@ -1,13 +1,16 @@
 """A second size joins an effect that was found with one; and a state that has grown is kept like any other."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.candidates import columns
+from hdev_jax.diagnosis.candidates import Candidate, columns
+from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.refit import grow, refit
+from hdev_jax.diagnosis.refit import grow, joined, refit, without
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
@@ -61,6 +64,35 @@ def test_cooling_joins_the_heating_that_was_found(tmp_path):
     again = from_plain(to_plain(grown), problem.vehicle, LIBRARY, 4)
     np.testing.assert_array_equal(problem.predict(again.fit.vehicle), problem.predict(grown.fit.vehicle))
     np.testing.assert_array_equal(again.table.values(again.fit.vehicle), jnp.asarray(grown.fit.values))
+
+
+def test_what_is_told_beside_an_effect_is_told_anew_without_it(tmp_path):
+    """A size that whitened rows told beside another is not held where it was once the other is gone."""
+    effects = {"grade_bias": {"bias_rad": 0.002}, "mass_scale": {"scale": 0.06}}
+    files = synthetic_log(seed=6, trips=12, rows_per_trip=100, effects=effects, ar_coefficient=0.97).write(tmp_path)
+    problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
+    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
+    loop = looks.Loop(rows, problem.target, clusters, (), 0.05, np.random.default_rng(0), 4)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    declared = looks.Search(problem.vehicle, problem.table, fit)
+    noise = loop.noise(fit)
+
+    def score(id_: str, size: float) -> Score:
+        kind = LIBRARY[id_]
+        sizes = tuple(p.name for p in kind.parameters if p.kind == "size")
+        shapes = tuple((p.name, p.null) for p in kind.parameters if p.kind != "size")
+        candidate = Candidate(kind, sizes, (None,) * len(sizes), shapes, "size", tuple(range(len(sizes))))
+        return Score(candidate, np.full(len(sizes), size), 50.0, 1e-9, 1e-6, 8.0, 0.7)
+
+    alone = joined(loop, declared, score("mass_scale", 0.05), noise)
+    both = joined(loop, alone, score("grade_bias", 0.002), noise)
+    assert all(c.told for c in both.table.free if c.path.startswith("effects."))
+    assert not any(c.told for c in both.table.free if not c.path.startswith("effects."))
+    back = without(loop, replace(both, found=[]), "grade_bias")
+    np.testing.assert_allclose(back.fit.values, alone.fit.values, rtol=0.02)
+    moved = both.fit.values[[c.path.startswith("effects.mass") for c in both.table.free]]
+    own = alone.fit.values[[c.path.startswith("effects.mass") for c in alone.table.free]]
+    assert abs(moved - own) > 0.05 * abs(own), "the two do not meet: nothing would show"
 
 
 def test_nothing_joins_where_nothing_is(tmp_path):

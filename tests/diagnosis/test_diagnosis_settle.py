@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
 from hdev_jax.diagnosis import look as looks
 from hdev_jax.diagnosis.look import Verdict
@@ -14,10 +15,10 @@ from hdev_jax.diagnosis.refit import _contradicted, as_known
 from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.significance import clusters_needed, clusters_to_tell, effective_number, ruled_out
 from hdev_jax.diagnosis.summary import _not_decidable, _sized
-from hdev_jax.diagnosis.sums import Sums, evidence_of
+from hdev_jax.diagnosis.sums import Sums, distance_from_table, evidence_of
 from hdev_jax.diagnosis.unexplained import Remainder
 from hdev_jax.fleet import synthetic_log
-from hdev_jax.inference import calibrate, cluster_rows, padded
+from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
@@ -60,7 +61,7 @@ def test_the_final_model_takes_what_whitened_rows_know(tmp_path):
     for seed in range(6):
         loop, fit, true = calibrated(tmp_path, seed)
         found = as_known(loop, ended(loop, fit))
-        assert all(c.borrowed for c in found.table.free)
+        assert all(c.told for c in found.table.free)
         assert np.all(found.sd < 0.5 * fit.sd)
         np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), found.sd)
         off = (found.values - true) - 1e-3 * np.clip((found.values - true) / 1e-3, -true, true)  # what truth leaves out
@@ -88,6 +89,54 @@ def test_where_it_settles_no_step_is_left(tmp_path):
     step, _ = evidence_of(loop.ground(settled, noise)).step()
     assert np.all(np.abs(step) < 0.05 * np.sqrt(np.diag(covariance)))
     assert np.all(np.isfinite(settled.predicted))
+
+
+@pytest.mark.parametrize("share", [1.3, 1.6])
+def test_beside_a_coefficient_at_its_bound_the_others_settle(tmp_path, share):
+    """More than all of the rolling resistance taken off the target: c_rr ends at 0, and drag goes where it is best
+    beside that, as a search along it alone finds."""
+    loop, fit, _ = calibrated(tmp_path, 2)
+    rolling = np.asarray(jacobian(fit.vehicle, fit.table, loop.rows.segments, loop.target)[:, 0]) * fit.values[0]
+    rows = eqx.tree_at(lambda r: r.measured, loop.rows, loop.rows.measured - share * rolling)
+    loop = replace(loop, rows=rows)
+    start = calibrate(fit.vehicle, fit.table, rows, loop.target, loop.clusters)
+    ground = loop.ground(start, loop.noise(start))
+    settled, covariance = settle(ground)
+    assert np.all(np.isfinite(covariance))
+    assert abs(settled.values[0]) < 1e-4
+
+    def cost(drag: float) -> float:
+        values = np.array([settled.values[0], drag])
+        here = replace(start, values=values, vehicle=start.table.insert(start.vehicle, jnp.asarray(values)))
+        moved, sd = distance_from_table(here)
+        return evidence_of(replace(ground, fit=here)).misfit() + 0.5 * float(np.sum((moved / sd) ** 2))
+
+    error = float(np.sqrt(covariance[1, 1]))
+    best = optimize.minimize_scalar(cost, bracket=(settled.values[1] - error, settled.values[1] + error)).x
+    assert abs(settled.values[1] - best) < 0.1 * error
+
+
+def test_evidence_from_elsewhere_and_with_some_held():
+    """Against the rows themselves."""
+    rng = np.random.default_rng(0)
+    ids, x, y = np.repeat(np.arange(8), 50), rng.normal(size=(400, 3)), rng.normal(size=400)
+    level, at, sd = rng.normal(size=400), np.array([0.5, -2.0, 0.0]), np.array([1.0, 2.0, 3.0])
+    slices = [slice(50 * k, 50 * k + 50) for k in range(8)]
+
+    def evidence(x, y, moved, sd):
+        sums = Sums(x.shape[1] + 1, 8, 8)
+        sums.add(np.c_[x, y], ids)
+        sums.add_levels(np.c_[x, y], level, ids, slices)
+        return sums.evidence(x.shape[1], moved=moved, prior_sd=sd, level_sd=0.7)
+
+    base = evidence(x, y, np.array([0.1, 0.2, 0.3]), sd)
+    there = evidence(x, y - x @ at, np.array([0.1, 0.2, 0.3]) + at, sd)
+    for name in ("grams", "levels", "pull"):
+        np.testing.assert_allclose(getattr(base.moved(at), name), getattr(there, name), rtol=1e-9, atol=1e-9)
+    held = np.array([False, True, False])
+    fewer = evidence(x[:, ~held], y, np.array([0.1, 0.3]), sd[~held])
+    for got, expected in zip(base.holding(held).step(), fewer.step(), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-9)
 
 
 def test_a_fit_of_nothing_settles_as_it_is(tmp_path):

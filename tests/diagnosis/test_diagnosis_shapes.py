@@ -1,12 +1,24 @@
 """Sizes whose thresholds few trips tell: what is said of them has room for every threshold that the log allows."""
 
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from planted import run
+from scipy import stats
 
-from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.shapes import Open, shapes_of
-from hdev_jax.physics import LIBRARY
+from hdev_jax.diagnosis.candidates import Candidate, finer
+from hdev_jax.diagnosis.diagnose import diagnose
+from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.shapes import Open, _wide, shapes_of
+from hdev_jax.diagnosis.split import split_trips
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY, Effect, Parameter
 
 
 def parameters(result):
@@ -14,9 +26,27 @@ def parameters(result):
 
 
 def test_what_is_open_adds_to_a_size_at_held_shapes_and_stands_by_itself_for_shapes():
-    np.testing.assert_allclose(Open(3.0).error(4.0), 5.0)
-    np.testing.assert_allclose(Open(5.0, 12.0).error(None), 13.0)
-    assert Open(0.0).error(2.0) == 2.0
+    spread = Open(np.array([-3.0, 3.0]), np.array([0.5, 0.5]), 4.0)
+    np.testing.assert_allclose([spread.error(), spread.error(0.0)], [5.0, 3.0])
+    assert Open(np.zeros(1), np.ones(1), 2.0).error() == 2.0
+
+
+def test_an_interval_of_one_set_of_shapes_is_students():
+    low, high = Open(np.zeros(1), np.ones(1), 2.0).interval(0.9, 7)
+    np.testing.assert_allclose([low, high], [2 * stats.t.ppf(0.05, 7), 2 * stats.t.ppf(0.95, 7)], rtol=1e-9)
+
+
+@given(
+    st.lists(st.floats(-50.0, 50.0), min_size=1, max_size=6), st.floats(0.1, 20.0), st.integers(1, 40),
+    st.integers(0, 2**31),
+)  # fmt: skip
+def test_an_interval_of_mixed_shapes_holds_what_draws_of_them_do(away, inside, freedom, seed):
+    rng = np.random.default_rng(seed)
+    share = rng.dirichlet(np.ones(len(away)))
+    low, high = Open(np.array(away), share, inside).interval(0.9, freedom)
+    drawn = rng.choice(away, 20_000, p=share) + inside * rng.standard_t(freedom, 20_000)
+    assert np.mean(drawn < low) == pytest.approx(0.05, abs=0.012)
+    assert np.mean(drawn > high) == pytest.approx(0.05, abs=0.012)
 
 
 def test_a_limit_anywhere_between_two_temperatures_leaves_the_slope_open():
@@ -26,6 +56,10 @@ def test_a_limit_anywhere_between_two_temperatures_leaves_the_slope_open():
     for name in ("below_w_per_k", "heat_c", "cool_c"):
         assert abs(told[name]["value"] - planted[name]) < 2.0 * told[name]["sd"], name
     assert told["heat_c"]["sd"] > 2.0
+    assert told["below_w_per_k"]["interval_90"][0] > 0.0
+    sheet = result.found["hvac_power"]  # numbers that belong together: the limits as they are, slopes beside them
+    assert sheet["heat_c"][1] == sheet["cool_c"][1] == 0.0
+    assert 0.0 < sheet["below_w_per_k"][1] < 0.3 * told["below_w_per_k"]["sd"]
     assert told["below_w_per_k"]["sd"] > 0.2 * told["below_w_per_k"]["value"]
     low, high = told["below_w_per_k"]["interval_90"]
     assert low < planted["below_w_per_k"] < high
@@ -38,6 +72,47 @@ def test_trips_at_all_temperatures_leave_little_open():
     for name in ("below_w_per_k", "above_w_per_k"):
         assert told[name]["sd"] < 0.1 * told[name]["value"]
         assert abs(told[name]["value"] - planted[name]) < 4.0 * told[name]["sd"], name
+
+
+class Unbounded(Effect):
+    """A user's own, without bounds: a time constant below 0 would make a column that no number holds."""
+
+    id: ClassVar = "fading_start"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "P·exp(−t/τ)"
+    parameters: ClassVar = (
+        Parameter("power_w", "W", 0.0, 1e4),
+        Parameter("tau_s", "s", 100.0, 100.0, kind="shape", grid=(20.0, 100.0, 400.0)),
+    )
+    power_w: Any
+    tau_s: Any
+
+    def power(self, row, car, point):
+        """Power [W]."""
+        return self.power_w * jnp.exp(-row.time_s / self.tau_s)
+
+
+def test_a_time_constant_without_bounds_stays_positive():
+    c = Candidate(Unbounded, ("power_w",), (None,), (("tau_s", 20.0),), "size", (0,))
+    for grid in (finer(c, 10.0, reach=1.0)["tau_s"], _wide(c, "tau_s", 25.0, 10.0)):
+        assert min(grid) > 0.0
+        assert min(grid) < 20.0
+    assert max(_wide(c, "tau_s", 25.0, 10.0)) > 400.0
+
+
+@pytest.mark.slow
+def test_a_users_effect_without_bounds_goes_through_the_loop(tmp_path):
+    made = synthetic_log(seed=3, trips=10, rows_per_trip=120, ar_coefficient=0.97)
+    frame = made.frame
+    fading = np.exp(-frame["time_s"] / 100.0) * frame["duration_s"] / 3600.0
+    frame["energy_wh"] += 6e4 * fading
+    files = made.write(tmp_path, truth=False)
+    log = read_log([files["log"]])
+    result = diagnose(prepare(log, read_sheet(files["sheet"])), split_trips(log), {**LIBRARY, Unbounded.id: Unbounded})
+    told = next(e for e in result.summary["effects"] if e["id"] == Unbounded.id)["parameters"]
+    assert abs(told["power_w"]["value"] / 6e4 - 1.0) < 0.15
+    low, high = told["tau_s"]["interval_90"]
+    assert 0.0 < low < 100.0 < high
 
 
 @pytest.mark.parametrize(

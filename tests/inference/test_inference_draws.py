@@ -14,7 +14,7 @@ from experiments import ranks
 from experiments.config import CONFIGS, resolve, typed
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Rows, linear_fit, padded
-from hdev_jax.inference.design import tabular as tabular_of
+from hdev_jax.inference.calibrate import tabular as tabular_of
 from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal
 from hdev_jax.inference.linear import Prior, Statistics, posterior
