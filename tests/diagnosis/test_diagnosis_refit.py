@@ -68,7 +68,7 @@ def test_cooling_joins_the_heating_that_was_found(tmp_path):
 
 def test_what_is_told_beside_an_effect_is_told_anew_without_it(tmp_path):
     """A size that whitened rows told beside another is not held where it was once the other is gone."""
-    effects = {"grade_bias": {"bias_rad": 0.002}, "mass_scale": {"scale": 0.06}}
+    effects = {"rotating_mass": {"factor": 0.08}, "mass_scale": {"scale": 0.06}}
     files = synthetic_log(seed=6, trips=12, rows_per_trip=100, effects=effects, ar_coefficient=0.97).write(tmp_path)
     problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
     rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
@@ -85,14 +85,14 @@ def test_what_is_told_beside_an_effect_is_told_anew_without_it(tmp_path):
         return Score(candidate, np.full(len(sizes), size), 50.0, 1e-9, 1e-6, 8.0, 0.7)
 
     alone = joined(loop, declared, score("mass_scale", 0.05), noise)
-    both = joined(loop, alone, score("grade_bias", 0.002), noise)
+    both = joined(loop, alone, score("rotating_mass", 0.08), noise)
     assert all(c.told for c in both.table.free if c.path.startswith("effects."))
     assert not any(c.told for c in both.table.free if not c.path.startswith("effects."))
-    back = without(loop, replace(both, found=[]), "grade_bias")
-    np.testing.assert_allclose(back.fit.values, alone.fit.values, rtol=0.02)
+    back = without(loop, replace(both, found=[]), "rotating_mass")
+    np.testing.assert_allclose(back.fit.values, alone.fit.values, rtol=0.05)
     moved = both.fit.values[[c.path.startswith("effects.mass") for c in both.table.free]]
     own = alone.fit.values[[c.path.startswith("effects.mass") for c in alone.table.free]]
-    assert abs(moved - own) > 0.05 * abs(own), "the two do not meet: nothing would show"
+    assert abs(moved - own) > 0.2 * abs(own), "the two do not meet: nothing would show"
 
 
 def test_nothing_joins_where_nothing_is(tmp_path):
