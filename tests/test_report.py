@@ -408,6 +408,13 @@ def test_spectrum_adds_up_and_finds_the_cycle():
         (words.plus_minus(-3.02e-6, 1.2e-7, "s²/m²"), "(−3.02 ± 0.12)×10⁻⁶ s²/m²"),
         (words.plus_minus(0.0065, None), "0.006500"),
         (words.plus_minus(None, 1.0), "–"),
+        (words.known({"value": 0.98, "sd": 0.03, "interval_90": [0.93, 1.03], "unit": "1"}), "0.98 ± 0.03"),
+        (words.known({"value": 0.98, "sd": 0.03, "unit": "m"}), "0.98 ± 0.03 m"),
+        (
+            words.known({"value": 150.0, "sd": 140.0, "interval_90": [52.0, 410.0], "unit": "W/K"}),
+            "150 W/K (90 %: 52.0 to 410)",
+        ),
+        (words.known({"value": 0.0, "sd": 0.0, "interval_90": [0.0, 0.0], "unit": "W"}), "0 W"),
         (words.pair(18.93, 7.62), ("18.9", "7.6")),
         (words.pair(0.7712, 0.4041), ("0.77", "0.40")),
         (words.pair(515.2, 190.4), ("515", "190")),

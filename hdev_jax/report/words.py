@@ -13,6 +13,7 @@ __all__ = [
     "answer",
     "answer_parts",
     "count",
+    "known",
     "next_drives",
     "number",
     "pair",
@@ -27,6 +28,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _DASH = "–"
 MOST_SUSPECTS = 3
+LEANING = 1.5  # one side of an interval over the other
 
 
 def _finite(*values: Any) -> bool:
@@ -80,6 +82,17 @@ def plus_minus(value: Any, sd: Any, unit: str | None = "") -> str:
     return _unit(text, unit)
 
 
+def known(p: dict[str, Any]) -> str:
+    """A parameter of diagnosis.json: `0.98 ± 0.03 m`; `150 W/K (90 %: 52 to 410)` where what is known of it leans far
+    to one side, as of a slope whose threshold few trips tell."""
+    value, (low, high) = p.get("value"), p.get("interval_90") or (None, None)
+    if _finite(value, low, high) and high - low > 0:
+        below, above = value - low, high - value
+        if max(below, above) > LEANING * min(below, above):
+            return f"{number(value, 3, p.get('unit'))} (90{NBSP}%: {number(low)} to {number(high)})"
+    return plus_minus(value, p.get("sd"), p.get("unit"))
+
+
 def pair(before: Any, after: Any) -> tuple[str, str]:
     """Two numbers with the same decimals: two digits of the smaller one, more where they would look the same."""
     if not _finite(before, after):
@@ -122,7 +135,7 @@ def count(n: int, word: str) -> str:
 def _sizes(effect: dict[str, Any]) -> str:
     """` (scale 0.98 ± 0.03)`."""
     found = [
-        f"{names.parameter(name)} {plus_minus(p.get('value'), p.get('sd'), p.get('unit'))}"
+        f"{names.parameter(name)} {known(p)}"
         for name, p in effect.get("parameters", {}).items()
         if p.get("sd")  # what was chosen among a few is in the table
     ]
