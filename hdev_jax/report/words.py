@@ -85,7 +85,7 @@ def plus_minus(value: Any, sd: Any, unit: str | None = "") -> str:
 def known(p: dict[str, Any]) -> str:
     """A parameter of diagnosis.json: `0.98 ± 0.03 m`; `150 W/K (90 %: 52 to 410)` where what is known of it leans far
     to one side, as of a slope whose threshold few trips tell."""
-    value, (low, high) = p.get("value"), p.get("interval_90") or (None, None)
+    value, low, high = (float("nan") if x is None else x for x in (p.get("value"), *p.get("interval_90", (None, None))))
     if _finite(value, low, high) and high - low > 0:
         below, above = value - low, high - value
         if max(below, above) > LEANING * min(below, above):
