@@ -4,12 +4,11 @@ A fit knows a size at the shapes where it stands, or at best near them. A log of
 well, a limit of heating anywhere between two trips' temperatures, with quite another size at each.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import optimize, stats
 
 from hdev_jax.diagnosis.candidates import Candidate, beyond, plan_of
 from hdev_jax.diagnosis.evidence import Score
@@ -46,22 +45,13 @@ class Open:
 
         def at(share: float) -> float:
             each = self.away + wide * float(stats.t.ppf(share, freedom))  # the mixture's lies between these
-            low, high = float(each.min()), float(each.max())
 
-            def beyond_it(x: float) -> float:
+            def past(x: float) -> float:
                 return float(np.sum(self.share * stats.t.cdf((x - self.away) / wide, freedom))) - share
 
-            return _passes(beyond_it, low, high)
+            return float(optimize.root_scalar(past, bracket=(each.min() - wide, each.max() + wide)).root)
 
         return at(0.5 - 0.5 * level), at(0.5 + 0.5 * level)
-
-
-def _passes(rises: Callable[[float], float], low: float, high: float) -> float:
-    """Where a function that rises from at most 0 at `low` to at least 0 at `high` passes 0."""
-    for _ in range(60):
-        mid = 0.5 * (low + high)
-        low, high = (mid, high) if rises(mid) < 0 else (low, mid)
-    return 0.5 * (low + high)
 
 
 def left_open(problem: Loop, state: Search, s: Score) -> dict[str, Open]:

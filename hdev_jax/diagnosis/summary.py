@@ -79,10 +79,10 @@ def _error(row: Coefficient, error: float) -> float:
     return max(error, row.told[1]) if row.told else error
 
 
-def parameters_of(f: Found, fit: Calibration, left: Mapping[str, Open], clusters: int) -> dict[str, dict[str, Any]]:
+def parameters_of(f: Found, fit: Calibration, leeway: Mapping[str, Open], clusters: int) -> dict[str, dict[str, Any]]:
     """A found effect's parameters, each with value, sd, unit and, unless it is a choice, its 90 % interval.
 
-    What was held has an sd of 0 by the fit alone, `left` empty: the sheet's numbers, which belong together. With what
+    What was held has an sd of 0 by the fit alone, `leeway` empty: the sheet's numbers, which belong together. With what
     its shapes leave open every number stands for itself.
     """
     c = f.score.candidate
@@ -94,27 +94,27 @@ def parameters_of(f: Found, fit: Calibration, left: Mapping[str, Open], clusters
     for row, value, sd in rows:
         name, error = row.name.removeprefix(prefix), _error(row, float(sd))
         told = _sized(float(value), error, clusters)
-        if name in left:
-            told = _opened(told, c.parameter(name), left[name], error if held else None, clusters)
+        if name in leeway:
+            told = _opened(told, c.parameter(name), leeway[name], error if held else None, clusters)
         parameters[name] = {**told, "unit": row.unit}
     for name, value in c.shapes:
         p = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
         if p:
             told = {"value": value, "sd": 0.0}
-            told = _opened(told, p, left[name], None, clusters) if name in left else told
+            told = _opened(told, p, leeway[name], None, clusters) if name in leeway else told
             parameters[name] = {**told, "unit": p.unit}
     return parameters
 
 
 def _effect_block(
-    f: Found, fit: Calibration, left: Mapping[str, Open], before: float, after: float, clusters: int
+    f: Found, fit: Calibration, leeway: Mapping[str, Open], before: float, after: float, clusters: int
 ) -> dict[str, Any]:
     c = f.score.candidate
     return {
         "id": f.id,
         "stage": c.effect.stage,
         "verdict": "one_of_class" if f.twins else "found",
-        "parameters": parameters_of(f, fit, left, clusters),
+        "parameters": parameters_of(f, fit, leeway, clusters),
         "equation": c.effect.equation,
         "separated_by": c.effect.separated_by,
         "q_value": f.q_value,
@@ -133,9 +133,9 @@ def summarise(
     steps: list[Calibration],
     predicted: list[np.ndarray],
     left: Remainder,
-    open_: Mapping[str, Mapping[str, Open]],
+    leeway: Mapping[str, Mapping[str, Open]],
 ) -> dict[str, Any]:
-    """The contract's diagnosis.json. `open_`: by effect and parameter, what its shapes leave open."""
+    """The contract's diagnosis.json. `leeway`: by effect and parameter, what its shapes leave open."""
     weight, y = problem.weight(), problem.measured
     train, test = problem.rows(split.train), problem.rows(split.test)
 
@@ -150,7 +150,7 @@ def summarise(
     rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
     clusters = cluster_rows(problem.segments.take(train))
     effects = [
-        {**_effect_block(f, steps[-1], open_[f.id], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
+        {**_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
         for k, f in enumerate(state.found)
     ]
     verdict = {
