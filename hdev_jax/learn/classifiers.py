@@ -122,7 +122,7 @@ def _catboost(trial: Any, seed: int) -> Fit:
     from catboost import CatBoostClassifier
 
     model = CatBoostClassifier(
-        iterations=trial.suggest_int("trees", 120, 200),
+        iterations=trial.suggest_int("trees", 300, 400),
         depth=trial.suggest_int("depth", 5, 6),
         learning_rate=trial.suggest_float("learning_rate", 0.15, 0.3),
         l2_leaf_reg=trial.suggest_float("l2_leaf_reg", 1.0, 10.0, log=True),
