@@ -120,6 +120,11 @@ def _as_asked(asked: str, task: dict[str, Any], result: dict[str, Any]) -> bool:
     return not scores.false(planted, result["named"])
 
 
+def _alone(result: dict[str, Any]) -> bool:
+    """Whether each entry is one name."""
+    return all(x["class_size"] == 1 for x in result["named"])
+
+
 def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     """What the table says of one setting."""
     case = config.cases[group[0][0]["case"]]
@@ -128,12 +133,14 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     as_asked = sum(_as_asked(case.asked, t, r) for t, r in group)
     hits = [(t, r) for t, r in group if scores.exact(t["effects"], r["named"])]
     first = sum({x["id"] for x in r["named"]} == set(scores.names(t["effects"])) for t, r in hits)
-    alone = sum(all(x["class_size"] == 1 for x in r["named"]) for _, r in hits)
+    alone = sum(_alone(r) for _, r in hits)
+    apart = [(t, r) for t, r in group if not any(r["alike"].values())]
+    alone_apart = sum(scores.exact(t["effects"], r["named"]) and _alone(r) for t, r in apart) / max(len(apart), 1)
     unexplained = sum(r["unexplained"] for _, r in group)
     enough = [
-        least is None or k / n >= least
-        for least, k in ((case.wanted, as_asked), (case.wanted_alone, alone),
-                         (case.wanted_unexplained, unexplained))
+        least is None or share >= least
+        for least, share in ((case.wanted, as_asked / n), (case.wanted_alone, alone_apart),
+                             (case.wanted_unexplained, unexplained / n))
     ]  # fmt: skip
     pairs = [s for _, r in group for s in r["sizes"]] if case.asked == "named" else []
     z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
@@ -152,7 +159,10 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "named_exactly": len(hits) / n if named else None,
         "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,
+        "separable": len(apart) / n if named else None,  # no other effect could be told from it by any test
+        "no_class_of_separable": alone_apart if named and apart else None,
         "no_class_wanted": case.wanted_alone,
+        "redrawn": sum(r["redrawn"] for _, r in group),
         "something_false": sum(scores.false(t["effects"], r["named"]) for t, r in group) / n,
         "furthest_coefficient_sd": float(np.median(far)) if case.asked == "absorbed" else None,
         "called_not_decidable": sum(bool(r["not_decidable"]) and not r["named"] for _, r in group) / n,

@@ -9,23 +9,18 @@ column here.
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from experiments.oracle import fitted_with
 from hdev_jax.diagnosis.candidates import Candidate, columns
 from hdev_jax.diagnosis.evidence import ABSORBED
-from hdev_jax.diagnosis.look import Search, look
 from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.select import twins_of
 from hdev_jax.diagnosis.split import Split
-from hdev_jax.fleet import SyntheticLog
 from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["comparable", "indistinguishable", "run_rivals"]
+__all__ = ["comparable", "run_rivals"]
 
 
 def _stlsq(x: np.ndarray, y: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -115,23 +110,6 @@ def run_rivals(names: list[str], problem: Problem, split: Split) -> dict[str, di
 def comparable(planted: Sequence[str]) -> bool:
     """Whether rivals could name all of it: what is sought elsewhere than in columns gives them no column."""
     return not any(LIBRARY[k].searched for k in planted if k in LIBRARY)
-
-
-def indistinguishable(
-    planted: Sequence[str], synthetic: SyntheticLog, problem: Problem, split: Split
-) -> dict[str, list[str]]:
-    """For each planted effect of the library, the effects that the columns of this log cannot tell from it.
-
-    By the rule that makes the loop's classes, however large, from where all that is planted beside it is known: a
-    rival that names one of them is as right as a class.
-    """
-    inside = [k for k in planted if k in LIBRARY]
-    out = {}
-    for id_ in inside:
-        fit, loop = fitted_with([k for k in inside if k != id_], synthetic, problem, split)
-        view = look(replace(loop, effects=tuple(LIBRARY.values())), Search(fit.vehicle, fit.table, fit))
-        out[id_] = list(twins_of(view, view.best[id_])) if id_ in view.best else []
-    return out
 
 
 def _best_ways(candidates: Sequence[Candidate], x: np.ndarray, y: np.ndarray) -> dict[str, Candidate]:

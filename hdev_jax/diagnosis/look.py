@@ -54,7 +54,8 @@ class Verdict:
     """A candidate that was not chosen, and why.
 
     `needed`: with how many clusters like these it could be told from chance; `between`: only trips can tell it, and
-    where nothing hints at it `needed` is what would do for half of what they differ by.
+    where nothing hints at it `needed` is what would do for half of what they differ by; `by_rows`: rows alone say it as
+    surely as is asked.
     """
 
     id: str
@@ -63,6 +64,7 @@ class Verdict:
     why_not: str
     needed: int | None = None
     between: bool = False
+    by_rows: bool = False
 
 
 @dataclass
@@ -172,9 +174,9 @@ class View:
             if state.vehicle.has(id_):
                 continue
             why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
-            out.append(
-                Verdict(id_, float(s.gain), float(self.q[id_]), why, self._needed(s, fdr), self.between(s.candidate))
-            )
+            by_rows = s.p_model <= self._level(id_, fdr)
+            needed, between = self._needed(s, fdr), self.between(s.candidate)
+            out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, needed, between, by_rows))
         out += [v for v in self.sought if not state.vehicle.has(v.id)]
         out += [Verdict(id_, None, 1.0, f"not tried: {why}") for id_, why in self.left_out.items()]
         return out
@@ -183,15 +185,20 @@ class View:
         """Whether its columns hardly change inside a trip, so that only trips can tell it."""
         return bool(self.slow[list(candidate.columns)].all())
 
+    def _level(self, id_: str, fdr: float) -> float:
+        """What a p has to be, before it is corrected as q is."""
+        return fdr / (2.0 * len(self.best) * self.ways[id_])
+
     def _needed(self, s: Score, fdr: float) -> int | None:
-        """Clusters that would do for a candidate that looks right but is not told from chance by those there are; or
-        trips, for one that they alone tell, and that may hold half of what they differ by for all that these say."""
+        """Clusters that would do for a candidate that looks right but is not told from chance by those there are, or
+        that the rows of too few of them speak for; or trips, for one that they alone tell, and that may hold half of
+        what they differ by for all that these say."""
         id_, k, count = s.candidate.id, len(s.beta), self.evidence.count
         if self.q[id_] <= fdr or id_ in self.reasons or id_ in self.absorbed_by or not plausible(s):
             return None
-        level = fdr / (2.0 * len(self.best) * self.ways[id_])  # before it is corrected as q is
+        level = self._level(id_, fdr)
         p = max(s.p_model, s.p_cluster)
-        if s.p <= HINT:
+        if s.p <= HINT or s.p_model <= level:
             return clusters_needed(p, k, count, level)
         if self.ground.clusters.kind != "trip" or not self.between(s.candidate) or ruled_out(HELD, p, k, count):
             return None

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.evidence import Evidence, Score
+from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.significance import effective_number
 
 __all__ = ["CLOSE", "LEFT_OUT", "STABLE", "best_of", "plausible", "worth"]
@@ -78,7 +78,11 @@ def _falling(worth: float) -> float:
 
 
 def _clearest(scores: list[Score]) -> Score:
-    """The first that is plausible, or one that explains about as much with fewer doubts: a second size may blur it."""
+    """The first that is plausible, or one that explains about as much with fewer doubts: a second size may blur it.
+
+    A way with a column that the fitted coefficients take up (a gain beside an offset) is one only where all are.
+    """
+    scores = [s for s in scores if s.left > ABSORBED] or scores
     able = [s for s in scores if plausible(s)]
     if not able or able[0].p <= CERTAIN:
         return (able or scores)[0]

@@ -246,15 +246,18 @@ def _idle(candidate: Candidate, path: str) -> bool:
 
 
 def _in_range(fit: Calibration, candidate: Candidate) -> bool:
-    """Whether sizes and limits are plausible, and nothing but a switch's null lies at the edge of its range."""
+    """Whether sizes and limits are plausible, and no limit ends up at an edge of its range.
+
+    An edge that is its null is none: a filter of half a second is a short one, whatever the longest may be.
+    """
     prefix = f"effects.{candidate.id}."
     for c, v in zip(fit.table.free, fit.values, strict=True):
         if c.path.startswith(prefix):
             p = candidate.parameter(c.path.removeprefix(prefix))
             if p.kind in ("size", "limit") and not p.lower <= v <= p.upper:
                 return False
-            width = p.upper - p.lower
-            if p.kind == "limit" and width < 1e9 and min(v - p.lower, p.upper - v) < 0.01 * width and v != p.null:
+            width, edges = p.upper - p.lower, [e for e in (p.lower, p.upper) if e != p.null]
+            if p.kind == "limit" and width < 1e9 and any(abs(v - e) < 0.01 * width for e in edges):
                 return False
     return True
 

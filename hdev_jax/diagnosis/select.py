@@ -9,6 +9,7 @@ from scipy import stats
 from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.forms import another_form
 from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
 from hdev_jax.diagnosis.modes import add_mode
 from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, STABLE, plausible, worth
@@ -130,7 +131,7 @@ def choose(
         fits.sort(key=lambda f: -f[0])
         for _, s, (new, _, started), gain in fits:
             c = s.candidate
-            if why := _placebo(problem, s, view):
+            if why := _placebo(problem, s, view) or another_form(problem, state, s, view):
                 view.reasons[c.id] = why
                 tell(f"turned down {c.id}: {why}")
                 continue

@@ -45,11 +45,14 @@ class Open:
 
         def at(share: float) -> float:
             each = self.away + wide * float(stats.t.ppf(share, freedom))  # the mixture's lies between these
+            beyond_it = wide + 1e-9 * float(np.max(np.abs(each)))  # more than rounding
+            low, high = float(each.min()) - beyond_it, float(each.max()) + beyond_it
 
-            def past(x: float) -> float:
+            def past(way: float) -> float:
+                x = low + way * (high - low)
                 return float(np.sum(self.share * stats.t.cdf((x - self.away) / wide, freedom))) - share
 
-            return float(optimize.root_scalar(past, bracket=(each.min() - wide, each.max() + wide)).root)
+            return low + float(optimize.root_scalar(past, bracket=(0.0, 1.0)).root) * (high - low)
 
         return at(0.5 - 0.5 * level), at(0.5 + 0.5 * level)
 

@@ -262,8 +262,14 @@ def test_between_trips_a_log_knows_no_more_than_it_has_trips():
     hinted = Verdict("hvac_power", 2.0, 1.0, "not significant", needed=40, between=True)
     inside = Verdict("headwind", 2.0, 1.0, "not significant", needed=30)
     strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=50)
+    rows_alone = Verdict("regen_limit", 90.0, 1.0, "too few trips", needed=110, by_rows=True)
     others = [Verdict(f"effect_{k}", 0.1, 1.0, "not significant", needed=45 + k, between=True) for k in range(4)]
-    every = [inside, *others, strong, hinted]
+    every = [inside, *others, rows_alone, strong, hinted]
     said = [(s["id"], s["clusters_needed"]) for s in _not_decidable(every, left)]
-    assert said == [("wet_road", 50), ("hvac_power", 40), *((f"effect_{k}", 45 + k) for k in range(4))]
-    assert [s["id"] for s in _not_decidable(every, replace(left, depends_on=()))] == ["wet_road"]
+    assert said == [
+        ("wet_road", 50),
+        ("regen_limit", 110),
+        ("hvac_power", 40),
+        *((f"effect_{k}", 45 + k) for k in range(4)),
+    ]
+    assert [s["id"] for s in _not_decidable(every, replace(left, depends_on=()))] == ["wet_road", "regen_limit"]

@@ -8,11 +8,11 @@ import pytest
 from experiments import planted_scores as scores
 from experiments import rivals
 from experiments.config import resolve, typed
-from experiments.oracle import noise_rmse, oracle_rmse
+from experiments.oracle import confusable, noise_rmse, oracle_rmse
 from experiments.planted import Config, tasks
 from experiments.planted_rivals import outcome, rival_rows
 from experiments.planted_tables import collect
-from experiments.rivals import comparable, indistinguishable
+from experiments.rivals import comparable
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
@@ -38,7 +38,7 @@ def result(*named: list[str], **values) -> dict:
         "named": entries(*named), "unexplained": False, "not_decidable": [], "clusters": 8,
         "baseline": {"road.c_rr": {"prior_z": 0.4, "absorbs": ["grade_bias"]}},
         "sizes": [], "test_rmse": {"before": 1.1, "after": 1.0}, "oracle_rmse": 1.0, "noise_rmse": 1.0,
-        "seconds": 1.0, "alike": {}, "rivals": {}, "verdict": "", "why_not": {}, "ratio": 0.5, **values,
+        "seconds": 1.0, "alike": {}, "redrawn": 0, "rivals": {}, "verdict": "", "why_not": {}, "ratio": 0.5, **values,
     }  # fmt: skip
 
 
@@ -221,7 +221,19 @@ def test_the_oracle_of_slow_noise_is_better_than_rows_of_equal_weight(tmp_path):
 def test_what_one_column_cannot_tell_apart_is_one_class(tmp_path):
     effects = {"auxiliary_power": {"power_w": 8000.0}}
     synthetic, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
-    assert "power_gain" in indistinguishable(["auxiliary_power"], synthetic, problem, split)["auxiliary_power"]
+    assert "power_gain" in confusable(["auxiliary_power"], synthetic, problem, split)["auxiliary_power"]
+
+
+@pytest.mark.slow
+def test_what_nobody_could_tell_apart_depends_on_how_loud_the_noise_is(tmp_path):
+    some = []
+    for level in (0.02, 5.0):
+        effects = {"crosswind": {}}
+        opening = {"seed": 2, "effects": effects, "noise": "white", "noise_level": level}
+        synthetic, problem, split = opened(tmp_path / str(level), **opening)
+        some.append(confusable(["crosswind"], synthetic, problem, split)["crosswind"])
+    assert not some[0]
+    assert some[1]
 
 
 @pytest.mark.slow

@@ -1,0 +1,78 @@
+"""What a found effect leaves behind where it truly has another form than the library's.
+
+A resistance that grows with cold, a cut-off that fades: the library's form takes most of it, and the rest looks like
+something else, which more of the same log can only make surer. A further candidate has to say more than the found
+effects would in other forms.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from hdev_jax.diagnosis.candidates import plan_of
+from hdev_jax.diagnosis.chunks import Chunk
+from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.look import Loop, Search, View
+from hdev_jax.diagnosis.sums import evidence_of
+from hdev_jax.inference import predict
+from hdev_jax.segments import Segments
+
+__all__ = ["another_form"]
+
+VARIES_WITH = ("ambient_temp_c", "soc")  # beside speed and time, where a log has them
+SHAPES = 24  # of an effect's thresholds and time constants that are tried at most
+
+
+def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | None:
+    """Which found effects, in other forms, would say what the candidate does; None where it says more.
+
+    Other forms of an effect: its columns at other thresholds and time constants together, and what it does now times
+    speed, temperature, charge and time in the trip, squared, or as its root. The candidate is to stay significant
+    over the library beside all of them. What only trips tell is not asked: they are too few for so many numbers.
+    """
+    if s.plain or not state.found:
+        return None
+    car = view.ground.fit.vehicle
+    parts = []
+    for f in state.found:
+        bare = car.minus(f.id)
+        plan = plan_of(bare, problem.effects, problem.facts, problem.target)
+        own = sorted({k for c in plan.candidates if c.id == f.id for k in c.columns})
+        parts.append((bare, plan, own[:: max(1, -(-len(own) // SHAPES))]))
+    varied = 4 + sum(problem.rows.segments.has(n) for n in VARIES_WITH)
+    width = sum(len(own) + varied for _, _, own in parts)
+    k = len(s.candidate.columns)
+
+    def write(out: np.ndarray, chunk: Chunk) -> None:
+        now = np.asarray(predict(car, chunk.segments, problem.target))
+        at = 0
+        for bare, plan, own in parts:
+            plan.write(out[:, at : at + len(own)], chunk.segments, own)
+            at += len(own)
+            does = now - np.asarray(predict(bare, chunk.segments, problem.target))
+            for column in _varied(does, chunk.segments):
+                out[:, at] = np.nan_to_num(column)
+                at += 1
+        view.source.write(out[:, width:], chunk.segments, s.candidate.columns)
+
+    evidence = evidence_of(view.ground, width + k, write)
+    totals = evidence.totals()
+    gain = evidence.gain(totals, range(width + k))[0] - evidence.gain(totals, range(width))[0]
+    p = float(stats.chi2.sf(2.0 * max(gain, 0.0), k)) * view.ways[s.candidate.id] * len(view.best)
+    if p <= problem.fdr:
+        return None
+    return f"no more than {' and '.join(f.id for f in state.found)} would say in another form"
+
+
+def _varied(does: Float[np.ndarray, " row"], segments: Segments) -> Iterator[np.ndarray]:
+    """What an effect does, as it would be if its size varied or its answer were not in proportion."""
+    size = np.abs(does)
+    yield does * size
+    yield np.sign(does) * np.sqrt(size)
+    yield does * np.asarray(segments.speed_mps)
+    yield does * np.asarray(segments.time_s)
+    for name in VARIES_WITH:
+        if segments.has(name):
+            yield does * np.asarray(segments.channels[name])
