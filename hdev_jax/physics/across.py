@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Int
 from hdev_jax.segments import Segments
 
 __all__ = [
-    "at_times",
     "distance_since_start",
+    "later_slope",
     "low_pass",
     "neighbours",
     "shifted",
@@ -25,6 +25,7 @@ __all__ = [
 FIRST, LAST = "derived:first_row_of_trip", "derived:last_row_of_trip"
 DISTANCE_SINCE_START = "derived:distance_since_start_m"
 TIME_SINCE_BRAKING = "derived:time_since_braking_s"
+STANDS = 0.05  # m: a way that says nothing of a slope
 
 
 def trip_bounds(segments: Segments) -> tuple[Int[Array, " row"], Int[Array, " row"]]:
@@ -101,30 +102,68 @@ def _lagged(carry: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
     return y, y
 
 
-def at_times(column: Any, segments: Segments, ahead_s: Any) -> Float[Array, " row"]:
-    """The column `ahead_s` seconds later inside its trip, linear in time, held at the trip's edges.
+def later_slope(segments: Segments, ahead_s: Any) -> Float[Array, " row"]:
+    """The slope of each row as it is read `ahead_s` seconds later in its trip, from the channel `grade_rad`.
 
-    Exactly the column itself at 0, where the slope is that towards the next row.
+    Slopes of rows are climbs over distances: between the rows' ends the height is a cubic in distance (Hermite's,
+    with slopes at the ends weighted by the rows' lengths), so that a row that reads parts of two others reads what they
+    climb there. Within a row the acceleration is constant. Held at the trip's edges; where the vehicle stands `ahead_s`
+    later, the slope there. The channel itself at 0.
     """
-    x = jnp.asarray(column)
-    clock = jnp.asarray(segments.time_s) + 0.5 * jnp.asarray(segments.duration_s)
-    first, last = trip_bounds(segments)
-    wanted = jnp.clip(clock + ahead_s, clock[first], clock[last])
-    sought = jax.lax.stop_gradient(wanted)
+    slope = jnp.asarray(segments.channels["grade_rad"])
+    d, span = jnp.asarray(segments.distance_m), jnp.asarray(segments.duration_s)
+    start, bounds = jnp.asarray(segments.time_s), trip_bounds(segments)
+    first, last = bounds
+    index = jnp.arange(slope.shape[0])
+    before, after = jnp.maximum(index - 1, first), jnp.minimum(index + 1, last)
+    # slopes at a row's two ends, by the parabola through its neighbours; the row's own at the edges of the trip
+    own = jnp.maximum(d, 1e-9)
+    at_start = (slope[before] * own + slope * own[before]) / (own + own[before])
+    at_end = (slope[after] * own + slope * own[after]) / (own + own[after])
+    u, v = jnp.asarray(segments.speed_start_mps), jnp.asarray(segments.speed_end_mps)
+    ways, climbs = _sums_before(d, first), _sums_before(slope * d, first)
+
+    def place(time: Array) -> tuple[Array, Array]:
+        """How far it has come at a time, and how high."""
+        k = _row_at(jax.lax.stop_gradient(time), start, bounds)
+        share = jnp.clip((time - start[k]) / span[k], 0.0, 1.0)
+        both = u[k] + v[k]
+        x = jnp.where(both > 0, (2 * u[k] + (v[k] - u[k]) * share) / jnp.where(both > 0, both, 1.0), 1.0) * share
+        # the cubic from 0 to the row's mean slope with these slopes at its ends
+        bend = 3 * slope[k] - 2 * at_start[k] - at_end[k] + x * (at_start[k] + at_end[k] - 2 * slope[k])
+        return ways[k] + d[k] * x, climbs[k] + d[k] * x * (at_start[k] + x * bend)
+
+    begin, end = start[first], (start + span)[last]
+    from_, to = (jnp.clip(t + ahead_s, begin, end) for t in (start, start + span))
+    (way_from, height_from), (way_to, height_to) = place(from_), place(to)
+    way = way_to - way_from
+    here = slope[_row_at(jax.lax.stop_gradient(0.5 * (from_ + to)), start, bounds)]
+    read = jnp.where(way > STANDS, (height_to - height_from) / jnp.where(way > STANDS, way, 1.0), here)
+    # at 0 the channel to the last bit, with the derivative of what is read
+    return jnp.where(jnp.asarray(ahead_s) == 0, slope + (read - jax.lax.stop_gradient(read)), read)
+
+
+def _sums_before(x: Float[Array, " row"], first: Int[Array, " row"]) -> Float[Array, " row"]:
+    """Sums over the rows of the trip before each: none runs on over the trips, so single precision is enough."""
+
+    def add(total: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        starts, value = row
+        total = jnp.where(starts, jnp.zeros_like(total), total)
+        return total + value, total
+
+    return jax.lax.scan(add, jnp.zeros_like(x[0]), (first == jnp.arange(x.shape[0]), x), unroll=8)[1]
+
+
+def _row_at(time: Array, start: Array, bounds: tuple[Array, Array]) -> Int[Array, " row"]:
+    """The last row of each row's own trip that starts by a time, by bisection: the trips may come in any order."""
 
     def halve(_: Any, span: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = span
         middle = (low + high + 1) // 2
-        before = clock[middle] <= sought
-        return jnp.where(before, middle, low), jnp.where(before, high, middle - 1)
+        starts = start[middle] <= time
+        return jnp.where(starts, middle, low), jnp.where(starts, high, middle - 1)
 
-    # bisection in each row's own trip: the trips may come in any order
-    here, _ = jax.lax.fori_loop(0, x.shape[0].bit_length(), halve, (first, last))
-    here = jnp.clip(here, first, jnp.maximum(last - 1, first))
-    after = jnp.minimum(here + 1, last)
-    gap = clock[after] - clock[here]
-    part = jnp.where(gap > 0, (wanted - clock[here]) / jnp.where(gap > 0, gap, 1.0), 0.0)
-    return (1 - part) * x[here] + part * x[after]
+    return jax.lax.fori_loop(0, start.shape[0].bit_length(), halve, bounds)[0]
 
 
 def distance_since_start(segments: Segments) -> Float[Array, " row"]:

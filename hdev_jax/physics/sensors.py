@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from hdev_jax.physics.across import at_times, low_pass, neighbours, shifted
+from hdev_jax.physics.across import later_slope, low_pass, neighbours, shifted
 from hdev_jax.physics.effect import Effect, Parameter
 
 __all__ = [
@@ -74,7 +74,7 @@ class GradeLag(Effect):
     lag_s: Any
 
     def across(self, segments):
-        return segments.with_channels(grade_rad=at_times(segments.channels["grade_rad"], segments, self.lag_s))
+        return segments.with_channels(grade_rad=later_slope(segments, self.lag_s))
 
 
 class SpeedScale(Effect):

@@ -3,7 +3,6 @@
 import pytest
 from planted import run
 
-
 LONG = {"ratio": 1.0, "trips": 24, "rows_per_trip": 250, "ar_coefficient": 0.97}
 SHAFT = {"ratio": 0.5, "trips": 12, "rows_per_trip": 600, "ar_coefficient": 0.97, "entry": "shaft", "mode": "samples"}
 
@@ -33,7 +32,7 @@ def test_a_second_cause_is_not_the_first_in_another_form():
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", ["sampling_filter", "torque_offset"])
 def test_instruments_of_the_shaft(effect):
-    """A filter of half a second is far from the longest, not at an edge; an offset is seen though a gain is absorbed."""
+    """A filter of half a second is far from the longest, not at an edge; an offset is seen beside an absorbed gain."""
     synthetic, result = run(90301, effects={effect: {}}, **SHAFT)
     assert names(result) == [effect]
     name = {"sampling_filter": "tau_s", "torque_offset": "offset_nm"}[effect]

@@ -28,10 +28,9 @@ def energy_wh(rows: list[dict], car: dict, effects: dict[str, dict]) -> list[flo
 def prepare(trip: list[dict], effects: dict) -> None:
     """What needs the rows before: slope that came late, distance since the start, time since braking."""
     if "grade_lag" in effects:
-        middles = [r["time_s"] + r["duration_s"] / 2 for r in trip]
-        slopes = [r["grade_rad"] for r in trip]
-        for r, t in zip(trip, middles, strict=True):
-            r["grade_rad"] = between(middles, slopes, t + effects["grade_lag"]["lag_s"])
+        later = [later_slope(trip, k, effects["grade_lag"]["lag_s"]) for k in range(len(trip))]
+        for r, slope in zip(trip, later, strict=True):
+            r["grade_rad"] = slope
     gone, released = 0.0, None
     for r in trip:
         r["gone_m"] = gone + r["distance_m"] / 2
@@ -43,15 +42,40 @@ def prepare(trip: list[dict], effects: dict) -> None:
             r["since_s"] = None if released is None else r["time_s"] + r["duration_s"] / 2 - released
 
 
-def between(times: list[float], values: list[float], t: float) -> float:
-    """Linear in time, held past the ends."""
-    if t <= times[0]:
-        return values[0]
-    for k in range(1, len(times)):
-        if t <= times[k]:
-            share = (t - times[k - 1]) / (times[k] - times[k - 1])
-            return values[k - 1] + share * (values[k] - values[k - 1])
-    return values[-1]
+def later_slope(trip: list[dict], k: int, lag_s: float) -> float:
+    """What row k climbs over its way, both of where its ends are `lag_s` later."""
+    a, b = (trip[k]["time_s"] + lag_s, trip[k]["time_s"] + trip[k]["duration_s"] + lag_s)
+    (way_a, height_a), (way_b, height_b) = place(trip, a), place(trip, b)
+    if way_b - way_a > 0.05:
+        return (height_b - height_a) / (way_b - way_a)
+    begin, end = trip[0]["time_s"], trip[-1]["time_s"] + trip[-1]["duration_s"]
+    middle = (min(max(a, begin), end) + min(max(b, begin), end)) / 2
+    return trip[row_at(trip, middle)]["grade_rad"]
+
+
+def row_at(trip: list[dict], t: float) -> int:
+    """The last row that has begun."""
+    return max([k for k, r in enumerate(trip) if r["time_s"] <= t], default=0)
+
+
+def place(trip: list[dict], t: float) -> tuple[float, float]:
+    """Way and height at a time: rows of constant acceleration, heights by Hermite's four polynomials in distance."""
+    k = row_at(trip, t)
+    r, d = trip[k], trip[k]["distance_m"]
+    share = min(max((t - r["time_s"]) / r["duration_s"], 0.0), 1.0)
+    u, v = r["speed_start_mps"], r["speed_end_mps"]
+    x = share * (2 * u + (v - u) * share) / (u + v) if u + v > 0 else share
+
+    def at_node(i: int, j: int) -> float:
+        """The slope between two rows, the shorter one counting for more."""
+        i, j = max(i, 0), min(j, len(trip) - 1)
+        d_i, d_j = (max(trip[n]["distance_m"], 1e-9) for n in (i, j))
+        return (trip[i]["grade_rad"] * d_j + trip[j]["grade_rad"] * d_i) / (d_i + d_j)
+
+    climb = r["grade_rad"] * (3 * x**2 - 2 * x**3)
+    climb += at_node(k - 1, k) * (x**3 - 2 * x**2 + x) + at_node(k, k + 1) * (x**3 - x**2)
+    way = sum(q["distance_m"] for q in trip[:k]) + d * x
+    return way, sum(q["distance_m"] * q["grade_rad"] for q in trip[:k]) + d * climb
 
 
 def battery_power_w(r: dict, car: dict, effects: dict) -> float:

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,34 +153,65 @@ def test_low_pass_at_zero_is_the_column_with_a_slope_of_zero() -> None:
 # --- times ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ahead", [-30.0, -1.3, 0.0, 0.4, 2.0, 30.0])
-def test_at_times_is_numpys_interpolation_by_trip(ahead: float) -> None:
-    """On rows of unequal duration, with trips in any order."""
+@pytest.mark.parametrize("ahead", [-7.0, -1.3, 0.0, 0.4, 2.0, 5.0])
+def test_a_later_slope_is_exact_where_the_road_bends_evenly(ahead: float) -> None:
+    """Slope in proportion to the way, at a speed that grows evenly: rows of unequal duration, trips in any order."""
+    rng, lengths = np.random.default_rng(4), (30, 25, 28)
+    trip = np.repeat([2, 0, 1], lengths)
+    span = rng.uniform(0.5, 1.5, len(trip))
+    clock = by_trip(lambda x: np.cumsum(x) - x, span, Segments(trip, trip, span, span, span, span, span, {}))
+
+    def way(t: np.ndarray) -> np.ndarray:
+        return 4.0 * t + 0.15 * t**2
+
+    def mean_slope(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return 0.01 - 5e-5 * (way(a) + way(b)) / 2
+
+    theta, d = mean_slope(clock, clock + span), way(clock + span) - way(clock)
+    log = Segments(trip, 0 * trip, clock, span, d, 4.0 + 0.3 * clock, 4.0 + 0.3 * (clock + span), {"grade_rad": theta})
+    first, last = (np.asarray(x) for x in across.trip_bounds(log))
+    # a row or more from the edges, where the slope's own slope is not known on both sides
+    inside = (clock + ahead > (clock + span)[first]) & (clock + span + ahead < clock[last])
+    expected = mean_slope(clock + ahead, clock + span + ahead)
+    assert inside.sum() > 40
+    np.testing.assert_allclose(across.later_slope(log, ahead)[inside], expected[inside], rtol=1e-11)
+    assert ahead or np.allclose(across.later_slope(log, ahead), theta, rtol=1e-11)
+
+
+@pytest.mark.parametrize("lag", [-2.1, 1e-3, 0.3, 1.9])
+def test_a_later_slope_has_the_slope_of_its_differences(lag: float) -> None:
     log = made.drives(*TRIPS)
-    log = log.take(np.argsort((log.trip + 2) % 4, kind="stable"))
-    x, clock = noise(), log.time_s + 0.5 * log.duration_s
-    expected = np.zeros(len(x))
-    for k in range(4):
-        here = log.trip == k
-        expected[here] = np.interp(clock[here] + ahead, clock[here], x[here])
-    np.testing.assert_allclose(across.at_times(x, log, ahead), expected, rtol=1e-12, atol=1e-12)
+    weight = noise(seed=1)
+    total = jax.jit(lambda t: jnp.sum(across.later_slope(log, t) * weight))
+    reverse, forward = jax.grad(total)(lag), jax.jvp(total, (lag,), (1.0,))[1]
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(reverse, (total(lag + 1e-6) - total(lag - 1e-6)) / 2e-6, rtol=1e-6)
+    assert jax.grad(total)(0.0) != 0.0
 
 
-def test_at_times_on_a_clock_that_float32_can_just_hold() -> None:
-    """A long trip after many: no clock runs on over the trips, so single precision is enough."""
-    column, segments = even(noise((4, 400)), (4, 400), 1.0)
-    single = jax.tree.map(lambda x: x.astype(np.float32) if made.is_real(x) else 5000 * x, segments)
-    seen = np.asarray(across.at_times(column.astype(np.float32), single, np.float32(0.25)))
-    np.testing.assert_allclose(seen[4:-1], 0.75 * column[4:-1] + 0.25 * column[5:], atol=1e-5)
+def test_a_later_slope_on_a_clock_that_float32_can_just_hold() -> None:
+    """A long trip after many: neither clock nor way runs on over the trips, so single precision is enough."""
+    lengths = (*(400,) * 20, 400)
+    column, segments = even(0.02 * noise(lengths), lengths, 1.0)
+    segments = segments.with_channels(grade_rad=column)
+    single = jax.tree.map(lambda x: x.astype(np.float32) if made.is_real(x) else x, segments)
+    seen = np.asarray(across.later_slope(single, np.float32(0.25)))
+    np.testing.assert_allclose(seen, across.later_slope(segments, 0.25), atol=1e-5)
 
 
 def test_grade_lag_takes_the_slope_of_later() -> None:
-    """A slope that comes 2 s late is found 2 s later in the log."""
+    """A slope that comes 2 s late is found 2 s later in the log; a place where the vehicle stands has its own."""
     theta, segments = even(0.02 * noise(), TRIPS)
     segments = segments.with_channels(grade_rad=theta)
     lagged = type(made.null("grade_lag"))(made.arr(1.0)).across(segments)
     expected = by_trip(lambda x: x[np.clip(np.arange(len(x)) + 2, None, len(x) - 1)], theta, segments)
     np.testing.assert_allclose(lagged.channels["grade_rad"], expected, rtol=1e-12)
+    stands = eqx.tree_at(
+        lambda s: (s.distance_m, s.speed_start_mps, s.speed_end_mps),
+        segments,
+        tuple(x * (np.arange(len(theta)) != 3) for x in (np.ones(len(theta)),) * 3),
+    )
+    assert type(made.null("grade_lag"))(made.arr(1.0)).across(stands).channels["grade_rad"][1] == theta[3]
 
 
 def test_distance_since_start() -> None:
