@@ -19,6 +19,7 @@ from hdev_jax.diagnosis.ranking import plausible
 from hdev_jax.diagnosis.settle import settle
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.sums import distance_from_table, evidence_of
+from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.fleet import SyntheticLog
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.physics import LIBRARY, Grouped, Vehicle, at_null, most_group
@@ -58,19 +59,25 @@ def confusable(planted: Sequence[str], synthetic: SyntheticLog, problem: Problem
     known, loop = fitted_with(planted, synthetic, problem, split)
     noise = loop.noise(known)
     right, loop = fitted_with(planted, synthetic, clean, split)
-    most = _likelihood(right, evidence_of(loop.ground(right, noise)))
+    most = _likelihood(right, _as_noisy(evidence_of(loop.ground(right, noise)), noise))
     out = {}
     for id_ in planted:
         fit, loop = fitted_with([k for k in planted if k != id_], synthetic, clean, split)
         ground = loop.ground(fit, noise)
         view = scored(ground, plan_of(fit.vehicle, tuple(LIBRARY.values()), loop.facts, loop.target))
-        base, totals = _likelihood(fit, view.evidence), view.evidence.totals()
+        evidence = _as_noisy(view.evidence, noise)
+        base, totals = _likelihood(fit, evidence), evidence.totals()
         out[id_] = sorted(
             k for k, s in view.best.items()
             if k != id_ and k not in view.absorbed_by and plausible(s)
-            and most - base - view.evidence.gain(totals, s.candidate.columns)[0] < TELLS
+            and most - base - evidence.gain(totals, s.candidate.columns)[0] < TELLS
         )  # fmt: skip
     return out
+
+
+def _as_noisy(evidence: Evidence, noise: Noise) -> Evidence:
+    """The evidence of rows without noise, weighed as with it: trips' levels have the variance that they have."""
+    return replace(evidence, variances=np.array([noise.level_sd**2]))
 
 
 def _likelihood(fit: Calibration, evidence: Evidence) -> float:

@@ -129,6 +129,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
                 table_sd=task["table_sd"],
             )  # fmt: skip
         except ValueError as e:
+            if redrawn:
+                continue
             return {"skipped": str(e)}
         with tempfile.TemporaryDirectory() as folder:
             files = synthetic.write(folder, truth=False)
@@ -138,7 +140,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         if all(acts_in(synthetic, problem, split, k) >= LEAST_TRIPS for k in planted):
             break
     else:
-        return {"skipped": f"in {MOST_DRAWS} draws one of {', '.join(planted)} acts in one training trip only"}
+        return {"skipped": f"{MOST_DRAWS} draws: {', '.join(planted)} in fewer than {LEAST_TRIPS} training trips"}
     started = time.perf_counter()
     result = diagnose(problem, split, LIBRARY, fdr=task["fdr"], seed=0)
     seconds = time.perf_counter() - started
@@ -173,7 +175,7 @@ def acts_in(synthetic: SyntheticLog, problem: Problem, split: Split, effect: str
     """How many training trips hold a twentieth or more of an effect's sum of squares."""
     squares = synthetic.truth[f"effect:{effect}"].to_numpy() ** 2
     each = np.array([np.sum(squares[problem.rows([t])]) for t in split.train])
-    return int(np.sum(each >= SHARE * np.sum(each)))
+    return int(np.sum((each > 0) & (each >= SHARE * np.sum(each))))
 
 
 def sizes(synthetic: SyntheticLog, found: list[dict[str, Any]]) -> list[dict[str, Any]]:

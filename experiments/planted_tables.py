@@ -134,11 +134,11 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     hits = [(t, r) for t, r in group if scores.exact(t["effects"], r["named"])]
     first = sum({x["id"] for x in r["named"]} == set(scores.names(t["effects"])) for t, r in hits)
     alone = sum(_alone(r) for _, r in hits)
-    apart = [(t, r) for t, r in group if not any(r["alike"].values())]
-    alone_apart = sum(scores.exact(t["effects"], r["named"]) and _alone(r) for t, r in apart) / max(len(apart), 1)
+    apart = [(t, r) for t, r in group if r["alike"] and not any(r["alike"].values())]
+    alone_apart = np.mean([scores.exact(t["effects"], r["named"]) and _alone(r) for t, r in apart]) if apart else None
     unexplained = sum(r["unexplained"] for _, r in group)
     enough = [
-        least is None or share >= least
+        least is None or share is None or share >= least
         for least, share in ((case.wanted, as_asked / n), (case.wanted_alone, alone_apart),
                              (case.wanted_unexplained, unexplained / n))
     ]  # fmt: skip
@@ -160,7 +160,7 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,
         "separable": len(apart) / n if named else None,  # no other effect could be told from it by any test
-        "no_class_of_separable": alone_apart if named and apart else None,
+        "no_class_of_separable": float(alone_apart) if named and alone_apart is not None else None,
         "no_class_wanted": case.wanted_alone,
         "redrawn": sum(r["redrawn"] for _, r in group),
         "something_false": sum(scores.false(t["effects"], r["named"]) for t, r in group) / n,

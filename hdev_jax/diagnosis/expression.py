@@ -271,7 +271,7 @@ def _chosen(
     segments = problem.rows.segments
     rows = replace(problem.rows, segments=segments.with_channels(**{TERM: product(factors, segments) / scale}))
     narrow = replace(problem, rows=rows, fdr=problem.fdr / STRICTER)
-    chosen = choose(narrow, start, view, tell, skip=(), tries=1)
+    chosen = choose(narrow, start, view, tell, skip=(), tries=1, forms=False)
     if chosen is None:
         return None
     at = next(i for i, c in enumerate(chosen.fit.table.free) if c.path == "effects.expression.k")

@@ -5,7 +5,7 @@ something else, which more of the same log can only make surer. A further candid
 effects would in other forms.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from jaxtyping import Float
@@ -22,15 +22,24 @@ from hdev_jax.segments import Segments
 __all__ = ["another_form"]
 
 VARIES_WITH = ("ambient_temp_c", "soc")  # beside speed and time, where a log has them
+ALWAYS: tuple[Callable[[np.ndarray, Segments], np.ndarray], ...] = (
+    lambda does, _: does,
+    lambda does, _: does * np.abs(does),
+    lambda does, _: np.sign(does) * np.sqrt(np.abs(does)),
+    lambda does, segments: does * np.asarray(segments.speed_mps),
+    lambda does, segments: does * np.asarray(segments.time_s),
+)
 SHAPES = 24  # of an effect's thresholds and time constants that are tried at most
 
 
 def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | None:
     """Which found effects, in other forms, would say what the candidate does; None where it says more.
 
-    Other forms of an effect: its columns at other thresholds and time constants together, and what it does now times
+    Other forms of an effect: its columns at other thresholds and time constants together, and what it does now, times
     speed, temperature, charge and time in the trip, squared, or as its root. The candidate is to stay significant
-    over the library beside all of them. What only trips tell is not asked: they are too few for so many numbers.
+    over the library beside all of them, by Bonferroni. What only trips tell is not asked: they are too few for so many
+    numbers. A second cause that is just such a form of the first (a constant load, and one in proportion to
+    temperature) is not named beside it, however long the log.
     """
     if s.plain or not state.found:
         return None
@@ -41,7 +50,7 @@ def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | No
         plan = plan_of(bare, problem.effects, problem.facts, problem.target)
         own = sorted({k for c in plan.candidates if c.id == f.id for k in c.columns})
         parts.append((bare, plan, own[:: max(1, -(-len(own) // SHAPES))]))
-    varied = 4 + sum(problem.rows.segments.has(n) for n in VARIES_WITH)
+    varied = len(ALWAYS) + sum(problem.rows.segments.has(n) for n in VARIES_WITH)
     width = sum(len(own) + varied for _, _, own in parts)
     k = len(s.candidate.columns)
 
@@ -60,19 +69,15 @@ def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | No
     evidence = evidence_of(view.ground, width + k, write)
     totals = evidence.totals()
     gain = evidence.gain(totals, range(width + k))[0] - evidence.gain(totals, range(width))[0]
-    p = float(stats.chi2.sf(2.0 * max(gain, 0.0), k)) * view.ways[s.candidate.id] * len(view.best)
-    if p <= problem.fdr:
+    if stats.chi2.sf(2.0 * max(gain, 0.0), k) <= view.level(s.candidate.id, problem.fdr):
         return None
     return f"no more than {' and '.join(f.id for f in state.found)} would say in another form"
 
 
 def _varied(does: Float[np.ndarray, " row"], segments: Segments) -> Iterator[np.ndarray]:
-    """What an effect does, as it would be if its size varied or its answer were not in proportion."""
-    size = np.abs(does)
-    yield does * size
-    yield np.sign(does) * np.sqrt(size)
-    yield does * np.asarray(segments.speed_mps)
-    yield does * np.asarray(segments.time_s)
+    """What an effect does, and as it would be if its size varied or its answer were not in proportion."""
+    for form in ALWAYS:
+        yield form(does, segments)
     for name in VARIES_WITH:
         if segments.has(name):
             yield does * np.asarray(segments.channels[name])

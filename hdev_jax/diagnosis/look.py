@@ -174,7 +174,7 @@ class View:
             if state.vehicle.has(id_):
                 continue
             why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
-            by_rows = s.p_model <= self._level(id_, fdr)
+            by_rows = not s.plain and bool(s.p_model <= self.level(id_, fdr))
             needed, between = self._needed(s, fdr), self.between(s.candidate)
             out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, needed, between, by_rows))
         out += [v for v in self.sought if not state.vehicle.has(v.id)]
@@ -185,8 +185,8 @@ class View:
         """Whether its columns hardly change inside a trip, so that only trips can tell it."""
         return bool(self.slow[list(candidate.columns)].all())
 
-    def _level(self, id_: str, fdr: float) -> float:
-        """What a p has to be, before it is corrected as q is."""
+    def level(self, id_: str, fdr: float) -> float:
+        """What a p of one test has to be, by Bonferroni over the library, and over rows whitened and as they are."""
         return fdr / (2.0 * len(self.best) * self.ways[id_])
 
     def _needed(self, s: Score, fdr: float) -> int | None:
@@ -196,7 +196,7 @@ class View:
         id_, k, count = s.candidate.id, len(s.beta), self.evidence.count
         if self.q[id_] <= fdr or id_ in self.reasons or id_ in self.absorbed_by or not plausible(s):
             return None
-        level = self._level(id_, fdr)
+        level = self.level(id_, fdr)
         p = max(s.p_model, s.p_cluster)
         if s.p <= HINT or s.p_model <= level:
             return clusters_needed(p, k, count, level)

@@ -96,9 +96,14 @@ def _added(problem: Loop, state: Search, view: View) -> Search:
 
 
 def choose(
-    problem: Loop, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str], tries: int = TRIES
-) -> Search | None:
-    """The candidate that clears every bar, refitted; None where none does. Keeps going past one that fails."""
+    problem: Loop, state: Search, view: View, tell: Callable[[str], None], *, skip: Sequence[str], tries: int = TRIES,
+    forms: bool = True,
+) -> Search | None:  # fmt: skip
+    """The candidate that clears every bar, refitted; None where none does. Keeps going past one that fails.
+
+    `forms`: whether it has to say more than what was found would in another form. What describes the rest need not,
+    nor what was found before the rest.
+    """
     able = [
         s
         for id_, s in view.best.items()
@@ -131,7 +136,7 @@ def choose(
         fits.sort(key=lambda f: -f[0])
         for _, s, (new, _, started), gain in fits:
             c = s.candidate
-            if why := _placebo(problem, s, view) or another_form(problem, state, s, view):
+            if why := _placebo(problem, s, view) or (another_form(problem, state, s, view) if forms else None):
                 view.reasons[c.id] = why
                 tell(f"turned down {c.id}: {why}")
                 continue

@@ -41,6 +41,8 @@ class Open:
     def interval(self, level: float, freedom: int, inside: float | None = None) -> tuple[float, float]:
         """How far below and above the central interval reaches: of Student's t at each set of shapes, mixed."""
         inside = self.inside if inside is None else inside
+        if not np.isfinite(inside):
+            return -np.inf, np.inf
         wide = max(inside, 1e-6 * float(np.ptp(self.away)), 1e-300)
 
         def at(share: float) -> float:

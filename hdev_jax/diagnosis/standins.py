@@ -61,4 +61,4 @@ def _again(problem: Loop, state: Search, f: Found, tell: Tell) -> bool:
         return BY_TRIP[by](problem, start)[0] is not None
     view = sharpened(problem, look(problem, start))
     others = [id_ for id_ in view.best if id_ not in (f.id, *f.twins)]
-    return choose(problem, start, view, tell, skip=others) is not None
+    return choose(problem, start, view, tell, skip=others, forms=False) is not None

@@ -38,6 +38,7 @@ def test_an_interval_of_one_set_of_shapes_is_students():
 
 def test_a_size_without_an_error_is_where_it_is_at_any_scale():
     np.testing.assert_allclose(Open(np.array([1e-3]), np.ones(1), 0.0).interval(0.9, 7), 1e-3, rtol=1e-6)
+    assert Open(np.zeros(1), np.ones(1), np.inf).interval(0.9, 7) == (-np.inf, np.inf)
     large = np.array(Open(np.array([-3.0, 5.0]), np.array([0.4, 0.6]), 2.0).interval(0.9, 7))
     small = Open(np.array([-3e-9, 5e-9]), np.array([0.4, 0.6]), 2e-9).interval(0.9, 7)
     np.testing.assert_allclose(small, 1e-9 * large, rtol=1e-6)

@@ -9,7 +9,7 @@ from experiments import planted_scores as scores
 from experiments import rivals
 from experiments.config import resolve, typed
 from experiments.oracle import confusable, noise_rmse, oracle_rmse
-from experiments.planted import Config, tasks
+from experiments.planted import Config, acts_in, tasks
 from experiments.planted_rivals import outcome, rival_rows
 from experiments.planted_tables import collect
 from experiments.rivals import comparable
@@ -160,10 +160,17 @@ def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
 
 def test_classes_are_not_what_was_asked_without_them(tmp_path):
     ten = every("single", effects=["headwind"])
-    logs = [(t, result(["headwind", "crosswind"] if k < 3 else ["headwind"])) for k, t in enumerate(ten)]
+    apart = {"headwind": []}
+    logs = [(t, result(["headwind", "crosswind"] if k < 3 else ["headwind"], alike=apart)) for k, t in enumerate(ten)]
     row = told(tmp_path, logs)["one effect, size 0.5, 12 trips, ar1"]
     assert (row["named_exactly"], row["named_first"], row["named_exactly_no_class"]) == (1.0, 1.0, 0.7)
     assert (row["wanted"], row["no_class_wanted"], row["met"]) == (0.88, 0.85, False)
+    assert (row["separable"], row["no_class_of_separable"]) == (1.0, 0.7)
+    # where nobody could tell them apart, the class is the answer
+    alike = [(t, {**r, "alike": {"headwind": ["crosswind"] if k < 3 else []}}) for k, (t, r) in enumerate(logs)]
+    row = told(tmp_path / "a", alike)["one effect, size 0.5, 12 trips, ar1"]
+    assert (row["named_exactly_no_class"], row["separable"], row["no_class_of_separable"]) == (0.7, 0.7, 1.0)
+    assert row["met"] is True
     big = [(t, {**r, "named": [{**r["named"][0], "class_size": 8}]}) for t, r in logs]
     row = told(tmp_path / "b", big)["one effect, size 0.5, 12 trips, ar1"]
     assert (row["named_exactly"], row["mean_class"]) == (0.0, 8.0)
@@ -222,6 +229,16 @@ def test_what_one_column_cannot_tell_apart_is_one_class(tmp_path):
     effects = {"auxiliary_power": {"power_w": 8000.0}}
     synthetic, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
     assert "power_gain" in confusable(["auxiliary_power"], synthetic, problem, split)["auxiliary_power"]
+
+
+@pytest.mark.slow
+def test_trips_that_hold_an_effect_are_counted(tmp_path):
+    """An effect that no training trip meets acts in none."""
+    synthetic, problem, split = opened(tmp_path, seed=2, effects={"headwind": {}}, noise_level=0.02)
+    assert acts_in(synthetic, problem, split, "headwind") >= 2
+    for trips, expected in (((), 0), (split.train[:1], 1), (split.train[:3], 3)):
+        synthetic.truth["effect:headwind"] = 1.0 * np.isin(problem.log.trip, [*trips, *split.test])
+        assert acts_in(synthetic, problem, split, "headwind") == expected
 
 
 @pytest.mark.slow
