@@ -1,14 +1,17 @@
 """An efficiency map learned from a log: penalised least squares on the kernel, the penalty a smooth random field.
 
-The unknowns are the efficiencies at the nodes of a given grid. A priori they are Gaussian of mean `mean` and precision
+The unknowns are the losses at the nodes of a given grid, as logarithms: η = P/(P + exp(u)) with P = |τ|·ω the power at
+the shaft, for driving and for braking. Losses go on smoothly where the torque changes its sign and the efficiency falls
+off a cliff, so that what is known of them at larger torques tells of those at small ones. A priori u is Gaussian of
+precision
 
     P = smooth·(D_ss'D_ss + D_tt'D_tt + D_st'D_st) + gears·D_g'D_g + I/wide²,
 
-second differences along speed and torque (steps of one node; not across the change of sign of the torque, where braking
-ends and driving begins) and first differences from gear to gear: a Gaussian Markov random field (Rue and Held, Gaussian
-Markov Random Fields, section 3.4). `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the
-noise. Each step solves the normal equations with the kernel's own gradient; the bilinear weights of the nodes stand for
-the map's own in the curvature alone, which decides the pace and the uncertainty and not where the fit ends.
+second differences along speed and torque (steps of one node) and first differences from gear to gear: a Gaussian Markov
+random field (Rue and Held, Gaussian Markov Random Fields, section 3.4). `smooth` is chosen by the marginal likelihood of
+the log (Laplace), and so is the noise. Each step solves the normal equations with the kernel's own gradient; the
+bilinear weights of the nodes stand for the map's own in the curvature alone, which decides the pace and the uncertainty
+and not where the fit ends.
 """
 
 from dataclasses import dataclass
@@ -28,8 +31,10 @@ from hdev_jax.segments import Segments
 
 __all__ = ["LearnedMap", "learn_map"]
 
-LOWEST, HIGHEST = 0.05, 1.0
-SMOOTH = tuple(float(s) for s in np.geomspace(1e1, 1e5, 5))  # tried, in units of 1/η²: 1e4 is a bend of 0.01
+FARTHEST = 12.0  # of a log loss from its prior mean: beyond any machine
+SMOOTH = tuple(
+    float(s) for s in np.geomspace(1e0, 1e4, 5)
+)  # tried: 1e2 is a bend of the losses of 10 % from node to node
 
 
 @dataclass(frozen=True)
@@ -56,15 +61,16 @@ def learn_map(
     start: EfficiencyMap,
     *,
     mean: float = 0.85,
-    wide: float = 0.15,
-    gears: float = 1e3,
+    wide: float = 3.0,
+    gears: float = 1e2,
     smooth: tuple[float, ...] = SMOOTH,
     max_steps: int = 15,
 ) -> LearnedMap:
     """Learn the driveline's map on the grid of `start`, all else of the vehicle being known.
 
-    **Arguments:** `energy_wh`, measured [row]; `start`, the grid, and the values where the search begins; `mean` and
-    `wide`, of the prior of a node; `gears`, precision of the difference between neighbouring gears [1/η²].
+    **Arguments:** `energy_wh`, measured [row]; `start`, the grid, and the values where the search begins; `mean`, the
+    efficiency at half of the grid's highest power that the prior's losses stand for, `wide`, the sd of a log loss about
+    them; `gears`, precision of the difference of log losses between neighbouring gears.
 
     **Raises:** `InputError` where the log has no gear, or one that the grid lacks, or too few rows that move.
     """
@@ -79,12 +85,13 @@ def learn_map(
         raise InputError(f"learning an efficiency map: {moving.sum()} rows that move; at least 50 are expected")
     problem = _Problem(vehicle, jax.tree.map(jnp.asarray, log), np.asarray(energy_wh, dtype=float), start)
     bends, ties = _bends(start), _ties(start)
-    theta, noise = np.asarray(start.values, dtype=float).ravel(), 0.0
+    losses = _Losses.of(start, mean)
+    theta, noise = losses.logarithm(np.asarray(start.values, dtype=float).ravel()), 0.0
     evidence: dict[float, float] = {}
     best: tuple[float, Any] | None = None
     for strength in smooth:
         prior = strength * bends + gears * ties + np.eye(theta.size) / wide**2
-        fit = _fit(problem, prior, mean, theta, max_steps)
+        fit = _fit(problem, losses, prior, theta, max_steps)
         theta = fit[0]  # the next strength begins where this one ended
         evidence[strength] = fit[-1]
         if best is None or fit[-1] > best[1][-1]:
@@ -92,9 +99,39 @@ def learn_map(
     assert best is not None
     chosen, (theta, covariance, noise, done, _) = best
     shape = start.values.shape
-    learned = EfficiencyMap(start.gears, start.speeds_radps, start.torques_nm, jnp.asarray(theta.reshape(shape)))
-    sd = np.sqrt(np.diag(covariance)).reshape(shape)
+    eta = losses.efficiency(theta)
+    learned = EfficiencyMap(start.gears, start.speeds_radps, start.torques_nm, jnp.asarray(eta.reshape(shape)))
+    sd = (eta * (1.0 - eta) * np.sqrt(np.diag(covariance))).reshape(shape)
     return LearnedMap(learned, sd, problem.rows_by_cell(learned), noise, chosen, evidence, done)
+
+
+@dataclass(frozen=True)
+class _Losses:
+    """Log losses of nodes and what efficiency they are: `power_w` at each node's shaft, `mean` of the log losses."""
+
+    power_w: Float[np.ndarray, " node"]
+    mean: float
+
+    @staticmethod
+    def of(m: EfficiencyMap, efficiency: float) -> "_Losses":
+        """Of a grid. At speed 0 no power flows: a node there counts as half of the way to the next."""
+        speeds = np.asarray(m.speeds_radps, dtype=float)
+        slow = 0.5 * float(np.min(speeds[speeds > 0]))
+        power = np.maximum(speeds, slow)[:, None] * np.maximum(np.abs(np.asarray(m.torques_nm)), 1e-3)[None, :]
+        mean = np.log(0.5 * np.max(power) * (1.0 / efficiency - 1.0))
+        return _Losses(np.tile(power.ravel(), len(m.gears)), float(mean))
+
+    def efficiency(self, u: np.ndarray) -> np.ndarray:
+        return self.power_w / (self.power_w + np.exp(u))
+
+    def logarithm(self, efficiency: np.ndarray) -> np.ndarray:
+        lost = self.power_w * (1.0 / np.clip(efficiency, 1e-3, 0.999) - 1.0)
+        return np.clip(np.log(lost), self.mean - FARTHEST, self.mean + FARTHEST)
+
+    def slope(self, u: np.ndarray) -> np.ndarray:
+        """∂η/∂u."""
+        eta = self.efficiency(u)
+        return -eta * (1.0 - eta)
 
 
 class _Problem:
@@ -114,16 +151,16 @@ class _Problem:
         found = eqx.tree_at(lambda m: m.values, self.start, values.reshape(self.shape))
         return eqx.tree_at(lambda v: v.driveline.efficiency, self.vehicle, found).energy(self.log)
 
-    def residual(self, theta: np.ndarray) -> np.ndarray:
-        return self.measured - np.asarray(self._energy(jnp.asarray(theta)))
+    def residual(self, eta: np.ndarray) -> np.ndarray:
+        return self.measured - np.asarray(self._energy(jnp.asarray(eta)))
 
-    def gradient(self, theta: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    def gradient(self, eta: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """J'r, by the kernel."""
-        return np.asarray(self._pull(jnp.asarray(theta), jnp.asarray(residual)))
+        return np.asarray(self._pull(jnp.asarray(eta), jnp.asarray(residual)))
 
-    def curvature(self, theta: np.ndarray) -> np.ndarray:
+    def curvature(self, eta: np.ndarray) -> np.ndarray:
         """J'J. A shift of all nodes shifts each row's efficiency by as much: that is ∂E/∂η, the weights do the rest."""
-        j = self.weights.multiply(np.asarray(self._slope(jnp.asarray(theta)))[:, None]).tocsr()
+        j = self.weights.multiply(np.asarray(self._slope(jnp.asarray(eta)))[:, None]).tocsr()
         return (j.T @ j).toarray()
 
     def rows_by_cell(self, found: EfficiencyMap) -> np.ndarray:
@@ -162,16 +199,9 @@ def _weights(m: EfficiencyMap, g: np.ndarray, i: np.ndarray, a: np.ndarray, j: n
 def _bends(m: EfficiencyMap) -> np.ndarray:
     """D'D of second differences along speed and torque and across both."""
     gears, speeds, torques = m.values.shape
-    axis = np.asarray(m.torques_nm)
-    second = lambda n: np.diff(np.eye(n), 2, axis=0)  # noqa: E731
-    by_torque = second(torques)
-    by_torque = by_torque[[np.all(axis[k : k + 3] > 0) or np.all(axis[k : k + 3] < 0) for k in range(torques - 2)]]
-    first = np.diff(np.eye(torques), axis=0)
-    first = first[axis[1:] * axis[:-1] > 0]
-    eye = np.eye
-    part = np.kron(_square(second(speeds)), eye(torques)) + np.kron(eye(speeds), _square(by_torque))
-    part += np.kron(_square(np.diff(eye(speeds), axis=0)), _square(first))
-    return np.kron(eye(gears), part)
+    first, second = (lambda n, k=k: _square(np.diff(np.eye(n), k, axis=0)) for k in (1, 2))
+    part = np.kron(second(speeds), np.eye(torques)) + np.kron(np.eye(speeds), second(torques))
+    return np.kron(np.eye(gears), part + np.kron(first(speeds), first(torques)))
 
 
 def _ties(m: EfficiencyMap) -> np.ndarray:
@@ -183,25 +213,33 @@ def _square(d: np.ndarray) -> np.ndarray:
     return d.T @ d
 
 
-def _fit(problem: _Problem, prior: np.ndarray, mean: float, theta: np.ndarray, max_steps: int) -> Any:
-    """Nodes, covariance, noise, whether it converged, and the log marginal likelihood."""
+def _fit(problem: _Problem, losses: _Losses, prior: np.ndarray, theta: np.ndarray, max_steps: int) -> Any:
+    """Log losses of the nodes, covariance, noise, whether it converged, and the log marginal likelihood."""
     count = len(problem.measured)
-    residual = problem.residual(theta)
+    residual = problem.residual(losses.efficiency(theta))
     noise = float(np.std(residual))
     done = False
+
+    def curvature(theta: np.ndarray) -> np.ndarray:
+        slope = losses.slope(theta)
+        return problem.curvature(losses.efficiency(theta)) * np.outer(slope, slope) / noise**2 + prior
+
+    def cost(residual: np.ndarray, theta: np.ndarray) -> float:
+        away = theta - losses.mean
+        return 0.5 * float(residual @ residual / noise**2 + away @ prior @ away)
+
     for _ in range(max_steps):
-        hessian = problem.curvature(theta) / noise**2 + prior
-        factor = cho_factor(hessian)
-        gradient = problem.gradient(theta, residual) / noise**2 - prior @ (theta - mean)
-        step = cho_solve(factor, gradient)
-        cost = _cost(residual, noise, prior, theta, mean)
+        factor = cho_factor(curvature(theta))
+        pull = losses.slope(theta) * problem.gradient(losses.efficiency(theta), residual)
+        step = cho_solve(factor, pull / noise**2 - prior @ (theta - losses.mean))
+        before = cost(residual, theta)
         for _ in range(8):
-            tried = np.clip(theta + step, LOWEST, HIGHEST)
-            after = problem.residual(tried)
-            if _cost(after, noise, prior, tried, mean) <= cost:
+            tried = np.clip(theta + step, losses.mean - FARTHEST, losses.mean + FARTHEST)
+            after = problem.residual(losses.efficiency(tried))
+            if cost(after, tried) <= before:
                 break
             step = 0.5 * step
-        moved = float(np.max(np.abs(tried - theta)))
+        moved = float(np.max(np.abs(losses.efficiency(tried) - losses.efficiency(theta))))
         theta, residual = tried, after
         # effective number of nodes (MacKay, Neural Computation 4, 1992): the noise that explains the residual
         used = theta.size - float(np.sum(cho_solve(factor, np.eye(theta.size)) * prior))
@@ -209,14 +247,8 @@ def _fit(problem: _Problem, prior: np.ndarray, mean: float, theta: np.ndarray, m
         if moved < 1e-4:
             done = True
             break
-    hessian = problem.curvature(theta) / noise**2 + prior
-    factor = cho_factor(hessian)
+    factor = cho_factor(curvature(theta))
     _, size_prior = np.linalg.slogdet(prior)
     size_post = 2 * float(np.sum(np.log(np.diag(factor[0]))))
-    evidence = -_cost(residual, noise, prior, theta, mean) - count * np.log(noise) + 0.5 * (size_prior - size_post)
+    evidence = -cost(residual, theta) - count * np.log(noise) + 0.5 * (size_prior - size_post)
     return theta, cho_solve(factor, np.eye(theta.size)), noise, done, float(evidence)
-
-
-def _cost(residual: np.ndarray, noise: float, prior: np.ndarray, theta: np.ndarray, mean: float) -> float:
-    away = theta - mean
-    return 0.5 * float(residual @ residual / noise**2 + away @ prior @ away)
