@@ -7,11 +7,11 @@ precision
 
     P = smooth·(D_ss'D_ss + D_tt'D_tt + D_st'D_st) + gears·D_g'D_g + I/wide²,
 
-second differences along speed and torque (steps of one node) and first differences from gear to gear: a Gaussian Markov
-random field (Rue and Held, Gaussian Markov Random Fields, section 3.4). `smooth` is chosen by the marginal likelihood of
-the log (Laplace), and so is the noise. Each step solves the normal equations with the kernel's own gradient; the
-bilinear weights of the nodes stand for the map's own in the curvature alone, which decides the pace and the uncertainty
-and not where the fit ends.
+second differences along speed and torque (steps of one node) and first differences from gear to gear: a Gaussian
+Markov random field (Rue and Held, Gaussian Markov Random Fields, section 3.4). `smooth` is chosen by the marginal
+likelihood of the log (Laplace), and so is the noise. Each step solves the normal equations with the kernel's own
+gradient; the bilinear weights of the nodes stand for the map's own in the curvature alone, which decides the pace and
+the uncertainty and not where the fit ends.
 """
 
 from dataclasses import dataclass
@@ -29,12 +29,11 @@ from hdev_jax.errors import InputError
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
-__all__ = ["LearnedMap", "learn_map"]
+__all__ = ["LearnedMap", "learn_map", "operating_points"]
 
 FARTHEST = 12.0  # of a log loss from its prior mean: beyond any machine
-SMOOTH = tuple(
-    float(s) for s in np.geomspace(1e0, 1e4, 5)
-)  # tried: 1e2 is a bend of the losses of 10 % from node to node
+# Tried, the smoothest first, from which the rougher ones begin: 1e2 is a bend of the losses of 10 % from node to node.
+SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 1e-2, 6))
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ def learn_map(
     wide: float = 3.0,
     gears: float = 1e2,
     smooth: tuple[float, ...] = SMOOTH,
-    max_steps: int = 15,
+    max_steps: int = 40,
 ) -> LearnedMap:
     """Learn the driveline's map on the grid of `start`, all else of the vehicle being known.
 
@@ -140,7 +139,7 @@ class _Problem:
     def __init__(self, vehicle: Vehicle, log: Segments, measured: np.ndarray, start: EfficiencyMap):
         self.log, self.measured, self.shape = log, measured, start.values.shape
         self.start, self.vehicle = start, vehicle
-        speed, torque = eqx.filter_jit(_points)(vehicle, log)
+        speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
         self.place = _places(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
         self.weights = _weights(start, *self.place)
         self._energy = eqx.filter_jit(self._with)
@@ -171,7 +170,8 @@ class _Problem:
         return out
 
 
-def _points(vehicle: Vehicle, log: Segments) -> Any:
+def operating_points(vehicle: Vehicle, log: Segments) -> Any:
+    """Motor speed [rad/s] and torque [Nm] of each row, as the map sees them."""
     ratio = jax.vmap(vehicle.driveline.ratio_radpm)(log)
     return log.get("motor_speed_radps", log.speed_mps * ratio), vehicle.force(log) / ratio
 

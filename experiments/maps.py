@@ -1,0 +1,150 @@
+"""An efficiency map learned from a log of the synthetic fleet, against the true one, cell by cell of its grid.
+
+The vehicle is the true one but for its map, of which the learner knows the grid. A cell's error is the mean over its
+rows of the learned less the true efficiency at their operating points. Three logs of each vehicle: with noise on the
+energy alone, with every instrument as the fleet has it (speed, slope, a target that is late, dropouts), and with a
+sheet's vehicle in place of the true one, which lacks what the fleet hides from its sheets.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from pydantic import Field
+
+from experiments.config import Strict
+from experiments.figures import save_figure, styled
+from experiments.tables import write_tables
+from hdev_jax.report.canvas import AFTER, GREY, figure, tidy
+from hdev_jax.rundir import Run
+
+__all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
+
+SOURCES = ("maps.py",)
+EXACT = {"speed_noise_mps": 0.0, "grade_noise_rad": 0.0, "clock_skew_s": 0.0, "dropout_share": 0.0}
+MASS_KNOWN = {"payload_bias": 0.0, "payload_sd": 0.0}
+LOGS = {
+    "noise on the energy": {"log": EXACT, "truth": MASS_KNOWN},
+    "all instruments": {"truth": MASS_KNOWN},
+    "all instruments, the sheet's vehicle": {},
+}
+
+
+class Config(Strict):
+    """Vehicles, the length of their logs, and what is asked of cells of so many rows."""
+
+    experiment: Literal["maps"]
+    artefact: str
+    caption: str
+    variants: list[str]
+    logs: list[str] = Field(default_factory=lambda: list(LOGS))
+    asked_of: str = "noise on the energy"
+    routes: int = 60
+    least_rows: int = 50
+    within: float = 0.01
+    seed: int = Field(0, ge=0)
+
+
+def tasks(config: Config) -> Iterator[dict[str, Any]]:
+    """One for each vehicle and log."""
+    for variant in config.variants:
+        for log in config.logs:
+            yield {"variant": variant, "log": log, "routes": config.routes, "least_rows": config.least_rows,
+                   "seed": config.seed}  # fmt: skip
+
+
+def run(task: dict[str, Any]) -> dict[str, Any]:
+    """Errors and claimed standard deviations of cells with enough rows, with where they are."""
+    from hdev_jax.fleet import simulate
+    from hdev_jax.inference.map_fit import learn_map, operating_points
+    from hdev_jax.physics import EfficiencyMap
+
+    settings = {"seed": task["seed"] + 1, "routes": task["routes"], "variants": [task["variant"]]}
+    vehicle = simulate({**settings, **LOGS[task["log"]]}).vehicles[0]
+    gears, padded = vehicle.variant.gears, vehicle.true.driveline.efficiency
+    grid = (padded.gears[:gears], padded.speeds_radps, padded.torques_nm)
+    truth = EfficiencyMap(*grid, padded.values[:gears])
+    car = eqx.tree_at(
+        lambda c: (c.driveline.efficiency, c.driveline.gear_ratios),
+        vehicle.tabular if "sheet" in task["log"] else vehicle.true,
+        (truth, jnp.asarray(vehicle.variant.gear_ratios)),
+    )
+    start = EfficiencyMap(*grid, jnp.full(truth.values.shape, 0.85))
+    s = vehicle.segments
+    found = learn_map(car, s, np.asarray(vehicle.energy_wh), start)
+    moves = np.asarray(s.distance_m) > 0
+    w, t = (np.asarray(x)[moves] for x in operating_points(car, jax.tree.map(jnp.asarray, s)))
+    g = np.asarray(s.channels["gear"])[moves]
+    learned, true = (
+        np.asarray(jax.vmap(m)(jnp.asarray(g), jnp.asarray(w), jnp.asarray(t))) for m in (found.map, truth)
+    )
+    speeds, torques = (np.asarray(x) for x in grid[1:])
+    i = np.clip(np.searchsorted(speeds, w, side="right") - 1, 0, len(speeds) - 2)
+    j = np.clip(np.searchsorted(torques, t, side="right") - 1, 0, len(torques) - 2)
+    cells, at, count = np.unique(np.stack([g.astype(int), i, j]), axis=1, return_inverse=True, return_counts=True)
+    at = np.ravel(at)
+    enough = np.flatnonzero(count >= task["least_rows"])
+    mean = lambda x: [float(np.mean(x[at == c])) for c in enough]  # noqa: E731
+    near = [found.sd[g - 1, i : i + 2, j : j + 2].max() for g, i, j in cells[:, enough].T]
+    return {
+        "error": mean(learned - true), "sd": [float(x) for x in near], "eta": mean(true),
+        "torque_share": mean(t / torques[-1]), "power_kw": mean(np.abs(t * w) / 1e3), "rows": count[enough].tolist(),
+        "all_rows": int(moves.sum()), "gears": gears, "noise_wh": found.noise_wh, "smooth": found.smooth,
+        "converged": found.converged,
+    }  # fmt: skip
+
+
+def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:
+    """How many cells are within what is asked, by vehicle and log."""
+    lines, missed = [], []
+    for task, r in results:
+        error, sd = np.abs(r["error"]), np.array(r["sd"])
+        ours = {
+            "gears": r["gears"], "rows": r["all_rows"], "cells": len(error),
+            "within": float(np.mean(error < config.within)),
+            "median_error_percent": 100 * float(np.median(error)), "worst_percent": 100 * float(np.max(error)),
+            "worst_at_kw": r["power_kw"][int(np.argmax(error))], "within_2_sd": float(np.mean(error < 2 * sd)),
+            "noise_wh": r["noise_wh"],
+        }  # fmt: skip
+        lines.append({"name": f"{task['variant']}, {task['log']}", "paper": None, "ours": ours})
+        if task["log"] == config.asked_of and ours["within"] < 1.0:
+            missed.append(
+                f"{task['variant']}: worst cell {ours['worst_percent']:.2f} %, {100 * config.within:g} wanted"
+            )
+        if not r["converged"]:
+            missed.append(f"{task['variant']}, {task['log']}: not converged")
+    write_tables(run, "maps", [{"vehicle and log": r["name"], **r["ours"]} for r in lines], config.caption)
+    _figure(run, results, config.within)
+    return {
+        "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": lines, "missed": missed,
+        "better_than_paper": 0, "of": 0,
+        "notes": [
+            f"cells of the map's grid (gear, speed, torque) with {config.least_rows} rows or more; errors in % points",
+            "the learner knows the vehicle but for its map, the mass by trip and the grid; the sheet's vehicle lacks "
+            "all that the fleet hides, which its map then takes up",
+        ],
+    }  # fmt: skip
+
+
+@styled
+def _figure(run: Run, results: Any, within: float) -> None:
+    logs = list(dict.fromkeys(t["log"] for t, _ in results))
+    fig = figure(9.0, 3.0)
+    for k, log in enumerate(logs, start=1):
+        ax = fig.add_subplot(1, len(logs), k)
+        ax.axhspan(-100 * within, 100 * within, color=GREY, alpha=0.25, linewidth=0)
+        for t, r in results:
+            if t["log"] == log:
+                ax.plot(100 * np.array(r["torque_share"]), 100 * np.array(r["error"]), ".", markersize=4, alpha=0.6,
+                        label=t["variant"])  # fmt: skip
+        ax.set_xlabel("motor torque, % of the highest")
+        ax.set_title(log.replace(", the", ",\nthe"))
+        if k == 1:
+            ax.set_ylabel("learned less true efficiency, % points")
+            ax.legend(fontsize=6)
+        ax.axhline(0.0, color=AFTER, linewidth=0.6)
+        tidy(ax)
+    save_figure(run, fig, "maps")
