@@ -110,7 +110,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     if effects:
         write_tables(run, "effects", effects, "What the diagnosis found, by vehicle: how often, and its median size")
     model_bars(run, gathered, data)
-    used = {t["name"]: r["effects"] for t, r in results if r.get("effects")}
+    used = {t["name"]: r["effects"] for t, r in results if "effects" in r and t["model"].get("effects")}
     return {
         "artefact": config.artefact, "data": data, "synthetic": config.data == "fleet", "rows": rows,
         "better_than_paper": 0, "of": 0, "headline": "rmse", "missed": _missed(config, gathered, at_bound),
@@ -123,7 +123,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "errors of coefficients: median of predicted over true, less one; spray counts as air",
             *_lost(results),
             *([GIVEN] if config.data == "fleet" else []),
-            *(f"effects in {name}: {', '.join(effects)}" for name, effects in used.items()),
+            *(f"effects in {name}: {', '.join(effects) or 'none'}" for name, effects in used.items()),
         ],
     }  # fmt: skip
 
