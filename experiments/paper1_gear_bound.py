@@ -5,6 +5,7 @@ agree the row tells the gear. Where they differ, the best guess is the likelier 
 the sheet tell; how good it is, is estimated by a classifier of just that choice, trained on the training routes' rows
 in the band with noiseless features, `lowest` and `highest` among them, and scored on the held-out rows. A held-out
 accuracy is never above the Bayes bound but by chance: the bound may lie somewhat higher than the estimate, not lower.
+For balanced accuracy each gear counts as common as it is in the held-out rows themselves, which no classifier knows.
 """
 
 import numpy as np

@@ -15,6 +15,7 @@ __all__ = ["collect", "equation_1", "macro_f1"]
 WORST_PERCENT = 1.0  # of a vehicle's energy, that the surrogate's gear may add
 POINTS = {"unseen_routes": 0.02, "unseen_variants": 0.06}
 POOLED, WITH_MEMORY = 0.90, 0.98
+GROUPS = {"all": "", "2 to 4 speeds": "_2_to_4_speeds", "12 speeds": "_12_speeds"}
 
 
 def equation_1(confusion: np.ndarray) -> float:
@@ -49,12 +50,15 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             found[name] = result
     rows: list[dict[str, Any]] = []
     for name, result in found.items():
-        rows.append({"name": name, "paper": config.paper.get(name), "ours": _ours(result, bound, result["scores"])})
+        of_rows = {} if name.endswith("+previous_gear") else bound  # what holds for single rows
+        rows.append({"name": name, "paper": config.paper.get(name), "ours": _ours(result, of_rows, result["scores"])})
         if "memory" in result:
             how = "+chain" if name.endswith("+previous_gear") else "+filter"
             rows.append({"name": f"{name}{how}", "paper": None, "ours": _memory(result["memory"], bound)})
     short = config.artefact.rpartition("/")[2]
     write_tables(run, short, [_line(r) for r in rows], config.caption)
+    if lines := [*_beside_bound(config, found, bound)]:
+        write_tables(run, f"{short}_bounds", lines, f"{config.figure}/{config.sets[-1]} beside its bound, in %")
     write_tables(
         run, f"{short}_speed", [*_speed(found)], "Time of a prediction, as it was on this machine while it worked"
     )
@@ -88,15 +92,28 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "balanced: the same probabilities, told as the likeliest gear where each is as common as any other in "
             "training (weights of classes in the decision, not in the fit); gears rarer than a share that the search "
             f"chooses count as that common; gears of fewer than {LEAST_ROWS} rows in what is scored are left out, of "
-            f"bounds too ({_rare(bound)})",
+            "bounds too; a bound's gears count as common as they are in what is scored, which can only raise it",
         ],
     }  # fmt: skip
 
 
-def _rare(bound: Mapping[str, float]) -> str:
-    """How many rows of each split are of gears too rare to be scored."""
-    counts = {k.replace("_", " "): bound.get(f"rare_rows_{k}") for k in POINTS}
-    return ", ".join(f"{n:.0f} rows of {k}" for k, n in counts.items() if n is not None) or "bounds not run"
+def _beside_bound(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -> Any:
+    """Each group and split of the chosen model, row by row and with the previous gear."""
+    name = f"{config.figure}/{config.sets[-1]}"
+    if name not in found or not bound:
+        return
+    memory = found.get(f"{name}+previous_gear", {}).get("scores", {})
+    for split in POINTS:
+        for group, end in GROUPS.items():
+            line: dict[str, Any] = {"rows of": f"{split.replace('_', ' ')}, {group}"}
+            for kind in ("accuracy", "balanced"):
+                key = f"{kind}_{split}{end}"
+                if key in bound:
+                    own = found[name]["scores"][key]
+                    line |= {kind: f"{100 * own:.1f}", f"{kind} bound": f"{100 * bound[key]:.1f}"}
+                    line[f"{kind}, points behind"] = f"{100 * (bound[key] - own):.1f}"
+                    line[f"{kind}, previous gear known"] = f"{100 * memory[key]:.1f}" if key in memory else None
+            yield {**line, "rows of rare gears": bound.get(f"rare_rows_{split}{end}")}
 
 
 _ENERGY = (
@@ -174,7 +191,7 @@ def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -
     if name not in found:
         return
     r = found[name]
-    for end in ("", "_2_to_4_speeds", "_12_speeds"):
+    for end in GROUPS.values():
         for split, points in POINTS.items():
             for kind in ("accuracy", "balanced"):
                 key = f"{kind}_{split}{end}"
@@ -186,8 +203,9 @@ def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -
     if (other := f"{name}+previous_gear") in found:
         with_memory |= {other: found[other]["scores"], f"{other}+chain": found[other]["memory"]}
     best = max(with_memory, key=lambda k: with_memory[k]["accuracy_unseen_routes"])
-    for split in POINTS:
-        key = f"accuracy_{split}"
+    for key in (
+        f"{kind}_{split}{end}" for kind in ("accuracy", "balanced") for split in POINTS for end in GROUPS.values()
+    ):
         if with_memory[best].get(key, 1.0) < WITH_MEMORY:
             yield f"{best}: {key} {100 * with_memory[best][key]:.1f} %, wanted 98 %"
     for way in ("hard", "soft"):

@@ -5,13 +5,13 @@ the shaft, for driving and for braking. Losses go on smoothly where the torque c
 off a cliff, so that what is known of them at larger torques tells of those at small ones. A priori u is Gaussian of
 precision
 
-    P = smooth·(D_ss'D_ss + D_tt'D_tt + D_st'D_st) + gears·D_g'D_g + I/wide²,
+    P = smooth·(D_ss'D_ss + D_tt'D_tt + D_st'D_st) + alike·(D_g'D_g + D_±'D_±) + I/wide²,
 
-second differences along speed and torque (steps of one node) and first differences from gear to gear: a Gaussian
-Markov random field (Rue and Held, Gaussian Markov Random Fields, section 3.4). `smooth` is chosen by the marginal
-likelihood of the log (Laplace), and so is the noise. Each step solves the normal equations with the kernel's own
-gradient; the bilinear weights of the nodes stand for the map's own in the curvature alone, which decides the pace and
-the uncertainty and not where the fit ends.
+second differences along speed and torque (steps of one node), first differences from gear to gear and between torques
+of either sign, since copper and iron do not know which way the power flows: a Gaussian Markov random field (Rue and
+Held, Gaussian Markov Random Fields, section 3.4). `smooth` is chosen by the marginal likelihood of the log (Laplace),
+and so is the noise. Each step is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt), with the
+kernel's own Jacobian.
 """
 
 from dataclasses import dataclass
@@ -32,8 +32,12 @@ from hdev_jax.segments import Segments
 __all__ = ["LearnedMap", "learn_map", "operating_points"]
 
 FARTHEST = 12.0  # of a log loss from its prior mean: beyond any machine
-# Tried, the smoothest first, from which the rougher ones begin: 1e2 is a bend of the losses of 10 % from node to node.
-SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 1e-2, 6))
+SETTLED, NEARLY = 0.01, 3.0  # log-likelihood that the last step gained, and that one more would by its own reckoning
+MOST_DAMPED = 8
+REACH = 4  # nodes along each axis that a row's efficiency depends on: its cell's two, and one more on either side
+# Tried, the smoothest first, from which the rougher ones begin: 1e2 is a bend of the losses of 10 % from node to node,
+# 1 one of a factor of e. Losses of a machine bend no more than that; an efficiency that is cut off somewhere does.
+SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 1e0, 4))
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class LearnedMap:
     """The map; `sd` of its nodes [gear, speed, torque]; `rows`, how many of the log each cell has [gear, cell, cell].
 
     `noise_wh` is the estimated noise of a row's energy, `smooth` the chosen strength, `evidence` the log marginal
-    likelihood by strength tried. `converged`: the last step moved no node by more than 1e-4.
+    likelihood by strength tried. `converged`: one more step would gain next to nothing.
     """
 
     map: EfficiencyMap
@@ -61,7 +65,7 @@ def learn_map(
     *,
     mean: float = 0.85,
     wide: float = 3.0,
-    gears: float = 1e2,
+    alike: float = 1e2,
     smooth: tuple[float, ...] = SMOOTH,
     max_steps: int = 40,
 ) -> LearnedMap:
@@ -69,11 +73,20 @@ def learn_map(
 
     **Arguments:** `energy_wh`, measured [row]; `start`, the grid, and the values where the search begins; `mean`, the
     efficiency at half of the grid's highest power that the prior's losses stand for, `wide`, the sd of a log loss about
-    them; `gears`, precision of the difference of log losses between neighbouring gears.
+    them; `alike`, precision of the difference of log losses between neighbouring gears, and between torques of either
+    sign where the grid has both.
 
-    **Raises:** `InputError` where the log has no gear, or one that the grid lacks, or too few rows that move.
+    **Raises:** `InputError` where the log has no gear, or one that the grid lacks, or too few rows that move; for
+    energies that are no numbers or of another length, and a grid of less than two speeds and two torques.
     """
-    log = segments
+    log, energy_wh = segments, np.asarray(energy_wh, dtype=float)
+    if len(energy_wh) != len(log) or not np.all(np.isfinite(energy_wh)):
+        raise InputError(
+            f"learning an efficiency map: a finite energy for each of {len(log)} rows is expected, found "
+            f"{int(np.sum(np.isfinite(energy_wh)))}"
+        )
+    if min(start.values.shape[1:]) < 2 or not np.all(np.isfinite(np.asarray(start.values))):
+        raise InputError("learning an efficiency map: a grid of two speeds and two torques or more, with finite values")
     if not log.has("gear"):
         raise InputError("learning an efficiency map: the log has no column 'gear'")
     moving = np.asarray(log.distance_m) > 0
@@ -82,14 +95,14 @@ def learn_map(
         raise InputError(f"learning an efficiency map: the log drives in gear {odd[0]:g}, which the grid does not have")
     if moving.sum() < 50:
         raise InputError(f"learning an efficiency map: {moving.sum()} rows that move; at least 50 are expected")
-    problem = _Problem(vehicle, jax.tree.map(jnp.asarray, log), np.asarray(energy_wh, dtype=float), start)
+    problem = _Problem(vehicle, jax.tree.map(jnp.asarray, log), energy_wh, start)
     bends, ties = _bends(start), _ties(start)
     losses = _Losses.of(start, mean)
     theta, noise = losses.logarithm(np.asarray(start.values, dtype=float).ravel()), 0.0
     evidence: dict[float, float] = {}
     best: tuple[float, Any] | None = None
     for strength in smooth:
-        prior = strength * bends + gears * ties + np.eye(theta.size) / wide**2
+        prior = strength * bends + alike * ties + np.eye(theta.size) / wide**2
         fit = _fit(problem, losses, prior, theta, max_steps)
         theta = fit[0]  # the next strength begins where this one ended
         evidence[strength] = fit[-1]
@@ -101,7 +114,7 @@ def learn_map(
     eta = losses.efficiency(theta)
     learned = EfficiencyMap(start.gears, start.speeds_radps, start.torques_nm, jnp.asarray(eta.reshape(shape)))
     sd = (eta * (1.0 - eta) * np.sqrt(np.diag(covariance))).reshape(shape)
-    return LearnedMap(learned, sd, problem.rows_by_cell(learned), noise, chosen, evidence, done)
+    return LearnedMap(learned, sd, problem.rows_by_cell(), noise, chosen, evidence, done)
 
 
 @dataclass(frozen=True)
@@ -113,10 +126,9 @@ class _Losses:
 
     @staticmethod
     def of(m: EfficiencyMap, efficiency: float) -> "_Losses":
-        """Of a grid. At speed 0 no power flows: a node there counts as half of the way to the next."""
-        speeds = np.asarray(m.speeds_radps, dtype=float)
-        slow = 0.5 * float(np.min(speeds[speeds > 0]))
-        power = np.maximum(speeds, slow)[:, None] * np.maximum(np.abs(np.asarray(m.torques_nm)), 1e-3)[None, :]
+        """Of a grid. Where speed or torque is 0 no power flows: a node there counts as half of the way to the next."""
+        speeds, torques = (_from_zero(x) for x in (m.speeds_radps, m.torques_nm))
+        power = speeds[:, None] * torques[None, :]
         mean = np.log(0.5 * np.max(power) * (1.0 / efficiency - 1.0))
         return _Losses(np.tile(power.ravel(), len(m.gears)), float(mean))
 
@@ -133,18 +145,21 @@ class _Losses:
         return -eta * (1.0 - eta)
 
 
+def _from_zero(axis: Any) -> np.ndarray:
+    size = np.abs(np.asarray(axis, dtype=float))
+    return np.maximum(size, 0.5 * np.min(size[size > 0]))
+
+
 class _Problem:
-    """Energies, their slopes by each row's own efficiency, and the gradient by the nodes, as functions of the nodes."""
+    """Energies and their Jacobian by the nodes, as functions of the nodes' efficiencies."""
 
     def __init__(self, vehicle: Vehicle, log: Segments, measured: np.ndarray, start: EfficiencyMap):
         self.log, self.measured, self.shape = log, measured, start.values.shape
         self.start, self.vehicle = start, vehicle
         speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
         self.place = _places(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
-        self.weights = _weights(start, *self.place)
         self._energy = eqx.filter_jit(self._with)
-        self._slope = eqx.filter_jit(lambda z: jax.jvp(self._with, (z,), (jnp.ones_like(z),))[1])
-        self._pull = eqx.filter_jit(lambda z, r: jax.vjp(self._with, z)[1](r)[0])
+        self._slope = eqx.filter_jit(lambda z, along: jax.jvp(self._with, (z,), (along,))[1])
 
     def _with(self, values: Any) -> Any:
         found = eqx.tree_at(lambda m: m.values, self.start, values.reshape(self.shape))
@@ -153,20 +168,29 @@ class _Problem:
     def residual(self, eta: np.ndarray) -> np.ndarray:
         return self.measured - np.asarray(self._energy(jnp.asarray(eta)))
 
-    def gradient(self, eta: np.ndarray, residual: np.ndarray) -> np.ndarray:
-        """J'r, by the kernel."""
-        return np.asarray(self._pull(jnp.asarray(eta), jnp.asarray(residual)))
+    def jacobian(self, eta: np.ndarray) -> sparse.csr_matrix:
+        """∂E/∂η [row, node]. A row reads the 4×4 nodes around its cell, so that nodes which are four apart along speed
+        or torque share a derivative: sixteen of the kernel's make them all (Curtis, Powell and Reid, 1974)."""
+        g, i, j = self.place
+        rows, entries = np.arange(len(g)), []
+        of_speed, of_torque = (np.arange(n) % REACH for n in self.shape[1:])
+        for a in range(REACH):
+            for b in range(REACH):
+                along = np.broadcast_to(np.outer(of_speed == a, of_torque == b), self.shape).astype(float)
+                slope = np.asarray(self._slope(jnp.asarray(eta), jnp.asarray(along.ravel())))
+                # the one node of these within reach of the row
+                m, n = (k - 1 + (c - k + 1) % REACH for k, c in ((i, a), (j, b)))
+                there = (m >= 0) & (m < self.shape[1]) & (n >= 0) & (n < self.shape[2]) & (slope != 0)
+                node = np.ravel_multi_index((g[there], m[there], n[there]), self.shape)
+                entries.append((slope[there], rows[there], node))
+        slope, row, node = (np.concatenate(x) for x in zip(*entries, strict=True))
+        return sparse.csr_matrix((slope, (row, node)), shape=(len(g), int(np.prod(self.shape))))
 
-    def curvature(self, eta: np.ndarray) -> np.ndarray:
-        """J'J. A shift of all nodes shifts each row's efficiency by as much: that is ∂E/∂η, the weights do the rest."""
-        j = self.weights.multiply(np.asarray(self._slope(jnp.asarray(eta)))[:, None]).tocsr()
-        return (j.T @ j).toarray()
-
-    def rows_by_cell(self, found: EfficiencyMap) -> np.ndarray:
-        g, i, _, j, _ = self.place
+    def rows_by_cell(self) -> np.ndarray:
+        """Rows that move in each cell; those beyond the grid count in the cell at its edge."""
         out = np.zeros((self.shape[0], self.shape[1] - 1, self.shape[2] - 1), dtype=int)
         use = np.asarray(self.log.distance_m) > 0
-        np.add.at(out, (g[use], i[use], j[use]), 1)
+        np.add.at(out, tuple(k[use] for k in self.place), 1)
         return out
 
 
@@ -177,23 +201,12 @@ def operating_points(vehicle: Vehicle, log: Segments) -> Any:
 
 
 def _places(m: EfficiencyMap, gear: np.ndarray, speed: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Gear and cell of each row."""
     g = np.argmin(np.abs(np.asarray(m.gears)[None, :] - gear[:, None]), axis=1)
-    out: list[np.ndarray] = [g]
+    cells = []
     for axis, x in ((np.asarray(m.speeds_radps), speed), (np.asarray(m.torques_nm), torque)):
-        i = np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
-        out += [i, (np.clip(x, axis[0], axis[-1]) - axis[i]) / (axis[i + 1] - axis[i])]
-    return tuple(out)
-
-
-def _weights(m: EfficiencyMap, g: np.ndarray, i: np.ndarray, a: np.ndarray, j: np.ndarray, b: np.ndarray) -> Any:
-    """Bilinear weights of the nodes [row, node]."""
-    shape, rows = m.values.shape, np.arange(len(g))
-    parts = [
-        (np.ravel_multi_index((g, i + p, j + q), shape), (a if p else 1 - a) * (b if q else 1 - b))
-        for p in (0, 1) for q in (0, 1)
-    ]  # fmt: skip
-    node, weight = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return sparse.csr_matrix((weight, (np.tile(rows, 4), node)), shape=(len(g), int(np.prod(shape))))
+        cells.append(np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2))
+    return (g, *cells)
 
 
 def _bends(m: EfficiencyMap) -> np.ndarray:
@@ -206,7 +219,13 @@ def _bends(m: EfficiencyMap) -> np.ndarray:
 
 def _ties(m: EfficiencyMap) -> np.ndarray:
     gears, speeds, torques = m.values.shape
-    return np.kron(_square(np.diff(np.eye(gears), axis=0)), np.eye(speeds * torques))
+    axis = np.asarray(m.torques_nm, dtype=float)
+    pairs = [(j, k) for k in range(torques) for j in range(k) if np.isclose(axis[j], -axis[k], rtol=1e-6) and axis[k]]
+    mirror = np.zeros((len(pairs), torques))
+    for n, (j, k) in enumerate(pairs):
+        mirror[n, [j, k]] = 1.0, -1.0
+    by_gear = np.kron(_square(np.diff(np.eye(gears), axis=0)), np.eye(speeds * torques))
+    return by_gear + np.kron(np.eye(gears * speeds), _square(mirror))
 
 
 def _square(d: np.ndarray) -> np.ndarray:
@@ -217,37 +236,46 @@ def _fit(problem: _Problem, losses: _Losses, prior: np.ndarray, theta: np.ndarra
     """Log losses of the nodes, covariance, noise, whether it converged, and the log marginal likelihood."""
     count = len(problem.measured)
     residual = problem.residual(losses.efficiency(theta))
-    noise = float(np.std(residual))
+    least = 1e-6 * float(np.std(problem.measured))  # energies without any noise
+    noise = max(float(np.std(residual)), least)
     done = False
 
-    def curvature(theta: np.ndarray) -> np.ndarray:
-        slope = losses.slope(theta)
-        return problem.curvature(losses.efficiency(theta)) * np.outer(slope, slope) / noise**2 + prior
+    def quadratic(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Hessian (Gauss-Newton) and downhill gradient."""
+        jac = problem.jacobian(losses.efficiency(theta)).multiply(losses.slope(theta)[None, :]).tocsr() / noise
+        return (jac.T @ jac).toarray() + prior, jac.T @ (residual / noise) - prior @ (theta - losses.mean)
 
     def cost(residual: np.ndarray, theta: np.ndarray) -> float:
         away = theta - losses.mean
         return 0.5 * float(residual @ residual / noise**2 + away @ prior @ away)
 
+    damping = 0.0
     for _ in range(max_steps):
-        factor = cho_factor(curvature(theta))
-        pull = losses.slope(theta) * problem.gradient(losses.efficiency(theta), residual)
-        step = cho_solve(factor, pull / noise**2 - prior @ (theta - losses.mean))
+        hessian, pull = quadratic(theta)
+        factor = cho_factor(hessian)
+        # what a whole step would gain if costs were quadratic, in log-likelihood; they have kinks where the map's own
+        # slopes turn to 0, at the bottom of which it is never quite nothing
+        done = 0.5 * float(pull @ cho_solve(factor, pull)) < NEARLY
         before = cost(residual, theta)
-        for _ in range(8):
+        for _ in range(MOST_DAMPED):
+            step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian))), pull)
             tried = np.clip(theta + step, losses.mean - FARTHEST, losses.mean + FARTHEST)
             after = problem.residual(losses.efficiency(tried))
-            if cost(after, tried) <= before:
+            if cost(after, tried) < before:
+                damping = damping / 10.0 if damping > 1e-3 else 0.0
                 break
-            step = 0.5 * step
-        moved = float(np.max(np.abs(losses.efficiency(tried) - losses.efficiency(theta))))
+            damping = max(10.0 * damping, 1e-2)
+        else:
+            break  # nowhere downhill
+        gained = before - cost(after, tried)
         theta, residual = tried, after
         # effective number of nodes (MacKay, Neural Computation 4, 1992): the noise that explains the residual
         used = theta.size - float(np.sum(cho_solve(factor, np.eye(theta.size)) * prior))
-        noise = float(np.sqrt(residual @ residual / max(count - used, 1.0)))
-        if moved < 1e-4:
-            done = True
+        noise = max(float(np.sqrt(residual @ residual / max(count - used, 1.0))), least)
+        if done and gained < SETTLED:
             break
-    factor = cho_factor(curvature(theta))
+        done = False
+    factor = cho_factor(quadratic(theta)[0])
     _, size_prior = np.linalg.slogdet(prior)
     size_post = 2 * float(np.sum(np.log(np.diag(factor[0]))))
     evidence = -cost(residual, theta) - count * np.log(noise) + 0.5 * (size_prior - size_post)

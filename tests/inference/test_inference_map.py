@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hdev_jax.errors import InputError
+from hdev_jax.inference import map_fit
 from hdev_jax.inference.map_fit import learn_map
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
@@ -88,6 +89,50 @@ def test_a_gear_that_the_map_lacks_is_refused(tmp_path):
         learn_map(car(true_map()), rows.without("gear"), np.zeros(50), true_map())
 
 
+def of_shape(speeds: int, torques: int) -> EfficiencyMap:
+    m = true_map()
+    return EfficiencyMap(m.gears, m.speeds_radps[:speeds], m.torques_nm[:torques], m.values[:, :speeds, :torques])
+
+
+@pytest.mark.parametrize(
+    ("energy", "start", "said"),
+    [
+        (np.full(60, np.nan), true_map(), "a finite energy for each of 60 rows"),
+        (np.zeros(59), true_map(), "found 59"),
+        (np.zeros(60), of_shape(1, 12), "two speeds and two torques"),
+        (np.zeros(60), of_shape(7, 1), "two speeds and two torques"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_said_in_a_line(energy, start, said):
+    with pytest.raises(InputError, match=said):
+        learn_map(car(true_map()), log(60), energy, start)
+
+
+def test_the_jacobian_by_colours_is_the_kernels():
+    rows, start = jax.tree.map(jnp.asarray, log(80)), true_map()
+    problem = map_fit._Problem(car(start), rows, np.zeros(80), start)
+    eta = np.asarray(start.values).ravel() + 0.01 * np.random.default_rng(0).normal(size=start.values.size)
+    whole = jax.jacobian(problem._with)(jnp.asarray(eta))
+    np.testing.assert_allclose(problem.jacobian(eta).toarray(), whole, atol=1e-10)
+
+
+def test_a_grid_that_holds_a_torque_of_zero():
+    rows, truth = log(600), true_map()
+    energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(1).normal(size=len(rows))
+    torques = jnp.linspace(-2600.0, 2600.0, 13)
+    start = EfficiencyMap(truth.gears, truth.speeds_radps, torques, jnp.full((2, 7, 13), 0.85))
+    found = learn_map(car(start), rows, energy, start)
+    assert found.converged
+    assert found.noise_wh < 1.0
+    assert found.map.values.min() > 0.2
+
+
+def test_energies_without_noise_are_met():
+    rows, truth = log(600), true_map()
+    found = learn_map(car(truth), rows, np.asarray(car(truth).energy(rows)), truth)
+    assert found.noise_wh < 0.1
+
+
 def test_axes_must_increase():
     m = true_map()
     with pytest.raises(ValueError, match="torques_nm must increase"):
@@ -101,6 +146,7 @@ def test_a_learned_map_is_the_true_one_where_the_log_has_been():
     energy = np.asarray(vehicle.energy(rows)) + 0.5 * rng.normal(size=len(rows))
     start = eqx.tree_at(lambda m: m.values, truth, jnp.full(truth.values.shape, 0.85))
     found = learn_map(car(start), rows, energy, start)
+    assert found.converged
     assert 0.45 < found.noise_wh < 0.55
     assert found.rows.sum() == len(rows)
     ratio = np.where(rows.channels["gear"] == 1, 50.0, 20.0)
