@@ -153,7 +153,8 @@ def _figure(run: Run, results: Any, within: float) -> None:
         ax.set_title(log.replace(", the", ",\nthe"))
         if k == 1:
             ax.set_ylabel("learned less true efficiency, % points")
-            ax.legend(fontsize=6)
+        if k == len(logs):
+            ax.legend(fontsize=6, loc="upper left")  # of the three, the panel with room
         ax.axhline(0.0, color=AFTER, linewidth=0.6)
         tidy(ax)
     save_figure(run, fig, "maps")

@@ -98,7 +98,7 @@ def learn_map(
     problem = _Problem(vehicle, jax.tree.map(jnp.asarray, log), energy_wh, start)
     bends, ties = _bends(start), _ties(start)
     losses = _Losses.of(start, mean)
-    theta, noise = losses.logarithm(np.asarray(start.values, dtype=float).ravel()), 0.0
+    theta = losses.logarithm(np.asarray(start.values, dtype=float).ravel())
     evidence: dict[float, float] = {}
     best: tuple[float, Any] | None = None
     for strength in smooth:
