@@ -154,7 +154,7 @@ def _figure(run: Run, results: Any, within: float) -> None:
         if k == 1:
             ax.set_ylabel("learned less true efficiency, % points")
         if k == len(logs):
-            ax.legend(fontsize=6, loc="upper left")  # of the three, the panel with room
+            ax.legend(fontsize=6, loc="upper right")  # of the three, the panel with room
         ax.axhline(0.0, color=AFTER, linewidth=0.6)
         tidy(ax)
     save_figure(run, fig, "maps")
