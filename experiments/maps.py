@@ -42,7 +42,7 @@ class Config(Strict):
     caption: str
     variants: list[str]
     logs: list[LogName] = Field(default_factory=lambda: list(LOGS))
-    asked_of: LogName = "noise on the energy"
+    asked_of: list[LogName] = Field(default_factory=lambda: ["noise on the energy", "all instruments"])
     routes: int = 60
     least_rows: int = 50
     within: float = 0.01
@@ -58,9 +58,9 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
-    """Errors and claimed standard deviations of cells with enough rows, with where they are."""
+    """Errors of cells with enough rows, with where they are; errors of their nodes over the claimed sds."""
     from hdev_jax.fleet import simulate
-    from hdev_jax.inference.map_fit import learn_map, operating_points
+    from hdev_jax.inference.map_fit import cells_of, learn_map, operating_points
     from hdev_jax.physics import EfficiencyMap
 
     settings = {"seed": task["seed"] + 1, "routes": task["routes"], "variants": [task["variant"]]}
@@ -82,19 +82,17 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     learned, true = (
         np.asarray(jax.vmap(m)(jnp.asarray(g), jnp.asarray(w), jnp.asarray(t))) for m in (found.map, truth)
     )
-    speeds, torques = (np.asarray(x) for x in grid[1:])
-    i = np.clip(np.searchsorted(speeds, w, side="right") - 1, 0, len(speeds) - 2)
-    j = np.clip(np.searchsorted(torques, t, side="right") - 1, 0, len(torques) - 2)
-    cells, at, count = np.unique(np.stack([g.astype(int), i, j]), axis=1, return_inverse=True, return_counts=True)
+    places = np.stack(cells_of(truth, g, w, t))
+    cells, at, count = np.unique(places, axis=1, return_inverse=True, return_counts=True)
     at = np.ravel(at)
     enough = np.flatnonzero(count >= task["least_rows"])
     mean = lambda x: [float(np.mean(x[at == c])) for c in enough]  # noqa: E731
-    corners = {(g - 1, i + m, j + n) for g, i, j in cells[:, enough].T for m in (0, 1) for n in (0, 1)}
+    corners = {(g, i + m, j + n) for g, i, j in cells[:, enough].T for m in (0, 1) for n in (0, 1)}
     nodes = tuple(np.array(sorted(corners)).reshape(-1, 3).T)
     off = (np.asarray(found.map.values) - np.asarray(truth.values))[nodes] / found.sd[nodes]
     return {
-        "error": mean(learned - true), "eta": mean(true), "node_z": off.tolist(),
-        "torque_share": mean(t / torques[-1]), "power_kw": mean(np.abs(t * w) / 1e3), "rows": count[enough].tolist(),
+        "error": mean(learned - true), "eta": mean(true), "node_z": off.tolist(), "rows": count[enough].tolist(),
+        "torque_share": mean(t / float(grid[2][-1])), "power_kw": mean(np.abs(t * w) / 1e3),
         "all_rows": int(moves.sum()), "gears": gears, "noise_wh": found.noise_wh, "smooth": found.smooth,
         "converged": found.converged,
     }  # fmt: skip
@@ -117,10 +115,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             "noise_wh": r["noise_wh"],
         }  # fmt: skip
         lines.append({"name": name, "paper": None, "ours": ours})
-        if task["log"] == config.asked_of and ours["within"] < 1.0:
-            missed.append(
-                f"{task['variant']}: worst cell {ours['worst_percent']:.2f} %, {100 * config.within:g} wanted"
-            )
+        if task["log"] in config.asked_of and ours["within"] < 1.0:
+            missed.append(f"{name}: worst cell {ours['worst_percent']:.2f} %, {100 * config.within:g} wanted")
         if not r["converged"]:
             missed.append(f"{name}: not converged")
     write_tables(run, "maps", [{"vehicle and log": r["name"], **r["ours"]} for r in lines], config.caption)
@@ -129,7 +125,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": lines, "missed": missed,
         "better_than_paper": 0, "of": 0,
         "notes": [
-            f"asked: every cell within {100 * config.within:g} % in the log with {config.asked_of}",
+            f"asked: every cell within {100 * config.within:g} % of the logs with {' and with '.join(config.asked_of)}",
             f"cells of the map's grid (gear, speed, torque) with {config.least_rows} rows or more; an error is the "
             "mean over the rows, in % points of efficiency, of learned less true at the points that the log shows",
             "the learner knows the vehicle but for its map, the mass by trip and the grid; the sheet's vehicle lacks "

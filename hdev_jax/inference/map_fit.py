@@ -29,7 +29,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
-__all__ = ["LearnedMap", "learn_map", "operating_points"]
+__all__ = ["LearnedMap", "cells_of", "learn_map", "operating_points"]
 
 FARTHEST = 12.0  # of a log loss from its prior mean: beyond any machine
 SETTLED, NEARLY = 0.01, 3.0  # log-likelihood that the last step gained, and that one more would by its own reckoning
@@ -157,7 +157,7 @@ class _Problem:
         self.log, self.measured, self.shape = log, measured, start.values.shape
         self.start, self.vehicle = start, vehicle
         speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
-        self.place = _places(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
+        self.place = cells_of(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
         self._energy = eqx.filter_jit(self._with)
         self._slope = eqx.filter_jit(lambda z, along: jax.jvp(self._with, (z,), (along,))[1])
 
@@ -200,8 +200,8 @@ def operating_points(vehicle: Vehicle, log: Segments) -> Any:
     return log.get("motor_speed_radps", log.speed_mps * ratio), vehicle.force(log) / ratio
 
 
-def _places(m: EfficiencyMap, gear: np.ndarray, speed: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Gear and cell of each row."""
+def cells_of(m: EfficiencyMap, gear: np.ndarray, speed: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Places of each row's gear and of its cell along speed and torque; the cell at the edge for what is beyond it."""
     g = np.argmin(np.abs(np.asarray(m.gears)[None, :] - gear[:, None]), axis=1)
     cells = []
     for axis, x in ((np.asarray(m.speeds_radps), speed), (np.asarray(m.torques_nm), torque)):
