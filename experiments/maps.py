@@ -43,7 +43,7 @@ class Config(Strict):
     variants: list[str]
     logs: list[LogName] = Field(default_factory=lambda: list(LOGS))
     asked_of: list[LogName] = Field(default_factory=lambda: ["noise on the energy", "all instruments"])
-    routes: int = 60
+    routes: int = 179  # a vehicle's share of the fleet's 5,000
     least_rows: int = 50
     within: float = 0.01
     seed: int = Field(0, ge=0)
@@ -93,8 +93,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     return {
         "error": mean(learned - true), "eta": mean(true), "node_z": off.tolist(), "rows": count[enough].tolist(),
         "torque_share": mean(t / float(grid[2][-1])), "power_kw": mean(np.abs(t * w) / 1e3),
-        "all_rows": int(moves.sum()), "gears": gears, "noise_wh": found.noise_wh, "smooth": found.smooth,
-        "converged": found.converged,
+        "all_rows": int(moves.sum()), "gears": gears, "noise_wh": found.noise_wh, "instruments": found.instruments,
+        "smooth": found.smooth, "converged": found.converged,
     }  # fmt: skip
 
 
@@ -112,7 +112,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             "median_error_percent": 100 * float(np.median(error)), "worst_percent": 100 * float(np.max(error)),
             "worst_at_kw": r["power_kw"][int(np.argmax(error))],
             "nodes_in_90": float(np.mean(np.abs(r["node_z"]) < 1.645)),
-            "noise_wh": r["noise_wh"],
+            "noise_wh": r["noise_wh"], "slope_noise_mrad": 1e3 * r["instruments"]["grade_rad"],
         }  # fmt: skip
         lines.append({"name": name, "paper": None, "ours": ours})
         if task["log"] in config.asked_of and ours["within"] < 1.0:

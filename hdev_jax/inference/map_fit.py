@@ -5,13 +5,14 @@ the shaft, for driving and for braking. Losses go on smoothly where the torque c
 off a cliff, so that what is known of them at larger torques tells of those at small ones. A priori u is Gaussian of
 precision
 
-    P = smooth·(D_ss'D_ss + D_tt'D_tt + D_st'D_st) + alike·(D_g'D_g + D_±'D_±) + I/wide²,
+    P = smooth·D₃'D₃ + straight·D₂'D₂ + alike·(D_g'D_g + D_±'D_±) + I/wide²,
 
-second differences along speed and torque (steps of one node), first differences from gear to gear and between torques
-of either sign, since copper and iron do not know which way the power flows: a Gaussian Markov random field (Rue and
-Held, Gaussian Markov Random Fields, section 3.4). `smooth` is chosen by the marginal likelihood of the log (Laplace),
-and so is the noise. Each step is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt), with the
-kernel's own Jacobian.
+third and second differences along speed, torque and both (steps of one node), first differences from gear to gear and
+between torques of either sign, since copper and iron do not know which way the power flows: a Gaussian Markov random field (Rue and
+Held, Gaussian Markov Random Fields, section 3.4), all but improper, so that nothing draws losses to a mean where the
+log has not been. `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the noise, which is not
+alike in all rows (`row_noise`). Each step is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt),
+with the kernel's own Jacobian.
 """
 
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from hdev_jax.errors import InputError
+from hdev_jax.inference.row_noise import INSTRUMENTS, row_noise, shapes
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
@@ -35,23 +37,25 @@ FARTHEST = 12.0  # of a log loss from its prior mean: beyond any machine
 SETTLED, NEARLY = 0.01, 3.0  # log-likelihood that the last step gained, and that one more would by its own reckoning
 MOST_DAMPED = 8
 REACH = 4  # nodes along each axis that a row's efficiency depends on: its cell's two, and one more on either side
-# Tried, the smoothest first, from which the rougher ones begin: 1e2 is a bend of the losses of 10 % from node to node,
-# 1 one of a factor of e. Losses of a machine bend no more than that; an efficiency that is cut off somewhere does.
-SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 1e0, 4))
+# Tried, the smoothest first, from which the rougher ones begin: 1e2 is bends of the log losses that change by 0.1 from
+# node to node.
+SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 10**0.5, 6))
 
 
 @dataclass(frozen=True)
 class LearnedMap:
     """The map; `sd` of its nodes [gear, speed, torque]; `rows`, how many of the log each cell has [gear, cell, cell].
 
-    `noise_wh` is the estimated noise of a row's energy, `smooth` the chosen strength, `evidence` the log marginal
-    likelihood by strength tried. `converged`: one more step would gain next to nothing.
+    `noise_wh` is the estimated noise of a row's energy, in the quadratic mean, `instruments` what it comes from
+    (`row_noise.INSTRUMENTS`), `smooth` the chosen strength, `evidence` the log marginal likelihood by strength tried.
+    `converged`: one more step would gain next to nothing.
     """
 
     map: EfficiencyMap
     sd: Float[np.ndarray, "gear speed torque"]
     rows: np.ndarray
     noise_wh: float
+    instruments: dict[str, float]
     smooth: float
     evidence: dict[float, float]
     converged: bool
@@ -64,8 +68,9 @@ def learn_map(
     start: EfficiencyMap,
     *,
     mean: float = 0.85,
-    wide: float = 3.0,
+    wide: float = 10.0,
     alike: float = 1e2,
+    straight: float = 3.0,
     smooth: tuple[float, ...] = SMOOTH,
     max_steps: int = 40,
 ) -> LearnedMap:
@@ -74,7 +79,8 @@ def learn_map(
     **Arguments:** `energy_wh`, measured [row]; `start`, the grid, and the values where the search begins; `mean`, the
     efficiency at half of the grid's highest power that the prior's losses stand for, `wide`, the sd of a log loss about
     them; `alike`, precision of the difference of log losses between neighbouring gears, and between torques of either
-    sign where the grid has both.
+    sign where the grid has both; `straight`, precision of a bend from node to node, which is what tells where the log
+    has not been; `smooth`, those of a bend's change that are tried.
 
     **Raises:** `InputError` where the log has no gear, or one that the grid lacks, or too few rows that move; for
     energies that are no numbers or of another length, and a grid of less than two speeds and two torques.
@@ -96,25 +102,32 @@ def learn_map(
     if moving.sum() < 50:
         raise InputError(f"learning an efficiency map: {moving.sum()} rows that move; at least 50 are expected")
     problem = _Problem(vehicle, jax.tree.map(jnp.asarray, log), energy_wh, start)
-    bends, ties = _bends(start), _ties(start)
+    rough, ties = _roughness(start, 3), alike * _ties(start) + straight * _roughness(start, 2)
     losses = _Losses.of(start, mean)
     theta = losses.logarithm(np.asarray(start.values, dtype=float).ravel())
     evidence: dict[float, float] = {}
-    best: tuple[float, Any] | None = None
+    best: _Fit | None = None
     for strength in smooth:
-        prior = strength * bends + alike * ties + np.eye(theta.size) / wide**2
-        fit = _fit(problem, losses, prior, theta, max_steps)
-        theta = fit[0]  # the next strength begins where this one ended
-        evidence[strength] = fit[-1]
-        if best is None or fit[-1] > best[1][-1]:
-            best = strength, fit
+        prior = strength * rough + ties + np.eye(theta.size) / wide**2
+        fit = _fit(_Posterior(problem, losses, prior), theta, max_steps)
+        theta = fit.theta  # the next strength begins where this one ended
+        evidence[strength] = fit.evidence
+        if best is None or fit.evidence > best.evidence:
+            best = fit
     assert best is not None
-    chosen, (theta, covariance, noise, done, _) = best
-    shape = start.values.shape
-    eta = losses.efficiency(theta)
-    learned = EfficiencyMap(start.gears, start.speeds_radps, start.torques_nm, jnp.asarray(eta.reshape(shape)))
-    sd = (eta * (1.0 - eta) * np.sqrt(np.diag(covariance))).reshape(shape)
-    return LearnedMap(learned, sd, problem.rows_by_cell(), noise, chosen, evidence, done)
+    eta = losses.efficiency(best.theta)
+    sd = eta * (1.0 - eta) * np.sqrt(np.diag(cho_solve(best.factor, np.eye(eta.size))))
+    values = jnp.asarray(eta.reshape(start.values.shape))
+    return LearnedMap(
+        map=eqx.tree_at(lambda m: m.values, start, values),
+        sd=sd.reshape(values.shape),
+        rows=problem.rows_by_cell(),
+        noise_wh=float(np.sqrt(np.mean(best.noise**2))),
+        instruments=dict(zip(INSTRUMENTS, best.instruments.tolist(), strict=True)),
+        smooth=max(evidence, key=lambda k: evidence[k]),
+        evidence=evidence,
+        converged=best.converged,
+    )
 
 
 @dataclass(frozen=True)
@@ -137,7 +150,10 @@ class _Losses:
 
     def logarithm(self, efficiency: np.ndarray) -> np.ndarray:
         lost = self.power_w * (1.0 / np.clip(efficiency, 1e-3, 0.999) - 1.0)
-        return np.clip(np.log(lost), self.mean - FARTHEST, self.mean + FARTHEST)
+        return self.within(np.log(lost))
+
+    def within(self, u: np.ndarray) -> np.ndarray:
+        return np.clip(u, self.mean - FARTHEST, self.mean + FARTHEST)
 
     def slope(self, u: np.ndarray) -> np.ndarray:
         """∂η/∂u."""
@@ -147,7 +163,7 @@ class _Losses:
 
 def _from_zero(axis: Any) -> np.ndarray:
     size = np.abs(np.asarray(axis, dtype=float))
-    return np.maximum(size, 0.5 * np.min(size[size > 0]))
+    return np.maximum(size, 0.5 * np.min(size[size > 1e-6 * np.max(size)]))  # an axis may miss 0 by rounding
 
 
 class _Problem:
@@ -156,17 +172,12 @@ class _Problem:
     def __init__(self, vehicle: Vehicle, log: Segments, measured: np.ndarray, start: EfficiencyMap):
         self.log, self.measured, self.shape = log, measured, start.values.shape
         self.start, self.vehicle = start, vehicle
+        self.shapes = shapes(log, log.channels.get("mass_kg", vehicle.mass_kg), measured)
         speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
         self.place = cells_of(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
-        self._energy = eqx.filter_jit(self._with)
-        self._slope = eqx.filter_jit(lambda z, along: jax.jvp(self._with, (z,), (along,))[1])
-
-    def _with(self, values: Any) -> Any:
-        found = eqx.tree_at(lambda m: m.values, self.start, values.reshape(self.shape))
-        return eqx.tree_at(lambda v: v.driveline.efficiency, self.vehicle, found).energy(self.log)
 
     def residual(self, eta: np.ndarray) -> np.ndarray:
-        return self.measured - np.asarray(self._energy(jnp.asarray(eta)))
+        return self.measured - np.asarray(_energy(self.vehicle, self.start, self.log, jnp.asarray(eta)))
 
     def jacobian(self, eta: np.ndarray) -> sparse.csr_matrix:
         """∂E/∂η [row, node]. A row reads the 4×4 nodes around its cell, so that nodes which are four apart along speed
@@ -177,7 +188,8 @@ class _Problem:
         for a in range(REACH):
             for b in range(REACH):
                 along = np.broadcast_to(np.outer(of_speed == a, of_torque == b), self.shape).astype(float)
-                slope = np.asarray(self._slope(jnp.asarray(eta), jnp.asarray(along.ravel())))
+                direction = jnp.asarray(eta), jnp.asarray(along.ravel())
+                slope = np.asarray(_slope(self.vehicle, self.start, self.log, *direction))
                 # the one node of these within reach of the row
                 m, n = (k - 1 + (c - k + 1) % REACH for k, c in ((i, a), (j, b)))
                 there = (m >= 0) & (m < self.shape[1]) & (n >= 0) & (n < self.shape[2]) & (slope != 0)
@@ -192,6 +204,17 @@ class _Problem:
         use = np.asarray(self.log.distance_m) > 0
         np.add.at(out, tuple(k[use] for k in self.place), 1)
         return out
+
+
+@eqx.filter_jit
+def _energy(vehicle: Vehicle, start: EfficiencyMap, log: Segments, values: Any) -> Any:
+    found = eqx.tree_at(lambda m: m.values, start, values.reshape(start.values.shape))
+    return eqx.tree_at(lambda v: v.driveline.efficiency, vehicle, found).energy(log)
+
+
+@eqx.filter_jit
+def _slope(vehicle: Vehicle, start: EfficiencyMap, log: Segments, values: Any, along: Any) -> Any:
+    return jax.jvp(lambda x: _energy(vehicle, start, log, x), (values,), (along,))[1]
 
 
 def operating_points(vehicle: Vehicle, log: Segments) -> Any:
@@ -209,12 +232,12 @@ def cells_of(m: EfficiencyMap, gear: np.ndarray, speed: np.ndarray, torque: np.n
     return (g, *cells)
 
 
-def _bends(m: EfficiencyMap) -> np.ndarray:
-    """D'D of second differences along speed and torque and across both."""
+def _roughness(m: EfficiencyMap, order: int) -> np.ndarray:
+    """D'D of differences of an order, along speed, along torque and across both."""
     gears, speeds, torques = m.values.shape
-    first, second = (lambda n, k=k: _square(np.diff(np.eye(n), k, axis=0)) for k in (1, 2))
-    part = np.kron(second(speeds), np.eye(torques)) + np.kron(np.eye(speeds), second(torques))
-    return np.kron(np.eye(gears), part + np.kron(first(speeds), first(torques)))
+    along = lambda n, k: _square(np.diff(np.eye(n), k, axis=0))  # noqa: E731
+    part = sum(np.kron(along(speeds, k), along(torques, order - k)) for k in range(order + 1))
+    return np.kron(np.eye(gears), part)
 
 
 def _ties(m: EfficiencyMap) -> np.ndarray:
@@ -232,51 +255,71 @@ def _square(d: np.ndarray) -> np.ndarray:
     return d.T @ d
 
 
-def _fit(problem: _Problem, losses: _Losses, prior: np.ndarray, theta: np.ndarray, max_steps: int) -> Any:
-    """Log losses of the nodes, covariance, noise, whether it converged, and the log marginal likelihood."""
-    count = len(problem.measured)
+@dataclass(frozen=True)
+class _Fit:
+    """Log losses of the nodes with the Cholesky factor of their precision; noise by row and by instrument; whether it
+    converged; the log marginal likelihood."""
+
+    theta: np.ndarray
+    factor: Any
+    noise: np.ndarray
+    instruments: np.ndarray
+    converged: bool
+    evidence: float
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Of log losses, given the noise."""
+
+    problem: _Problem
+    losses: _Losses
+    prior: np.ndarray
+
+    def cost(self, residual: np.ndarray, noise: np.ndarray, theta: np.ndarray) -> float:
+        away = theta - self.losses.mean
+        return 0.5 * float(np.sum((residual / noise) ** 2) + away @ self.prior @ away)
+
+    def quadratic(self, residual: np.ndarray, noise: np.ndarray, theta: np.ndarray) -> tuple[Any, np.ndarray]:
+        """Hessian (Gauss-Newton) and downhill gradient."""
+        jac = self.problem.jacobian(self.losses.efficiency(theta)).multiply(self.losses.slope(theta)[None, :])
+        jac = jac.multiply(1.0 / noise[:, None]).tocsr()
+        pull = jac.T @ (residual / noise) - self.prior @ (theta - self.losses.mean)
+        return (jac.T @ jac).toarray() + self.prior, pull
+
+
+def _fit(posterior: _Posterior, theta: np.ndarray, max_steps: int) -> _Fit:
+    problem, losses = posterior.problem, posterior.losses
     residual = problem.residual(losses.efficiency(theta))
     least = 1e-6 * float(np.std(problem.measured))  # energies without any noise
-    noise = max(float(np.std(residual)), least)
-    done = False
-
-    def quadratic(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Hessian (Gauss-Newton) and downhill gradient."""
-        jac = problem.jacobian(losses.efficiency(theta)).multiply(losses.slope(theta)[None, :]).tocsr() / noise
-        return (jac.T @ jac).toarray() + prior, jac.T @ (residual / noise) - prior @ (theta - losses.mean)
-
-    def cost(residual: np.ndarray, theta: np.ndarray) -> float:
-        away = theta - losses.mean
-        return 0.5 * float(residual @ residual / noise**2 + away @ prior @ away)
-
-    damping = 0.0
+    noise, instruments = row_noise(residual, problem.shapes, 0.0, least)
+    done, damping = False, 0.0
     for _ in range(max_steps):
-        hessian, pull = quadratic(theta)
+        hessian, pull = posterior.quadratic(residual, noise, theta)
         factor = cho_factor(hessian)
         # what a whole step would gain if costs were quadratic, in log-likelihood; they have kinks where the map's own
         # slopes turn to 0, at the bottom of which it is never quite nothing
         done = 0.5 * float(pull @ cho_solve(factor, pull)) < NEARLY
-        before = cost(residual, theta)
+        before = posterior.cost(residual, noise, theta)
         for _ in range(MOST_DAMPED):
             step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian))), pull)
-            tried = np.clip(theta + step, losses.mean - FARTHEST, losses.mean + FARTHEST)
-            after = problem.residual(losses.efficiency(tried))
-            if cost(after, tried) < before:
+            tried = losses.within(theta + step)
+            left = problem.residual(losses.efficiency(tried))
+            after = posterior.cost(left, noise, tried)
+            if after < before:
                 damping = damping / 10.0 if damping > 1e-3 else 0.0
                 break
             damping = max(10.0 * damping, 1e-2)
         else:
             break  # nowhere downhill
-        gained = before - cost(after, tried)
-        theta, residual = tried, after
+        theta, residual = tried, left
         # effective number of nodes (MacKay, Neural Computation 4, 1992): the noise that explains the residual
-        used = theta.size - float(np.sum(cho_solve(factor, np.eye(theta.size)) * prior))
-        noise = max(float(np.sqrt(residual @ residual / max(count - used, 1.0))), least)
-        if done and gained < SETTLED:
+        used = theta.size - float(np.sum(cho_solve(factor, np.eye(theta.size)) * posterior.prior))
+        noise, instruments = row_noise(residual, problem.shapes, used, least)
+        if done and before - after < SETTLED:
             break
         done = False
-    factor = cho_factor(quadratic(theta)[0])
-    _, size_prior = np.linalg.slogdet(prior)
-    size_post = 2 * float(np.sum(np.log(np.diag(factor[0]))))
-    evidence = -cost(residual, theta) - count * np.log(noise) + 0.5 * (size_prior - size_post)
-    return theta, cho_solve(factor, np.eye(theta.size)), noise, done, float(evidence)
+    factor = cho_factor(posterior.quadratic(residual, noise, theta)[0])
+    sizes = np.linalg.slogdet(posterior.prior)[1], 2 * float(np.sum(np.log(np.diag(factor[0]))))
+    evidence = -posterior.cost(residual, noise, theta) - float(np.sum(np.log(noise))) + 0.5 * (sizes[0] - sizes[1])
+    return _Fit(theta, factor, noise, instruments, done, float(evidence))

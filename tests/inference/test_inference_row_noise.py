@@ -1,0 +1,61 @@
+"""What a row's noise comes from: planted instruments are found again, and those that add nothing are none."""
+
+import numpy as np
+import pytest
+
+from hdev_jax.inference.row_noise import INSTRUMENTS, row_noise, shapes
+from hdev_jax.segments import Segments
+
+MASS = 2e4
+
+
+def log(count: int) -> Segments:
+    rng = np.random.default_rng(3)
+    speed, duration = rng.uniform(1.0, 25.0, count), rng.uniform(4.0, 12.0, count)
+    zero = np.zeros(count, int)
+    return Segments(zero, zero, np.cumsum(duration), duration, speed * duration, speed, speed, {})
+
+
+def energies(rows: Segments) -> np.ndarray:
+    return np.random.default_rng(4).normal(0.0, 150.0, len(rows))
+
+
+@pytest.mark.parametrize(
+    "sd", [(3.0, 0.0, 0.0, 0.0), (3.0, 0.03, 0.0, 0.0), (2.0, 0.0, 4e-4, 0.0), (2.0, 0.03, 4e-4, 0.03)]
+)
+def test_planted_instruments_are_found(sd):
+    rows = log(40_000)
+    shape = shapes(rows, MASS, energies(rows))
+    each = np.sqrt(shape**2 @ np.square(sd))
+    of_row, found = row_noise(each * np.random.default_rng(5).normal(size=len(rows)), shape, 0.0, 1e-9)
+    np.testing.assert_allclose(of_row, each, rtol=0.06)
+    share = np.mean((shape * found) ** 2, axis=0) / np.mean(each**2)
+    np.testing.assert_allclose(share, np.mean((shape * np.array(sd)) ** 2, axis=0) / np.mean(each**2), atol=0.06)
+    assert len(found) == len(INSTRUMENTS)
+
+
+def test_a_slope_off_by_a_milliradian_is_the_climb_of_a_metre_in_a_kilometre():
+    rows = log(10)
+    climb = shapes(rows, MASS, energies(rows))[:, INSTRUMENTS.index("grade_rad")]
+    np.testing.assert_allclose(1e-3 * climb * 3600.0, MASS * 9.80665 * 1e-3 * np.asarray(rows.distance_m))
+
+
+def test_a_change_of_speed_is_one_of_kinetic_energy():
+    rows = log(10)
+    kick = shapes(rows, MASS, energies(rows))[:, INSTRUMENTS.index("speed_mps")] * 3600.0
+    v = np.asarray(rows.speed_mps)
+    np.testing.assert_allclose(1e-3 * kick, 0.5 * MASS * ((v + 5e-4) ** 2 - (v - 5e-4) ** 2), rtol=1e-9)
+
+
+def test_what_parameters_took_of_the_residuals_is_given_back():
+    rows = log(1000)
+    shape, noise = shapes(rows, MASS, energies(rows)), np.random.default_rng(6).normal(size=1000)
+    plain, given = (row_noise(noise, shape, used, 1e-9)[0] for used in (0.0, 500.0))
+    np.testing.assert_allclose(given, np.sqrt(2.0) * plain, rtol=1e-6)
+
+
+def test_no_residuals_are_the_least_noise():
+    rows = log(50)
+    of_row, found = row_noise(np.zeros(50), shapes(rows, MASS, energies(rows)), 0.0, 1e-3)
+    np.testing.assert_array_equal(of_row, 1e-3)
+    np.testing.assert_array_equal(found, 0.0)
