@@ -8,11 +8,11 @@ precision
     P = smooth·D₃'D₃ + straight·D₂'D₂ + alike·(D_g'D_g + D_±'D_±) + I/wide²,
 
 third and second differences along speed, torque and both (steps of one node), first differences from gear to gear and
-between torques of either sign, since copper and iron do not know which way the power flows: a Gaussian Markov random field (Rue and
-Held, Gaussian Markov Random Fields, section 3.4), all but improper, so that nothing draws losses to a mean where the
-log has not been. `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the noise, which is not
-alike in all rows (`row_noise`). Each step is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt),
-with the kernel's own Jacobian.
+between torques of either sign, since copper and iron do not know which way the power flows: a Gaussian Markov random
+field (Rue and Held, Gaussian Markov Random Fields, section 3.4), all but improper, so that nothing draws losses to a
+mean where the log has not been. `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the
+noise, which is not alike in all rows (`row_noise`). Each step is Gauss and Newton's, damped where it leads uphill
+(Levenberg-Marquardt), with the kernel's own Jacobian.
 """
 
 from dataclasses import dataclass
