@@ -25,21 +25,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotri
 
 from hdev_jax.errors import InputError
+from hdev_jax.inference.map_prior import Losses, roughness, ties
 from hdev_jax.inference.row_noise import INSTRUMENTS, row_noise, shapes
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
 __all__ = ["LearnedMap", "cells_of", "learn_map", "operating_points"]
 
-FARTHEST = 12.0  # of a log loss from its prior mean: beyond any machine
 SETTLED, NEARLY = 0.01, 3.0  # log-likelihood that the last step gained, and that one more would by its own reckoning
 MOST_DAMPED = 8
+STEADY = 0.01  # of any row's noise, from step to step
 REACH = 4  # nodes along each axis that a row's efficiency depends on: its cell's two, and one more on either side
-# Tried, the smoothest first, from which the rougher ones begin: 1e2 is bends of the log losses that change by 0.1 from
-# node to node.
-SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 10**0.5, 6))
+# Tried, the smoothest first, from which the rougher ones begin, until the log has been less likely twice: 1e2 is bends
+# of the log losses that change by 0.1 from node to node.
+SMOOTH = tuple(float(s) for s in np.geomspace(1e3, 1e-2, 11))
+WORSE = 2
 
 
 @dataclass(frozen=True)
@@ -85,38 +88,30 @@ def learn_map(
     **Raises:** `InputError` where the log has no gear, or one that the grid lacks, or too few rows that move; for
     energies that are no numbers or of another length, and a grid of less than two speeds and two torques.
     """
-    log, energy_wh = segments, np.asarray(energy_wh, dtype=float)
-    if len(energy_wh) != len(log) or not np.all(np.isfinite(energy_wh)):
-        raise InputError(
-            f"learning an efficiency map: a finite energy for each of {len(log)} rows is expected, found "
-            f"{int(np.sum(np.isfinite(energy_wh)))}"
-        )
-    if min(start.values.shape[1:]) < 2 or not np.all(np.isfinite(np.asarray(start.values))):
-        raise InputError("learning an efficiency map: a grid of two speeds and two torques or more, with finite values")
-    if not log.has("gear"):
-        raise InputError("learning an efficiency map: the log has no column 'gear'")
-    moving = np.asarray(log.distance_m) > 0
-    gear = np.asarray(log.channels["gear"])
-    if odd := sorted(set(gear[moving].tolist()) - set(np.asarray(start.gears).tolist())):
-        raise InputError(f"learning an efficiency map: the log drives in gear {odd[0]:g}, which the grid does not have")
-    if moving.sum() < 50:
-        raise InputError(f"learning an efficiency map: {moving.sum()} rows that move; at least 50 are expected")
-    problem = _Problem(vehicle, jax.tree.map(jnp.asarray, log), energy_wh, start)
-    rough, ties = _roughness(start, 3), alike * _ties(start) + straight * _roughness(start, 2)
-    losses = _Losses.of(start, mean)
+    energy_wh = np.asarray(energy_wh, dtype=float)
+    if not smooth or min(smooth) <= 0.0 or not 0.0 < mean < 1.0 or min(wide, alike, straight) <= 0.0:
+        raise ValueError("strengths of the prior are above 0, its mean is an efficiency between 0 and 1")
+    _check(segments, energy_wh, start)
+    problem = _Problem(vehicle, jax.tree.map(jnp.asarray, segments), energy_wh, start)
+    losses = Losses.of(start, mean)
     theta = losses.logarithm(np.asarray(start.values, dtype=float).ravel())
-    evidence: dict[float, float] = {}
-    best: _Fit | None = None
+    fixed = alike * ties(start) + straight * roughness(start, 2) + np.eye(theta.size) / wide**2
+    rough = roughness(start, 3)
+    fits: list[_Fit] = []
+    best = None
     for strength in smooth:
-        prior = strength * rough + ties + np.eye(theta.size) / wide**2
-        fit = _fit(_Posterior(problem, losses, prior), theta, max_steps)
-        theta = fit.theta  # the next strength begins where this one ended
-        evidence[strength] = fit.evidence
-        if best is None or fit.evidence > best.evidence:
-            best = fit
+        fit = _fit(_Posterior(problem, losses, strength * rough + fixed), strength, theta, max_steps)
+        fits.append(fit)
+        if fit.converged:
+            theta = fit.theta  # the next strength begins where this one ended
+        best = max(fits, key=lambda f: (f.converged, f.evidence))
+        if len(fits) - fits.index(best) > WORSE:
+            break
     assert best is not None
     eta = losses.efficiency(best.theta)
-    sd = eta * (1.0 - eta) * np.sqrt(np.diag(cho_solve(best.factor, np.eye(eta.size))))
+    away = np.sqrt(np.diag(_inverse(best.factor)))
+    # half of what lies within one sd of the log loss to either side: where the log has not been that is far
+    sd = 0.5 * (losses.efficiency(best.theta - away) - losses.efficiency(best.theta + away))
     values = jnp.asarray(eta.reshape(start.values.shape))
     return LearnedMap(
         map=eqx.tree_at(lambda m: m.values, start, values),
@@ -124,46 +119,32 @@ def learn_map(
         rows=problem.rows_by_cell(),
         noise_wh=float(np.sqrt(np.mean(best.noise**2))),
         instruments=dict(zip(INSTRUMENTS, best.instruments.tolist(), strict=True)),
-        smooth=max(evidence, key=lambda k: evidence[k]),
-        evidence=evidence,
+        smooth=best.strength,
+        evidence={f.strength: f.evidence for f in fits},
         converged=best.converged,
     )
 
 
-@dataclass(frozen=True)
-class _Losses:
-    """Log losses of nodes and what efficiency they are: `power_w` at each node's shaft, `mean` of the log losses."""
-
-    power_w: Float[np.ndarray, " node"]
-    mean: float
-
-    @staticmethod
-    def of(m: EfficiencyMap, efficiency: float) -> "_Losses":
-        """Of a grid. Where speed or torque is 0 no power flows: a node there counts as half of the way to the next."""
-        speeds, torques = (_from_zero(x) for x in (m.speeds_radps, m.torques_nm))
-        power = speeds[:, None] * torques[None, :]
-        mean = np.log(0.5 * np.max(power) * (1.0 / efficiency - 1.0))
-        return _Losses(np.tile(power.ravel(), len(m.gears)), float(mean))
-
-    def efficiency(self, u: np.ndarray) -> np.ndarray:
-        return self.power_w / (self.power_w + np.exp(u))
-
-    def logarithm(self, efficiency: np.ndarray) -> np.ndarray:
-        lost = self.power_w * (1.0 / np.clip(efficiency, 1e-3, 0.999) - 1.0)
-        return self.within(np.log(lost))
-
-    def within(self, u: np.ndarray) -> np.ndarray:
-        return np.clip(u, self.mean - FARTHEST, self.mean + FARTHEST)
-
-    def slope(self, u: np.ndarray) -> np.ndarray:
-        """∂η/∂u."""
-        eta = self.efficiency(u)
-        return -eta * (1.0 - eta)
-
-
-def _from_zero(axis: Any) -> np.ndarray:
-    size = np.abs(np.asarray(axis, dtype=float))
-    return np.maximum(size, 0.5 * np.min(size[size > 1e-6 * np.max(size)]))  # an axis may miss 0 by rounding
+def _check(log: Segments, energy_wh: np.ndarray, start: EfficiencyMap) -> None:
+    what = "learning an efficiency map"
+    if energy_wh.shape != (len(log),) or not np.all(np.isfinite(energy_wh)):
+        found = int(np.sum(np.isfinite(energy_wh)))
+        raise InputError(f"{what}: a finite energy for each of {len(log)} rows is expected, found {found}")
+    if min(start.values.shape[1:]) < 2 or not np.all(np.isfinite(np.asarray(start.values))):
+        raise InputError(f"{what}: a grid of two speeds and two torques or more, with finite values, is expected")
+    if not log.has("gear"):
+        raise InputError(f"{what}: the log has no column 'gear'")
+    for name in ("grade_rad", "mass_kg"):
+        if len(odd := np.flatnonzero(~np.isfinite(np.asarray(log.get(name, np.zeros(len(log))))))):
+            raise InputError(
+                f"{what}: row {odd[0] + 1}, column '{name}': a number is expected; fill it or leave the row out"
+            )
+    moving = np.asarray(log.distance_m) > 0
+    gear = np.asarray(log.channels["gear"])
+    if odd := sorted(set(gear[moving].tolist()) - set(np.asarray(start.gears).tolist())):
+        raise InputError(f"{what}: the log drives in gear {odd[0]:g}, which the grid does not have")
+    if moving.sum() < 50:
+        raise InputError(f"{what}: {moving.sum()} rows that move; at least 50 are expected")
 
 
 class _Problem:
@@ -172,16 +153,28 @@ class _Problem:
     def __init__(self, vehicle: Vehicle, log: Segments, measured: np.ndarray, start: EfficiencyMap):
         self.log, self.measured, self.shape = log, measured, start.values.shape
         self.start, self.vehicle = start, vehicle
-        self.shapes = shapes(log, log.channels.get("mass_kg", vehicle.mass_kg), measured)
+        self.moving = np.asarray(log.distance_m) > 0  # what stands says nothing of a map
+        known = eqx.tree_at(lambda v: v.driveline.efficiency, vehicle, start)
+        self.shapes = shapes(known, log, measured)[self.moving]
         speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
         self.place = cells_of(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
 
     def residual(self, eta: np.ndarray) -> np.ndarray:
-        return self.measured - np.asarray(_energy(self.vehicle, self.start, self.log, jnp.asarray(eta)))
+        """Of the rows that move."""
+        return (self.measured - np.asarray(_energy(self.vehicle, self.start, self.log, jnp.asarray(eta))))[self.moving]
+
+    def back(self, eta: np.ndarray, weighted: np.ndarray) -> np.ndarray:
+        """J'·weighted, J = ∂E/∂η of the rows that move, as exact where an effect acts across rows."""
+        every = np.zeros(len(self.moving))
+        every[self.moving] = weighted
+        return np.asarray(_back(self.vehicle, self.start, self.log, jnp.asarray(eta), jnp.asarray(every)))
 
     def jacobian(self, eta: np.ndarray) -> sparse.csr_matrix:
-        """∂E/∂η [row, node]. A row reads the 4×4 nodes around its cell, so that nodes which are four apart along speed
-        or torque share a derivative: sixteen of the kernel's make them all (Curtis, Powell and Reid, 1974)."""
+        """∂E/∂η [row that moves, node], without what neighbouring rows lend each other.
+
+        A row reads the 4×4 nodes around its cell, so that nodes which are four apart along speed or torque share a
+        derivative: sixteen of the kernel's make them all (Curtis, Powell and Reid, 1974).
+        """
         g, i, j = self.place
         rows, entries = np.arange(len(g)), []
         of_speed, of_torque = (np.arange(n) % REACH for n in self.shape[1:])
@@ -196,13 +189,12 @@ class _Problem:
                 node = np.ravel_multi_index((g[there], m[there], n[there]), self.shape)
                 entries.append((slope[there], rows[there], node))
         slope, row, node = (np.concatenate(x) for x in zip(*entries, strict=True))
-        return sparse.csr_matrix((slope, (row, node)), shape=(len(g), int(np.prod(self.shape))))
+        return sparse.csr_matrix((slope, (row, node)), shape=(len(g), int(np.prod(self.shape))))[self.moving]
 
     def rows_by_cell(self) -> np.ndarray:
         """Rows that move in each cell; those beyond the grid count in the cell at its edge."""
         out = np.zeros((self.shape[0], self.shape[1] - 1, self.shape[2] - 1), dtype=int)
-        use = np.asarray(self.log.distance_m) > 0
-        np.add.at(out, tuple(k[use] for k in self.place), 1)
+        np.add.at(out, tuple(k[self.moving] for k in self.place), 1)
         return out
 
 
@@ -215,6 +207,11 @@ def _energy(vehicle: Vehicle, start: EfficiencyMap, log: Segments, values: Any) 
 @eqx.filter_jit
 def _slope(vehicle: Vehicle, start: EfficiencyMap, log: Segments, values: Any, along: Any) -> Any:
     return jax.jvp(lambda x: _energy(vehicle, start, log, x), (values,), (along,))[1]
+
+
+@eqx.filter_jit
+def _back(vehicle: Vehicle, start: EfficiencyMap, log: Segments, values: Any, weighted: Any) -> Any:
+    return jax.vjp(lambda x: _energy(vehicle, start, log, x), values)[1](weighted)[0]
 
 
 def operating_points(vehicle: Vehicle, log: Segments) -> Any:
@@ -232,34 +229,12 @@ def cells_of(m: EfficiencyMap, gear: np.ndarray, speed: np.ndarray, torque: np.n
     return (g, *cells)
 
 
-def _roughness(m: EfficiencyMap, order: int) -> np.ndarray:
-    """D'D of differences of an order, along speed, along torque and across both."""
-    gears, speeds, torques = m.values.shape
-    along = lambda n, k: _square(np.diff(np.eye(n), k, axis=0))  # noqa: E731
-    part = sum(np.kron(along(speeds, k), along(torques, order - k)) for k in range(order + 1))
-    return np.kron(np.eye(gears), part)
-
-
-def _ties(m: EfficiencyMap) -> np.ndarray:
-    gears, speeds, torques = m.values.shape
-    axis = np.asarray(m.torques_nm, dtype=float)
-    pairs = [(j, k) for k in range(torques) for j in range(k) if np.isclose(axis[j], -axis[k], rtol=1e-6) and axis[k]]
-    mirror = np.zeros((len(pairs), torques))
-    for n, (j, k) in enumerate(pairs):
-        mirror[n, [j, k]] = 1.0, -1.0
-    by_gear = np.kron(_square(np.diff(np.eye(gears), axis=0)), np.eye(speeds * torques))
-    return by_gear + np.kron(np.eye(gears * speeds), _square(mirror))
-
-
-def _square(d: np.ndarray) -> np.ndarray:
-    return d.T @ d
-
-
 @dataclass(frozen=True)
 class _Fit:
     """Log losses of the nodes with the Cholesky factor of their precision; noise by row and by instrument; whether it
     converged; the log marginal likelihood."""
 
+    strength: float
     theta: np.ndarray
     factor: Any
     noise: np.ndarray
@@ -273,7 +248,7 @@ class _Posterior:
     """Of log losses, given the noise."""
 
     problem: _Problem
-    losses: _Losses
+    losses: Losses
     prior: np.ndarray
 
     def cost(self, residual: np.ndarray, noise: np.ndarray, theta: np.ndarray) -> float:
@@ -282,16 +257,21 @@ class _Posterior:
 
     def quadratic(self, residual: np.ndarray, noise: np.ndarray, theta: np.ndarray) -> tuple[Any, np.ndarray]:
         """Hessian (Gauss-Newton) and downhill gradient."""
-        jac = self.problem.jacobian(self.losses.efficiency(theta)).multiply(self.losses.slope(theta)[None, :])
-        jac = jac.multiply(1.0 / noise[:, None]).tocsr()
-        pull = jac.T @ (residual / noise) - self.prior @ (theta - self.losses.mean)
+        eta, slope = self.losses.efficiency(theta), self.losses.slope(theta)
+        jac = self.problem.jacobian(eta).multiply(slope[None, :]).multiply(1.0 / noise[:, None]).tocsr()
+        pull = slope * self.problem.back(eta, residual / noise**2) - self.prior @ (theta - self.losses.mean)
         return (jac.T @ jac).toarray() + self.prior, pull
 
 
-def _fit(posterior: _Posterior, theta: np.ndarray, max_steps: int) -> _Fit:
+def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: int) -> _Fit:
     problem, losses = posterior.problem, posterior.losses
     residual = problem.residual(losses.efficiency(theta))
-    least = 1e-6 * float(np.std(problem.measured))  # energies without any noise
+    if len(odd := np.flatnonzero(~np.isfinite(residual))):
+        row = int(np.flatnonzero(problem.moving)[odd[0]]) + 1
+        raise InputError(
+            f"learning an efficiency map: the vehicle's energy in row {row} is no number; mend its channels"
+        )
+    least = 1e-6 * float(np.sqrt(np.mean(problem.measured**2))) + 1e-6  # [Wh], for energies without any noise
     noise, instruments = row_noise(residual, problem.shapes, 0.0, least)
     done, damping = False, 0.0
     for _ in range(max_steps):
@@ -302,7 +282,8 @@ def _fit(posterior: _Posterior, theta: np.ndarray, max_steps: int) -> _Fit:
         done = 0.5 * float(pull @ cho_solve(factor, pull)) < NEARLY
         before = posterior.cost(residual, noise, theta)
         for _ in range(MOST_DAMPED):
-            step = cho_solve(cho_factor(hessian + damping * np.diag(np.diag(hessian))), pull)
+            damped = cho_factor(hessian + damping * np.diag(np.diag(hessian))) if damping else factor
+            step = cho_solve(damped, pull)
             tried = losses.within(theta + step)
             left = problem.residual(losses.efficiency(tried))
             after = posterior.cost(left, noise, tried)
@@ -314,12 +295,21 @@ def _fit(posterior: _Posterior, theta: np.ndarray, max_steps: int) -> _Fit:
             break  # nowhere downhill
         theta, residual = tried, left
         # effective number of nodes (MacKay, Neural Computation 4, 1992): the noise that explains the residual
-        used = theta.size - float(np.sum(cho_solve(factor, np.eye(theta.size)) * posterior.prior))
+        used = theta.size - float(np.sum(_inverse(factor) * posterior.prior))
+        last = noise
         noise, instruments = row_noise(residual, problem.shapes, used, least)
-        if done and before - after < SETTLED:
+        still = float(np.max(np.abs(np.log(noise / last)))) < STEADY
+        if done and still and before - after < SETTLED:
             break
         done = False
     factor = cho_factor(posterior.quadratic(residual, noise, theta)[0])
     sizes = np.linalg.slogdet(posterior.prior)[1], 2 * float(np.sum(np.log(np.diag(factor[0]))))
     evidence = -posterior.cost(residual, noise, theta) - float(np.sum(np.log(noise))) + 0.5 * (sizes[0] - sizes[1])
-    return _Fit(theta, factor, noise, instruments, done, float(evidence))
+    return _Fit(strength, theta, factor, noise, instruments, done, float(evidence))
+
+
+def _inverse(factor: tuple[np.ndarray, bool]) -> np.ndarray:
+    """Of the symmetric matrix whose Cholesky factor this is."""
+    inverse, _ = dpotri(factor[0], lower=factor[1])
+    half = np.tril(inverse) if factor[1] else np.triu(inverse)
+    return half + half.T - np.diag(np.diag(half))

@@ -1,34 +1,52 @@
 """Noise of a row's energy from several instruments: its variance is a sum of parts, each with a known shape over rows.
 
-    Var e_i = a² + (b·E_i)² + (c·m_i·g·d_i)² + (s·m_i·v_i)²
+    Var e_i = a² + (b·E_i)² + (c·∂E_i/∂slope)² + (s·∂E_i/∂(change of speed))²
 
 a the energy's own noise [Wh], b one in proportion to it, c that of the slope [rad], s that of the change of speed
 [m/s]. The four variances are fitted to squared residuals, none below 0, by reweighted least squares: the likelihood of
-a gamma model with identity link (McCullagh and Nelder, Generalized Linear Models, section 8.3).
+a gamma model with identity link (McCullagh and Nelder, Generalized Linear Models, section 8.3), in which no residual
+counts as more than five standard deviations.
 """
 
-from typing import Any
-
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import nnls
 
-from hdev_jax.physics.vehicle import GRAVITY_MPS2, JOULES_PER_WH
+from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 
 __all__ = ["INSTRUMENTS", "row_noise", "shapes"]
 
 INSTRUMENTS = ("energy_wh", "energy_share", "grade_rad", "speed_mps")
-ROUNDS = 20
+ROUNDS, STEADY = 100, 1e-4
+FARTHEST = 5.0  # standard deviations that a residual counts at most
 
 
-def shapes(log: Segments, mass_kg: Any, energy_wh: Float[np.ndarray, " row"]) -> Float[np.ndarray, "row instrument"]:
-    """Energy [Wh] that one unit of each instrument's noise is, in each row; `energy_wh`, the measured: a model that
-    strays would be let stray by a noise in proportion to what it says."""
-    mass = np.broadcast_to(np.asarray(mass_kg, dtype=float), energy_wh.shape)
-    climb = mass * GRAVITY_MPS2 * np.asarray(log.distance_m) / JOULES_PER_WH
-    kick = mass * np.asarray(log.speed_mps) / JOULES_PER_WH
+def shapes(
+    vehicle: Vehicle, log: Segments, energy_wh: Float[np.ndarray, " row"]
+) -> Float[np.ndarray, "row instrument"]:
+    """Energy [Wh] that one unit of each instrument's noise is, in each row, by the kernel's derivatives.
+
+    `energy_wh` is the measured: a model that strays would be let stray by a noise in proportion to what it says.
+    """
+    climb, kick = (np.abs(np.asarray(x)) for x in _slopes(vehicle, jax.tree.map(jnp.asarray, log)))
     return np.stack([np.ones_like(energy_wh), np.abs(energy_wh), climb, kick], axis=1)
+
+
+@eqx.filter_jit
+def _slopes(vehicle: Vehicle, log: Segments) -> tuple[jax.Array, jax.Array]:
+    """∂E/∂slope, ∂E/∂(change of speed) of each row."""
+
+    def energy(slope: jax.Array, change: jax.Array) -> jax.Array:
+        ends = log.speed_start_mps - 0.5 * change, log.speed_end_mps + 0.5 * change
+        moved = eqx.tree_at(lambda s: (s.speed_start_mps, s.speed_end_mps), log, ends)
+        return vehicle.energy(moved.with_channels(grade_rad=log.get("grade_rad", 0.0) + slope))
+
+    zero, one = jnp.zeros(len(log)), jnp.ones(len(log))
+    return jax.jvp(energy, (zero, zero), (one, zero))[1], jax.jvp(energy, (zero, zero), (zero, one))[1]
 
 
 def row_noise(
@@ -44,6 +62,11 @@ def row_noise(
     parts, variance = parts / scale, np.full(len(squares), max(float(np.mean(squares)), least**2))
     found = np.zeros(parts.shape[1])
     for _ in range(ROUNDS):
-        found, _ = nnls(parts / variance[:, None], squares / variance)
-        variance = np.maximum(parts @ found, least**2)
+        within = np.minimum(squares, FARTHEST**2 * variance)
+        found, _ = nnls(parts / variance[:, None], within / variance)
+        new = np.sqrt(variance * np.maximum(parts @ found, least**2))  # half of the way, or two answers may take turns
+        settled = np.max(np.abs(np.log(new / variance))) < STEADY
+        variance = new
+        if settled:
+            break
     return np.sqrt(variance), np.sqrt(found / scale)

@@ -128,6 +128,61 @@ def test_a_grid_that_holds_a_torque_of_zero(middle):
     assert found.map.values.min() > 0.2
 
 
+@pytest.mark.parametrize("floor", [0.05, 0.3])
+def test_what_a_table_says_of_no_torque_does_not_touch_its_neighbours(floor):
+    rows, truth = log(600, 1), true_map()
+    torques = np.linspace(-2600.0, 2600.0, 13)
+    w, t = np.meshgrid(np.asarray(truth.speeds_radps) + 20.0, np.abs(torques), indexing="ij")
+    eta = np.maximum(t * w / (t * w + 3.0 * w + 0.004 * t**2 + 400.0), floor)
+    truth = EfficiencyMap(truth.gears, truth.speeds_radps, jnp.asarray(torques), jnp.asarray([eta * 0.97, eta]))
+    energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(2).normal(size=len(rows))
+    found = learn_map(
+        car(truth), rows, energy, eqx.tree_at(lambda m: m.values, truth, jnp.full(eta.shape, 0.85)[None].repeat(2, 0))
+    )
+    assert found.noise_wh < 0.65
+    speed, torque = (np.asarray(x) for x in map_fit.operating_points(car(truth), rows))
+    away = np.abs(torque) > 434.0  # beyond the nodes next to it
+    points = rows.channels["gear"][away], speed[away], torque[away]
+    off = [np.asarray(jax.vmap(m)(*points)) for m in (found.map, truth)]
+    assert away.sum() > 50
+    assert np.sqrt(np.mean((off[0] - off[1]) ** 2)) < 0.005
+
+
+def test_rows_that_stand_say_nothing_of_a_map():
+    rows, truth = log(900), true_map()
+    energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(1).normal(size=len(rows))
+    still = np.zeros(len(rows), bool)
+    still[::3] = True
+    stand = lambda x: np.where(still, 0.0, np.asarray(x))  # noqa: E731
+    stopped = eqx.tree_at(
+        lambda s: (s.distance_m, s.speed_start_mps, s.speed_end_mps), rows,
+        tuple(map(stand, (rows.distance_m, rows.speed_start_mps, rows.speed_end_mps))),
+    )  # fmt: skip
+    start = eqx.tree_at(lambda m: m.values, truth, jnp.full(truth.values.shape, 0.85))
+    with_them = learn_map(car(start), stopped, np.where(still, 20.0, energy), start)
+    without = learn_map(car(start), rows.take(~still), energy[~still], start)
+    np.testing.assert_allclose(with_them.map.values, without.map.values, atol=1e-6)
+    assert with_them.noise_wh == pytest.approx(without.noise_wh, rel=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [{"smooth": ()}, {"smooth": (-1.0,)}, {"mean": 1.0}, {"wide": 0.0}])
+def test_a_prior_that_is_none(wrong):
+    with pytest.raises(ValueError, match="strengths of the prior"):
+        learn_map(car(true_map()), log(60), np.zeros(60), true_map(), **wrong)
+
+
+def test_a_hole_in_a_channel_is_named():
+    rows = log(60)
+    rows.channels["grade_rad"][7] = np.nan
+    with pytest.raises(InputError, match="row 8, column 'grade_rad'"):
+        learn_map(car(true_map()), rows, np.zeros(60), true_map())
+
+
+def test_equal_rows_of_equal_energy():
+    rows = log(60).take(np.zeros(100, int))
+    assert np.all(np.isfinite(learn_map(car(true_map()), rows, np.full(100, 30.0), true_map()).map.values))
+
+
 def test_energies_without_noise_are_met():
     rows, truth = log(600), true_map()
     found = learn_map(car(truth), rows, np.asarray(car(truth).energy(rows)), truth)
