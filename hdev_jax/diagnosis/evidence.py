@@ -137,17 +137,17 @@ class Evidence:
 
     def left(self, gram: np.ndarray, at: Sequence[int]) -> float:
         """Smallest share of the columns that is left after projecting the base columns off."""
-        if not self.base:
-            return 1.0
-        gram, shares = gram[0], []
-        for k in at:
-            j = self.base + k
-            a = gram[: self.base, : self.base]
-            d = np.sqrt(np.maximum(np.diag(a), 1e-300))
-            c = gram[: self.base, j] / d
-            x = np.linalg.lstsq(a / np.outer(d, d), c, rcond=1e-10)[0]
-            shares.append(1.0 - float(c @ x) / max(gram[j, j], 1e-300))
-        return min(shares)
+        return min(self.span(gram, k)[0] for k in at) if self.base else 1.0
+
+    def span(self, gram: np.ndarray, at: int) -> tuple[float, Float[np.ndarray, " base"]]:
+        """Share of a column that is left after projecting the base columns off, and the weights of those, each of
+        which counts with its length one."""
+        gram, j = gram[0], self.base + at
+        a = gram[: self.base, : self.base]
+        d = np.sqrt(np.maximum(np.diag(a), 1e-300))
+        c = gram[: self.base, j] / d
+        x = np.linalg.lstsq(a / np.outer(d, d), c, rcond=1e-10)[0]
+        return 1.0 - float(c @ x) / max(gram[j, j], 1e-300), x
 
     def projected(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "left left"]:
         """Gram matrix of columns with the base columns taken off, as far as their prior lets those move.

@@ -235,26 +235,31 @@ def scored(ground: Ground, source: Source) -> View:
     left_out = dict(source.left_out)
     for id_ in {c.id for c in source.candidates} - set(best):
         left_out[id_] = "does nothing on this log"
-    absorbs, absorbed_by = _absorption(evidence, ground.fit.table, best)
+    absorbs, absorbed_by = _absorption(evidence, ground.fit.table, best, source.candidates)
     return View(evidence, plain, ground, source, slow, best, ways, left_out, absorbs, absorbed_by)
 
 
 def _absorption(
-    evidence: Evidence, table: ParameterTable, best: dict[str, Score]
+    evidence: Evidence, table: ParameterTable, best: dict[str, Score], candidates: Sequence[Candidate]
 ) -> tuple[dict[str, list[str]], dict[str, str]]:
-    """Which candidates lie in the span of the fitted coefficients, and of which one mostly."""
+    """Which candidates lie in the span of the fitted coefficients, and of which one mostly.
+
+    Of an effect with several sizes one may: a gain, though not the offset beside it. A coefficient may have absorbed
+    that effect too, which by its other ways can still be found.
+    """
     names = [c.name for c in table.free]
     absorbs: dict[str, list[str]] = {n: [] for n in names}
     by: dict[str, str] = {}
-    total = evidence.totals()[0]
-    for id_, s in best.items():
-        if s.left > ABSORBED or not names:
+    if not names:
+        return absorbs, by
+    totals = evidence.totals()
+    plainest = [c for c in candidates if c.kind == "size" and c.id in best and c.freedoms == len(c.columns) == 1]
+    for c in [*(s.candidate for s in best.values() if s.left <= ABSORBED), *plainest]:
+        left, weights = min((evidence.span(totals, k) for k in c.columns), key=lambda x: x[0])
+        if left > ABSORBED or any(c.id in ids for ids in absorbs.values()):
             continue
-        column = total[: evidence.base, evidence.base + s.candidate.columns[0]]
-        a = total[: evidence.base, : evidence.base]
-        d = np.sqrt(np.maximum(np.diag(a), 1e-300))
-        x = np.linalg.lstsq(a / np.outer(d, d), column / d, rcond=1e-10)[0]
-        k = int(np.argmax(np.abs(x)))
-        absorbs[names[k]].append(id_)
-        by[id_] = names[k]
+        name = names[int(np.argmax(np.abs(weights)))]
+        absorbs[name].append(c.id)
+        if best[c.id].left <= ABSORBED:
+            by[c.id] = name
     return absorbs, by

@@ -24,8 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotri
+from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.map_prior import Losses, roughness, ties
@@ -310,6 +309,7 @@ def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: i
 
 def _inverse(factor: tuple[np.ndarray, bool]) -> np.ndarray:
     """Of the symmetric matrix whose Cholesky factor this is."""
-    inverse, _ = dpotri(factor[0], lower=factor[1])
+    (potri,) = get_lapack_funcs(("potri",), (factor[0],))
+    inverse, _ = potri(factor[0], lower=factor[1])
     half = np.tril(inverse) if factor[1] else np.triu(inverse)
     return half + half.T - np.diag(np.diag(half))

@@ -9,7 +9,7 @@ from experiments import planted_scores as scores
 from experiments import rivals
 from experiments.config import resolve, typed
 from experiments.oracle import confusable, noise_rmse, oracle_rmse
-from experiments.planted import Config, acts_in, tasks
+from experiments.planted import Config, acts_in, run, tasks
 from experiments.planted_rivals import outcome, rival_rows
 from experiments.planted_tables import collect
 from experiments.rivals import comparable
@@ -73,6 +73,15 @@ def test_a_truth_in_another_form_is_called_by_what_comes_nearest():
     assert scores.false(["linear_cornering"], entries(["headwind"]))
     assert scores.nameable(["linear_cornering"])
     assert not scores.nameable(["outside_humidity_load"])
+
+
+@pytest.mark.parametrize("planted", ["torque_offset", "power_gain"])
+def test_a_gain_that_an_efficiency_takes_up_is_said_though_an_offset_beside_it_could_be_found(planted):
+    task = next(t for t in tasks(config()) if t["case"] == "absorbed_shaft" and t["effects"] == [planted])
+    told = run(task)
+    assert told["named"] == []
+    assert planted in told["baseline"]["machine.motoring_efficiency"]["absorbs"]
+    assert scores.absorbed([planted], told)
 
 
 @pytest.mark.parametrize(
