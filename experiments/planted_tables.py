@@ -46,7 +46,7 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
         write_tables(run, "planted_rivals", against, caption)
     power_figure(run, [(t, r) for t, r in able if t["noise"] == "ar1"], config.rivals)
     false_figure(run, [(t, r) for t, r in able if not t["effects"]], config.rivals)
-    confusion_figure(run, [(t, r) for t, r in done if t["effects"]])
+    confusion_figure(run, [(t, r) for t, r in able if t["effects"]])
     missed = [r["name"] for r in (*rows, *sized) if r["met"] is False]
     return {
         "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "logs": len(done),
