@@ -43,7 +43,7 @@ class Config(Strict):
     variants: list[str]
     logs: list[LogName] = Field(default_factory=lambda: list(LOGS))
     asked_of: list[LogName] = Field(default_factory=lambda: ["noise on the energy", "all instruments"])
-    routes: int = 179
+    routes: int = 179  # a vehicle's share of the fleet's 5,000
     least_rows: int = 50
     within: float = 0.01
     seed: int = Field(0, ge=0)
