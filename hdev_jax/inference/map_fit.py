@@ -46,11 +46,12 @@ WORSE = 2
 
 @dataclass(frozen=True)
 class LearnedMap:
-    """The map; `sd` of its nodes [gear, speed, torque]; `rows`, how many of the log each cell has [gear, cell, cell].
+    """The map; `sd` of its nodes' efficiencies [gear, speed, torque]; `rows`, how many of those that move are in each
+    cell [gear, speed cell, torque cell].
 
-    `noise_wh` is the estimated noise of a row's energy, in the quadratic mean, `instruments` what it comes from
-    (`row_noise.INSTRUMENTS`), `smooth` the chosen strength, `evidence` the log marginal likelihood by strength tried.
-    `converged`: one more step would gain next to nothing.
+    `noise_wh` is the estimated noise of a moving row's energy [Wh], in the quadratic mean, `instruments` the sds that
+    it comes from (`row_noise.INSTRUMENTS`, with their units), `smooth` the chosen strength, `evidence` the log marginal
+    likelihood by strength tried. `converged`: one more step would gain next to nothing.
     """
 
     map: EfficiencyMap
