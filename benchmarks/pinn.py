@@ -42,7 +42,7 @@ from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Ensemble, Member, stretches
 from hdev_jax.learn.pinn_rows import FEATURES, Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
-from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2
+from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
 
 LIMITS = {
     "over_torch": 1.0, "over_loop": 3.0, "paper_minutes": 10.0, "ready_one_row_us": 100.0, "many_rows_s": 1.0,

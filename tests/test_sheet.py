@@ -12,8 +12,8 @@ from hdev_jax.inference.maps import read_map
 from hdev_jax.inference.sheet import choose_entry, read_sheet, traction_force_from_torque
 from hdev_jax.inference.sheet_text import augmented_sheet
 from hdev_jax.physics import LIBRARY, EfficiencyMap, Grouped, at_null
-from hdev_jax.physics.vehicle import GRAVITY_MPS2
 from hdev_jax.segments import Segments
+from hdev_jax.units import GRAVITY_MPS2
 
 CONFIGS = Path(__file__).parents[1] / "configs" / "vehicles"
 ROAD = "mass_kg = 24000.0\n[road]\nc_rr = { value = 0.006, sd = 0.0008 }\ncda_m2 = { value = 5.6, sd = 0.5 }\n"

@@ -23,7 +23,7 @@ from hdev_jax.diagnosis.refit import joined
 from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.physics.loads import PeriodicLoad
-from hdev_jax.physics.vehicle import JOULES_PER_WH
+from hdev_jax.units import J_PER_WH
 
 __all__ = ["add_cycle"]
 
@@ -121,7 +121,7 @@ def _rows(problem: Loop, residual: np.ndarray, left: np.ndarray) -> _Rows:
     levels = problem.clusters.kind == "trip"
     noise = estimate_noise(left, problem.trip, problem.seconds, levels=levels)
     start = np.asarray(problem.rows.segments.time_s)[: problem.rows.rows]
-    worth = problem.seconds / JOULES_PER_WH if problem.target == "energy_wh" else np.full(len(start), 1e-3)
+    worth = problem.seconds / J_PER_WH if problem.target == "energy_wh" else np.full(len(start), 1e-3)
     clocked = Clocked(start + 0.5 * problem.seconds, problem.seconds, problem.trip, worth, noise)
     return _Rows(**vars(clocked), white=clocked.whitened(residual[:, None])[:, 0])
 

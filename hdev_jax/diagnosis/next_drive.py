@@ -17,6 +17,7 @@ from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.inference import Fit, jacobian, padded
 from hdev_jax.physics import Effect
 from hdev_jax.segments import Segments
+from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = ["DRIVES", "Advice", "advise"]
 
@@ -117,7 +118,7 @@ def simulate(parts: Sequence[Part], problem: Problem) -> Segments:
     grade = np.array([p.grade for p in parts])[at]
     load = np.array([p.load for p in parts])[at]
     # a usual vehicle's effort, in the units of the log's own: what a sensor at the wheel or the shaft would show
-    effort = load * (accel + 9.81 * (grade + 0.007)) + 1.2e-4 * speed**2
+    effort = load * (accel + GRAVITY_MPS2 * (grade + 0.007)) + 1.2e-4 * speed**2
     effort = np.where(speed > 0, effort, 0.0)
     for name in ("traction_force_n", "motor_torque_nm"):
         if name in channels:
@@ -128,7 +129,7 @@ def simulate(parts: Sequence[Part], problem: Problem) -> Segments:
         ratio = np.median(np.asarray(s.channels["motor_speed_radps"])[moving] / np.asarray(s.speed_mps)[moving])
         channels["motor_speed_radps"] = speed * float(ratio)
     if "accel_mps2" in channels:
-        channels["accel_mps2"] = accel + 9.81 * np.sin(grade)
+        channels["accel_mps2"] = accel + GRAVITY_MPS2 * np.sin(grade)
     if "brake_pressure_pa" in channels:
         channels["brake_pressure_pa"] = np.where(accel < -1.0, 3e5, 0.0)
     return Segments(

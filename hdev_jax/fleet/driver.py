@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hdev_jax.fleet.shifting import Program, load_share, shift_lines
-from hdev_jax.physics import GRAVITY_MPS2
+from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = ["STEP_M", "Car", "Driven", "Roads", "drive"]
 

@@ -20,8 +20,9 @@ from hdev_jax.fleet.roads import STEPS, RouteBatch, draw_routes
 from hdev_jax.fleet.rows import TRUTH_ONLY, log_rows, measured, padded
 from hdev_jax.fleet.shifting import Program, engaged, load_share, shift_lines
 from hdev_jax.fleet.variants import AXLE_LOAD_SHARE, Variant
-from hdev_jax.physics import AIR_DENSITY_KGPM3, Driveline, Machine, Vehicle, coefficients_that_hold
+from hdev_jax.physics import Driveline, Machine, Vehicle, coefficients_that_hold
 from hdev_jax.segments import Segments
+from hdev_jax.units import AIR_DENSITY_KGPM3
 
 __all__ = ["ROUTES_PER_BATCH", "Batch", "VehiclePart", "batches", "shares"]
 

@@ -25,6 +25,8 @@ Every vehicle is invented: none of them is a product, and none was measured.
 import math
 from dataclasses import dataclass
 
+from hdev_jax.units import GRAVITY_MPS2
+
 __all__ = ["AXLE_LOAD_SHARE", "VARIANTS", "Variant", "variant"]
 
 # Share of the weight on driven axles, for adhesion (engineering assumptions for loaded vehicles).
@@ -179,7 +181,11 @@ def variant(id: str) -> Variant:
 def _sound(v: Variant) -> bool:
     """Whether a row can drive at all: starts loaded on 15 %, and reaches 80 km/h (buses 70)."""
     start = v.torque_nm * v.gear_ratios[0] * v.final_drive / v.wheel_radius_m * 0.9
-    return start > 0.15 * 9.81 * v.mass_kg[1] and v.top_speed_mps > (19.4 if v.bus else 22.2) and math.isfinite(start)
+    return (
+        start > 0.15 * GRAVITY_MPS2 * v.mass_kg[1]
+        and v.top_speed_mps > (19.4 if v.bus else 22.2)
+        and math.isfinite(start)
+    )
 
 
 assert len({v.id for v in VARIANTS}) == len(VARIANTS)

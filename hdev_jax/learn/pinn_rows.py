@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdev_jax.errors import InputError
-from hdev_jax.physics import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Driveline, Effect, Vehicle
+from hdev_jax.physics import Driveline, Effect, Vehicle
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Column, Ids, Segments
+from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
 
 __all__ = [
     "FEATURES",

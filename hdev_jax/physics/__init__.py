@@ -5,12 +5,10 @@ from hdev_jax.physics.driveline import GEAR_PROBABILITY, Driveline, EfficiencyMa
 from hdev_jax.physics.effect import Effect, Grouped, Parameter, Point
 from hdev_jax.physics.library import LIBRARY, at_null, derived, library, most_group, unavailable
 from hdev_jax.physics.machine import Machine
-from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
+from hdev_jax.physics.vehicle import Vehicle
 
 __all__ = [
-    "AIR_DENSITY_KGPM3",
     "GEAR_PROBABILITY",
-    "GRAVITY_MPS2",
     "LIBRARY",
     "Driveline",
     "Effect",

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = [
     "BatteryResistance",
@@ -184,7 +185,7 @@ class StepChange(Effect):
     def power(self, row, car, point):
         at_trip = jnp.asarray(self.at_trip)
         after = jnp.where(jnp.asarray(row.trip).astype(at_trip.dtype) >= at_trip - 0.5, 1.0, 0.0)
-        weight = car.mass(row) * 9.80665 * row.speed_mps
+        weight = car.mass(row) * GRAVITY_MPS2 * row.speed_mps
         return after * (self.power_w + self.c_rr * weight + self.loss * jnp.abs(point.power_w))
 
 
@@ -222,7 +223,7 @@ class ModeChange(Effect):
 
     def power(self, row, car, point):
         z = jnp.where(jnp.isnan(self.in_mode), self.share, self.in_mode)
-        weight = car.mass(row) * 9.80665 * row.speed_mps
+        weight = car.mass(row) * GRAVITY_MPS2 * row.speed_mps
         recovered = jnp.maximum(-point.power_w, 0.0)
         losses = self.loss * jnp.abs(point.power_w) + self.regeneration * recovered
         return z * (self.power_w + self.c_rr * weight + losses)

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Real, resolve
 from hdev_jax.physics.road import mean_square_speed, weight_on_road
-from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, Vehicle
+from hdev_jax.physics.vehicle import Vehicle
 from hdev_jax.segments import Segments
+from hdev_jax.units import AIR_DENSITY_KGPM3
 
 __all__ = ["WITH_AIR", "WITH_WEIGHT", "coefficients_that_hold"]
 

@@ -5,8 +5,9 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Effect, Parameter
-from hdev_jax.physics.vehicle import AIR_DENSITY_KGPM3, GRAVITY_MPS2, Vehicle
+from hdev_jax.physics.vehicle import Vehicle
 from hdev_jax.segments import Segments
+from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
 
 __all__ = [
     "Aero",

@@ -12,14 +12,12 @@ from hdev_jax.physics.driveline import Driveline
 from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.segments import Segments
+from hdev_jax.units import AIR_DENSITY_KGPM3, J_PER_WH
 
-__all__ = ["AIR_DENSITY_KGPM3", "GRAVITY_MPS2", "Entry", "Target", "Vehicle"]
+__all__ = ["Entry", "Target", "Vehicle"]
 
-GRAVITY_MPS2 = 9.80665  # standard gravity, 3rd CGPM (1901)
-AIR_DENSITY_KGPM3 = 1.225  # ISO 2533 standard atmosphere at sea level, 15 °C
 Entry = Literal["road", "wheel", "shaft"]
 Target = Literal["energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n"]
-JOULES_PER_WH = 3600.0
 
 
 class _Chain(NamedTuple):
@@ -185,7 +183,7 @@ class Vehicle(eqx.Module):
 
     def energy(self, segments: Segments) -> Float[Array, " row"]:
         """Battery energy of each row [Wh]: e of paper 1, equation 5, with the vehicle's other effects."""
-        return self.power(segments) * (jnp.asarray(segments.duration_s) / JOULES_PER_WH)
+        return self.power(segments) * (jnp.asarray(segments.duration_s) / J_PER_WH)
 
     def force(self, segments: Segments) -> Float[Array, " row"]:
         """Traction force at the wheels [N]: F_w of paper 1, equation 3; 0 at a standstill, where brakes hold.
@@ -221,7 +219,7 @@ class Vehicle(eqx.Module):
         Forces count at the wheel; `driveline` and `machine` are what the efficiencies cost; a sensor effect counts as
         the difference it makes.
         """
-        hours = jnp.asarray(segments.duration_s) / JOULES_PER_WH
+        hours = jnp.asarray(segments.duration_s) / J_PER_WH
         chain_only = self._with(tuple(e for e in self.effects if not _is_sensor(e)))
         parts = {k: w * hours for k, w in chain_only._rows(segments, lambda c, _: c.added_w).items()}
         car, before = chain_only, chain_only.energy(segments)
