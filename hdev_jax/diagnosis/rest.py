@@ -123,14 +123,15 @@ def _shadow(
 ) -> str | None:
     """A found effect that may be no more than the mean of the structure that is left, the latest first.
 
-    The mean of a cause that the library does not hold is a constant load: one that reads no channel and explains less
-    than what is left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
+    The mean of a cause that the library does not hold is a constant load: one that reads no channel, is there all the
+    time and explains less than what is left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
     """
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
         effect = f.score.candidate.effect
         gain = max(mse[k] - mse[k + 1], 0.0)
-        constant = effect.stage == "battery" and not (effect.needs or effect.searched)
+        told = effect.needs or effect.searched or any(p.kind == "choice" for p in effect.parameters)
+        constant = effect.stage == "battery" and not told
         reads_nothing = effect.id == "power_gain" or constant
         if reads_nothing and gain < left.rms**2:
             return f.id
