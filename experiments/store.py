@@ -75,7 +75,8 @@ def sources(module: ModuleType, *, collect: bool = False) -> str:
     """Fingerprint of the source files that an experiment's results depend on.
 
     For a task: the module itself, those beside it that it names in `SOURCES`, and every file of the package that these
-    import, directly or not. With `collect`, for a whole run: also what they import under `experiments/`, and the page.
+    import, directly or not, without comments and docstrings: hours of tasks stay kept when a comment is mended. With
+    `collect`, for a whole run: whole files, also what they import under `experiments/`, and the page.
     """
     itself = Path(str(module.__file__))
     return _digest((itself, *(itself.parent / name for name in module.SOURCES)), collect)
@@ -87,8 +88,18 @@ def _digest(starts: tuple[Path, ...], collect: bool) -> str:
     for name, path in sorted(
         (_name(p), p) for p in reached((*starts, HERE / "page.py") if collect else starts, collect)
     ):
-        digest.update(name.encode() + b"\0" + path.read_bytes())
+        digest.update(name.encode() + b"\0" + (path.read_bytes() if collect else _code(path)))
     return digest.hexdigest()[:16]
+
+
+def _code(path: Path) -> bytes:
+    """A file without its comments and docstrings."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if documented and ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:] or [ast.Pass()]
+    return ast.unparse(tree).encode()
 
 
 def _name(path: Path) -> str:

@@ -264,6 +264,17 @@ def test_metrics_are_checked():
         check({**good, "rows": [{**row, "ours": None}]})
 
 
+def test_only_code_counts_towards_what_is_kept(tmp_path):
+    text = '"""What it is."""\n\n\nclass A:\n    """An A."""\n\n\ndef f(x):\n    """Twice."""\n    return 2 * x  # so\n'
+    codes = []
+    for k, (old, new) in enumerate(
+        [("", ""), ("Twice", "Two times"), ("# so", "# why"), ("An A", "One"), ("2 *", "3 *")]
+    ):
+        (tmp_path / f"{k}.py").write_text(text.replace(old, new))
+        codes.append(store._code(tmp_path / f"{k}.py"))
+    assert codes[0] == codes[1] == codes[2] == codes[3] != codes[4]
+
+
 @pytest.mark.parametrize("name", store.experiments_here())
 def test_what_a_task_depends_on_is_what_its_modules_load(name):
     """Every file of the package that importing the sources loads is in the fingerprint; none that they do not name."""

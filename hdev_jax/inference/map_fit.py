@@ -11,11 +11,13 @@ third and second differences along speed, torque and both (steps of one node), f
 between torques of either sign, since copper and iron do not know which way the power flows: a Gaussian Markov random
 field (Rue and Held, Gaussian Markov Random Fields, section 3.4), all but improper, so that nothing draws losses to a
 mean where the log has not been. `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the
-noise, which is not alike in all rows (`row_noise`). Each step is Gauss and Newton's, damped where it leads uphill
-(Levenberg-Marquardt), with the kernel's own Jacobian.
+noise, which is not alike in all rows (`row_noise`). Slopes and speeds were read with the errors that this noise tells
+of, and energies are not linear in them where the torque changes its sign: each row's is its mean over them. Each step
+is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt), with the kernel's own Jacobian.
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import equinox as eqx
@@ -28,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.map_prior import Losses, roughness, ties
-from hdev_jax.inference.row_noise import INSTRUMENTS, row_noise, shapes
+from hdev_jax.inference.row_noise import INSTRUMENTS, read_higher, row_noise, shapes
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
@@ -158,19 +160,37 @@ class _Problem:
         self.shapes = shapes(known, log, measured)[self.moving]
         speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
         self.place = cells_of(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
+        self.believe(np.zeros(len(INSTRUMENTS)))
+
+    def believe(self, instruments: np.ndarray) -> None:
+        """That slopes and speeds were read with errors of these sds: a row's energy is its mean over what they may
+        have been, which is nearer to the mean reading and one sd to either side of there, as a linear guess of them and
+        its variance ask for (regression calibration: Carroll et al., Measurement Error in Nonlinear Models, chapter 4).
+        """
+        log, either = self.log, []
+        slope = log.get("grade_rad", jnp.zeros(len(log)))
+        for name, read in (("grade_rad", slope), ("speed_mps", log.speed_end_mps - log.speed_start_mps)):
+            of_moving = np.asarray(read)[self.moving]
+            share = min(instruments[INSTRUMENTS.index(name)] ** 2 / max(float(np.var(of_moving)), 1e-300), 1.0)
+            nearer = share * (float(np.mean(of_moving)) - read)
+            away = np.sqrt(share * (1.0 - share) * float(np.var(of_moving)))
+            either.append((nearer + away, nearer - away) if share else (0.0,))
+        self.logs = [read_higher(log, *errors) for errors in product(*either)]
 
     def residual(self, eta: np.ndarray) -> np.ndarray:
         """Of the rows that move."""
-        return (self.measured - np.asarray(_energy(self.vehicle, self.start, self.log, jnp.asarray(eta))))[self.moving]
+        energies = [np.asarray(_energy(self.vehicle, self.start, log, jnp.asarray(eta))) for log in self.logs]
+        return (self.measured - np.mean(energies, axis=0))[self.moving]
 
     def back(self, eta: np.ndarray, weighted: np.ndarray) -> np.ndarray:
         """J'·weighted, J = ∂E/∂η of the rows that move, as exact where an effect acts across rows."""
         every = np.zeros(len(self.moving))
-        every[self.moving] = weighted
-        return np.asarray(_back(self.vehicle, self.start, self.log, jnp.asarray(eta), jnp.asarray(every)))
+        every[self.moving] = weighted / len(self.logs)
+        each = (_back(self.vehicle, self.start, log, jnp.asarray(eta), jnp.asarray(every)) for log in self.logs)
+        return np.sum([np.asarray(x) for x in each], axis=0)
 
     def jacobian(self, eta: np.ndarray) -> sparse.csr_matrix:
-        """∂E/∂η [row that moves, node], without what neighbouring rows lend each other.
+        """∂E/∂η [row that moves, node] at what was read, without what neighbouring rows lend each other.
 
         A row reads the 4×4 nodes around its cell, so that nodes which are four apart along speed or torque share a
         derivative: sixteen of the kernel's make them all (Curtis, Powell and Reid, 1974).
@@ -293,11 +313,13 @@ def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: i
             damping = max(10.0 * damping, 1e-2)
         else:
             break  # nowhere downhill
-        theta, residual = tried, left
+        theta = tried
         # effective number of nodes (MacKay, Neural Computation 4, 1992): the noise that explains the residual
         used = theta.size - float(np.sum(_inverse(factor) * posterior.prior))
         last = noise
-        noise, instruments = row_noise(residual, problem.shapes, used, least)
+        noise, instruments = row_noise(left, problem.shapes, used, least)
+        problem.believe(instruments)
+        residual = problem.residual(losses.efficiency(theta))
         still = float(np.max(np.abs(np.log(noise / last)))) < STEADY
         if done and still and before - after < SETTLED:
             break

@@ -12,13 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 from scipy.optimize import nnls
 
 from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 
-__all__ = ["INSTRUMENTS", "row_noise", "shapes"]
+__all__ = ["INSTRUMENTS", "read_higher", "row_noise", "shapes"]
 
 INSTRUMENTS = ("energy_wh", "energy_share", "grade_rad", "speed_mps")
 ROUNDS, STEADY = 100, 1e-4
@@ -36,14 +36,19 @@ def shapes(
     return np.stack([np.ones_like(energy_wh), np.abs(energy_wh), climb, kick], axis=1)
 
 
+def read_higher(log: Segments, slope_rad: ArrayLike, change_mps: ArrayLike) -> Segments:
+    """The log with slopes and changes of speed read higher by so much, a number or one for each row."""
+    ends = log.speed_start_mps - 0.5 * change_mps, log.speed_end_mps + 0.5 * change_mps
+    moved = eqx.tree_at(lambda s: (s.speed_start_mps, s.speed_end_mps), log, ends)
+    return moved.with_channels(grade_rad=log.get("grade_rad", jnp.zeros(len(log))) + slope_rad)
+
+
 @eqx.filter_jit
 def _slopes(vehicle: Vehicle, log: Segments) -> tuple[jax.Array, jax.Array]:
     """∂E/∂slope, ∂E/∂(change of speed) of each row."""
 
     def energy(slope: jax.Array, change: jax.Array) -> jax.Array:
-        ends = log.speed_start_mps - 0.5 * change, log.speed_end_mps + 0.5 * change
-        moved = eqx.tree_at(lambda s: (s.speed_start_mps, s.speed_end_mps), log, ends)
-        return vehicle.energy(moved.with_channels(grade_rad=log.get("grade_rad", 0.0) + slope))
+        return vehicle.energy(read_higher(log, slope, change))
 
     zero, one = jnp.zeros(len(log)), jnp.ones(len(log))
     return jax.jvp(energy, (zero, zero), (one, zero))[1], jax.jvp(energy, (zero, zero), (zero, one))[1]
