@@ -92,8 +92,9 @@ def _digest(starts: tuple[Path, ...], collect: bool) -> str:
     return digest.hexdigest()[:16]
 
 
+@cache
 def _code(path: Path) -> bytes:
-    """A file without its comments and docstrings."""
+    """A file without its comments and docstrings, as this version of Python writes it: another may keep tasks apart."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)

@@ -123,9 +123,9 @@ def _shadow(
 ) -> str | None:
     """A found effect that may be no more than the mean of the structure that is left, the latest first.
 
-    The mean of a cause that the library does not hold is a constant load: one that reads no channel, is there all the
-    time and explains less than what is left (`left.rms`) is no cause of its own. Both are of training rows: no choice
-    sees the others.
+    The mean of a cause that the library does not hold is a load that reads no channel and chooses nothing, neither
+    when it is there nor from which trip on. One that explains less than what is left (`left.rms`) is no cause of its
+    own. Both are of training rows: no choice sees the others.
     """
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):

@@ -12,12 +12,12 @@ between torques of either sign, since copper and iron do not know which way the 
 field (Rue and Held, Gaussian Markov Random Fields, section 3.4), all but improper, so that nothing draws losses to a
 mean where the log has not been. `smooth` is chosen by the marginal likelihood of the log (Laplace), and so is the
 noise, which is not alike in all rows (`row_noise`). Slopes and speeds were read with the errors that this noise tells
-of, and energies are not linear in them where the torque changes its sign: each row's is its mean over them. Each step
-is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt), with the kernel's own Jacobian.
+of, and energies are not linear in them where the torque changes its sign: each row's is its mean over what they may
+have been (`believed`). Each step is Gauss and Newton's, damped where it leads uphill (Levenberg-Marquardt), with the
+kernel's own Jacobian.
 """
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import equinox as eqx
@@ -30,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.map_prior import Losses, roughness, ties
-from hdev_jax.inference.row_noise import INSTRUMENTS, read_higher, row_noise, shapes
+from hdev_jax.inference.row_noise import INSTRUMENTS, believed, row_noise, shapes
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
@@ -53,7 +53,8 @@ class LearnedMap:
 
     `noise_wh` is the estimated noise of a moving row's energy [Wh], in the quadratic mean, `instruments` the sds that
     it comes from (`row_noise.INSTRUMENTS`, with their units), `smooth` the chosen strength, `evidence` the log marginal
-    likelihood by strength tried. `converged`: one more step would gain next to nothing.
+    likelihood by strength tried. `converged`: one more step would gain next to nothing. `sd` and `evidence` have the
+    kernel's derivatives at what was read, which makes `sd` some per cent too small where slopes are read badly.
     """
 
     map: EfficiencyMap
@@ -96,16 +97,16 @@ def learn_map(
     _check(segments, energy_wh, start)
     problem = _Problem(vehicle, jax.tree.map(jnp.asarray, segments), energy_wh, start)
     losses = Losses.of(start, mean)
-    theta = losses.logarithm(np.asarray(start.values, dtype=float).ravel())
+    theta, instruments = losses.logarithm(np.asarray(start.values, dtype=float).ravel()), np.zeros(len(INSTRUMENTS))
     fixed = alike * ties(start) + straight * roughness(start, 2) + np.eye(theta.size) / wide**2
     rough = roughness(start, 3)
     fits: list[_Fit] = []
     best = None
     for strength in smooth:
-        fit = _fit(_Posterior(problem, losses, strength * rough + fixed), strength, theta, max_steps)
+        fit = _fit(_Posterior(problem, losses, strength * rough + fixed), strength, theta, instruments, max_steps)
         fits.append(fit)
         if fit.converged:
-            theta = fit.theta  # the next strength begins where this one ended
+            theta, instruments = fit.theta, fit.instruments  # the next strength begins where this one ended
         best = max(fits, key=lambda f: (f.converged, f.evidence))
         if len(fits) - fits.index(best) > WORSE:
             break
@@ -160,33 +161,17 @@ class _Problem:
         self.shapes = shapes(known, log, measured)[self.moving]
         speed, torque = eqx.filter_jit(operating_points)(vehicle, log)
         self.place = cells_of(start, np.asarray(log.channels["gear"]), np.asarray(speed), np.asarray(torque))
-        self.believe(np.zeros(len(INSTRUMENTS)))
 
-    def believe(self, instruments: np.ndarray) -> None:
-        """That slopes and speeds were read with errors of these sds: a row's energy is its mean over what they may
-        have been, which is nearer to the mean reading and one sd to either side of there, as a linear guess of them and
-        its variance ask for (regression calibration: Carroll et al., Measurement Error in Nonlinear Models, chapter 4).
-        """
-        log, either = self.log, []
-        slope = log.get("grade_rad", jnp.zeros(len(log)))
-        for name, read in (("grade_rad", slope), ("speed_mps", log.speed_end_mps - log.speed_start_mps)):
-            of_moving = np.asarray(read)[self.moving]
-            share = min(instruments[INSTRUMENTS.index(name)] ** 2 / max(float(np.var(of_moving)), 1e-300), 1.0)
-            nearer = share * (float(np.mean(of_moving)) - read)
-            away = np.sqrt(share * (1.0 - share) * float(np.var(of_moving)))
-            either.append((nearer + away, nearer - away) if share else (0.0,))
-        self.logs = [read_higher(log, *errors) for errors in product(*either)]
-
-    def residual(self, eta: np.ndarray) -> np.ndarray:
-        """Of the rows that move."""
-        energies = [np.asarray(_energy(self.vehicle, self.start, log, jnp.asarray(eta))) for log in self.logs]
+    def residual(self, eta: np.ndarray, logs: list[Segments]) -> np.ndarray:
+        """Of the rows that move, a row's energy being its mean over the logs."""
+        energies = [np.asarray(_energy(self.vehicle, self.start, log, jnp.asarray(eta))) for log in logs]
         return (self.measured - np.mean(energies, axis=0))[self.moving]
 
-    def back(self, eta: np.ndarray, weighted: np.ndarray) -> np.ndarray:
+    def back(self, eta: np.ndarray, weighted: np.ndarray, logs: list[Segments]) -> np.ndarray:
         """J'·weighted, J = ∂E/∂η of the rows that move, as exact where an effect acts across rows."""
         every = np.zeros(len(self.moving))
-        every[self.moving] = weighted / len(self.logs)
-        each = (_back(self.vehicle, self.start, log, jnp.asarray(eta), jnp.asarray(every)) for log in self.logs)
+        every[self.moving] = weighted / len(logs)
+        each = (_back(self.vehicle, self.start, log, jnp.asarray(eta), jnp.asarray(every)) for log in logs)
         return np.sum([np.asarray(x) for x in each], axis=0)
 
     def jacobian(self, eta: np.ndarray) -> sparse.csr_matrix:
@@ -275,17 +260,20 @@ class _Posterior:
         away = theta - self.losses.mean
         return 0.5 * float(np.sum((residual / noise) ** 2) + away @ self.prior @ away)
 
-    def quadratic(self, residual: np.ndarray, noise: np.ndarray, theta: np.ndarray) -> tuple[Any, np.ndarray]:
-        """Hessian (Gauss-Newton) and downhill gradient."""
+    def quadratic(
+        self, residual: np.ndarray, noise: np.ndarray, theta: np.ndarray, logs: list[Segments]
+    ) -> tuple[Any, np.ndarray]:
+        """Hessian (Gauss-Newton, at what was read) and downhill gradient."""
         eta, slope = self.losses.efficiency(theta), self.losses.slope(theta)
         jac = self.problem.jacobian(eta).multiply(slope[None, :]).multiply(1.0 / noise[:, None]).tocsr()
-        pull = slope * self.problem.back(eta, residual / noise**2) - self.prior @ (theta - self.losses.mean)
+        pull = slope * self.problem.back(eta, residual / noise**2, logs) - self.prior @ (theta - self.losses.mean)
         return (jac.T @ jac).toarray() + self.prior, pull
 
 
-def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: int) -> _Fit:
+def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, instruments: np.ndarray, max_steps: int) -> _Fit:
     problem, losses = posterior.problem, posterior.losses
-    residual = problem.residual(losses.efficiency(theta))
+    logs = believed(problem.log, instruments, problem.moving)
+    residual = problem.residual(losses.efficiency(theta), logs)
     if len(odd := np.flatnonzero(~np.isfinite(residual))):
         row = int(np.flatnonzero(problem.moving)[odd[0]]) + 1
         raise InputError(
@@ -295,7 +283,7 @@ def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: i
     noise, instruments = row_noise(residual, problem.shapes, 0.0, least)
     done, damping = False, 0.0
     for _ in range(max_steps):
-        hessian, pull = posterior.quadratic(residual, noise, theta)
+        hessian, pull = posterior.quadratic(residual, noise, theta, logs)
         factor = cho_factor(hessian)
         # what a whole step would gain if costs were quadratic, in log-likelihood; they have kinks where the map's own
         # slopes turn to 0, at the bottom of which it is never quite nothing
@@ -305,7 +293,7 @@ def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: i
             damped = cho_factor(hessian + damping * np.diag(np.diag(hessian))) if damping else factor
             step = cho_solve(damped, pull)
             tried = losses.within(theta + step)
-            left = problem.residual(losses.efficiency(tried))
+            left = problem.residual(losses.efficiency(tried), logs)
             after = posterior.cost(left, noise, tried)
             if after < before:
                 damping = damping / 10.0 if damping > 1e-3 else 0.0
@@ -318,13 +306,13 @@ def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, max_steps: i
         used = theta.size - float(np.sum(_inverse(factor) * posterior.prior))
         last = noise
         noise, instruments = row_noise(left, problem.shapes, used, least)
-        problem.believe(instruments)
-        residual = problem.residual(losses.efficiency(theta))
+        logs = believed(problem.log, instruments, problem.moving)
+        residual = problem.residual(losses.efficiency(theta), logs)
         still = float(np.max(np.abs(np.log(noise / last)))) < STEADY
         if done and still and before - after < SETTLED:
             break
         done = False
-    factor = cho_factor(posterior.quadratic(residual, noise, theta)[0])
+    factor = cho_factor(posterior.quadratic(residual, noise, theta, logs)[0])
     sizes = np.linalg.slogdet(posterior.prior)[1], 2 * float(np.sum(np.log(np.diag(factor[0]))))
     evidence = -posterior.cost(residual, noise, theta) - float(np.sum(np.log(noise))) + 0.5 * (sizes[0] - sizes[1])
     return _Fit(strength, theta, factor, noise, instruments, done, float(evidence))

@@ -3,22 +3,24 @@
     Var e_i = a² + (b·E_i)² + (c·∂E_i/∂slope)² + (s·∂E_i/∂(change of speed))²
 
 a the energy's own noise [Wh], b one in proportion to it, c that of the slope [rad], s that of the change of speed
-[m/s]. The four variances are fitted to squared residuals, none below 0, by reweighted least squares: the likelihood of
-a gamma model with identity link (McCullagh and Nelder, Generalized Linear Models, section 8.3), in which no residual
-counts as more than five standard deviations.
+[m/s], both about what their readings tell (`believed`). The four variances are fitted to squared residuals, none below
+0, by reweighted least squares: the likelihood of a gamma model with identity link (McCullagh and Nelder, Generalized
+Linear Models, section 8.3), in which no residual counts as more than five standard deviations.
 """
+
+from itertools import product
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Bool, Float
 from scipy.optimize import nnls
 
 from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 
-__all__ = ["INSTRUMENTS", "read_higher", "row_noise", "shapes"]
+__all__ = ["INSTRUMENTS", "believed", "row_noise", "shapes"]
 
 INSTRUMENTS = ("energy_wh", "energy_share", "grade_rad", "speed_mps")
 ROUNDS, STEADY = 100, 1e-4
@@ -36,8 +38,33 @@ def shapes(
     return np.stack([np.ones_like(energy_wh), np.abs(energy_wh), climb, kick], axis=1)
 
 
-def read_higher(log: Segments, slope_rad: ArrayLike, change_mps: ArrayLike) -> Segments:
-    """The log with slopes and changes of speed read higher by so much, a number or one for each row."""
+def believed(
+    log: Segments, instruments: Float[np.ndarray, " instrument"], moves: Bool[np.ndarray, " row"]
+) -> list[Segments]:
+    """Logs of equal weight that stand for what slopes and changes of speed may have been, given their readings.
+
+    A truth that is uncertain by c about what its reading x tells lies at x + ρ·(x̄ − x) ± c, where ρ(1 − ρ)·Var x = c²:
+    the best linear guess of it from the reading and that guess's variance (regression calibration: Carroll et al.,
+    Measurement Error in Nonlinear Models, chapter 4). The reading's own error is c/√(1 − ρ), ρ at most one half; where
+    every reading is the same, as where the log has none, ρ is 0. Rows that stand are as they were read.
+    """
+    sides = []
+    slope = log.get("grade_rad", jnp.zeros(len(log)))
+    for name, read in (("grade_rad", slope), ("speed_mps", log.speed_end_mps - log.speed_start_mps)):
+        sd = float(instruments[INSTRUMENTS.index(name)])
+        if sd == 0.0:
+            sides.append([0.0])
+            continue
+        moving = np.asarray(read)[moves]
+        spread = float(np.var(moving))
+        share = 0.5 * (1.0 - np.sqrt(max(1.0 - 4.0 * sd**2 / spread, 0.0))) if spread > 0 else 0.0
+        nearer = share * (float(np.mean(moving)) - read)
+        sides.append([jnp.where(moves, nearer + side, 0.0) for side in (sd, -sd)])
+    return [shifted(log, *errors) for errors in product(*sides)]
+
+
+def shifted(log: Segments, slope_rad: ArrayLike, change_mps: ArrayLike) -> Segments:
+    """The log with slopes and changes of speed higher by so much, a number or one for each row."""
     ends = log.speed_start_mps - 0.5 * change_mps, log.speed_end_mps + 0.5 * change_mps
     moved = eqx.tree_at(lambda s: (s.speed_start_mps, s.speed_end_mps), log, ends)
     return moved.with_channels(grade_rad=log.get("grade_rad", jnp.zeros(len(log))) + slope_rad)
@@ -48,7 +75,7 @@ def _slopes(vehicle: Vehicle, log: Segments) -> tuple[jax.Array, jax.Array]:
     """∂E/∂slope, ∂E/∂(change of speed) of each row."""
 
     def energy(slope: jax.Array, change: jax.Array) -> jax.Array:
-        return vehicle.energy(read_higher(log, slope, change))
+        return vehicle.energy(shifted(log, slope, change))
 
     zero, one = jnp.zeros(len(log)), jnp.ones(len(log))
     return jax.jvp(energy, (zero, zero), (one, zero))[1], jax.jvp(energy, (zero, zero), (zero, one))[1]

@@ -13,6 +13,7 @@ from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
 from hdev_jax.inference import Clusters
+from hdev_jax.physics import LIBRARY
 
 TRIPS, ROWS = 8, 150
 
@@ -73,14 +74,18 @@ def test_a_formula_that_explains_test_rows_alone_is_none(monkeypatch):
     assert rest._formula(problem, train, bare(Search), bare(Loop), np.zeros(300), {}, left, silent) == {}
 
 
-@pytest.mark.parametrize(("rms", "gone"), [(0.0, None), (0.1, None), (2.0, "power_gain")])
-def test_a_constant_goes_where_more_than_it_explains_is_left(rms, gone):
-    effect = SimpleNamespace(id="power_gain", stage="sensors", needs=(), searched="")
-    state = bare(
-        Search,
-        found=[SimpleNamespace(id="power_gain", score=SimpleNamespace(candidate=SimpleNamespace(effect=effect)))],
-    )
+@pytest.mark.parametrize(
+    ("effect", "rms", "gone"),
+    [
+        ("power_gain", 0.0, False), ("power_gain", 0.1, False), ("power_gain", 2.0, True),
+        ("auxiliary_power", 2.0, True), ("step_change", 2.0, False), ("standstill_load", 2.0, False),
+        ("hvac_power", 2.0, False),
+    ],
+)  # fmt: skip
+def test_a_constant_goes_where_more_than_it_explains_is_left(effect, rms, gone):
+    candidate = SimpleNamespace(effect=LIBRARY[effect])
+    state = bare(Search, found=[SimpleNamespace(id=effect, score=SimpleNamespace(candidate=candidate))])
     problem, train = bare(Problem, measured=np.r_[np.ones(10), np.full(5, 9.0)]), np.arange(15) < 10
     predicted = [np.zeros(15), np.where(train, 1.0, 0.0)]  # explains the training rows: a gain of 1
     left = replace(left_of(side(0, size=0.0), side(1, size=0.0)), rms=rms, significant=rms == 0.0)
-    assert rest._shadow(problem, state, predicted, train, left) == gone
+    assert rest._shadow(problem, state, predicted, train, left) == (effect if gone else None)

@@ -1,10 +1,12 @@
 """What a row's noise comes from: planted instruments are found again, and those that add nothing are none."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hdev_jax.inference.row_noise import INSTRUMENTS, row_noise
+from hdev_jax.inference.row_noise import INSTRUMENTS, believed, row_noise
 from hdev_jax.inference.row_noise import shapes as shapes_of
 from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
@@ -84,3 +86,54 @@ def test_no_residuals_are_the_least_noise():
     of_row, found = row_noise(np.zeros(50), shapes(rows, energies(rows)), 0.0, 1e-3)
     np.testing.assert_array_equal(of_row, 1e-3)
     np.testing.assert_array_equal(found, 0.0)
+
+
+def readings(count: int) -> Segments:
+    rng, rows = np.random.default_rng(8), log(count)
+    change = rng.normal(0.2, 1.0, count)
+    distance = np.where(np.arange(count) % 7 == 0, 0.0, rows.distance_m)
+    slope = rng.normal(0.01, 0.02, count)
+    ends = {"distance_m": distance, "speed_start_mps": 10.0 - 0.5 * change, "speed_end_mps": 10.0 + 0.5 * change}
+    return replace(rows, **ends).with_channels(grade_rad=slope)
+
+
+def test_what_was_read_is_believed_between_the_reading_and_the_mean():
+    rows = readings(500)
+    moves = np.asarray(rows.distance_m) > 0
+    slope, change = (np.asarray(x) for x in (rows.channels["grade_rad"], rows.speed_end_mps - rows.speed_start_mps))
+    errors = {"slope": 0.5 * slope[moves].std(), "change": 0.2 * change[moves].std()}
+    given = [s * np.sqrt(1 - s**2 / x[moves].var()) for s, x in zip(errors.values(), (slope, change), strict=True)]
+    logs = believed(rows, np.array([0.0, 0.0, *given]), moves)
+    assert len(logs) == 4
+    slopes = np.stack([x.channels["grade_rad"] for x in logs])
+    changes = np.stack([x.speed_end_mps - x.speed_start_mps for x in logs])
+    # Gaussian truths of variance v read with errors of variance s²: their mean and variance given the readings
+    for truth, read, s in ((slopes, slope, errors["slope"]), (changes, change, errors["change"])):
+        v, mean = read[moves].var() - s**2, read[moves].mean()
+        np.testing.assert_allclose(truth.mean(0)[moves], ((v * read + s**2 * mean) / (v + s**2))[moves], atol=1e-12)
+        np.testing.assert_allclose(truth.var(0)[moves], v * s**2 / (v + s**2), rtol=1e-9)
+        np.testing.assert_array_equal(truth[:, ~moves], np.broadcast_to(read[~moves], truth[:, ~moves].shape))
+
+
+def test_an_instrument_that_adds_nothing_moves_nothing():
+    rows = readings(50)
+    (same,) = believed(rows, np.array([1.0, 0.1, 0.0, 0.0]), np.ones(50, bool))
+    np.testing.assert_array_equal(same.channels["grade_rad"], rows.channels["grade_rad"])
+    np.testing.assert_array_equal(same.speed_end_mps, rows.speed_end_mps)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_slope_that_is_the_same_everywhere_is_uncertain_about_that(told):
+    rows = readings(50)
+    rows = rows.with_channels(grade_rad=np.zeros(50)) if told else rows.without("grade_rad")
+    up, down = believed(rows, np.array([0.0, 0.0, 1e-3, 0.0]), np.ones(50, bool))
+    np.testing.assert_allclose(up.channels["grade_rad"], 1e-3)
+    np.testing.assert_allclose(down.channels["grade_rad"], -1e-3)
+
+
+def test_an_instrument_as_large_as_its_readings_spread_believes_half_of_them():
+    rows = readings(50)
+    read = np.asarray(rows.channels["grade_rad"])
+    logs = believed(rows, np.array([0.0, 0.0, 2.0 * read.std(), 0.0]), np.ones(50, bool))
+    half = np.mean([x.channels["grade_rad"] for x in logs], axis=0)
+    np.testing.assert_allclose(half, 0.5 * (read + read.mean()), atol=1e-12)
