@@ -226,7 +226,7 @@ def _figure(run: Run, name: str, result: Mapping[str, Any]) -> None:
     top.step(at, sample["told"], where="mid", label="row by row", lw=1.0)
     if "filter" in sample:
         top.step(at, sample["filter"], where="mid", label="with memory (filter)", lw=1.0, ls="--")
-    top.set(xlabel="row of the route, about 0.1 km each", ylabel="gear", title="An unseen route, synthetic fleet")
+    top.set(xlabel="distance along the route, km", ylabel="gear", title="An unseen route, synthetic fleet")
     top.legend()
     table = np.asarray(result["confusion"], dtype=float)
     share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
