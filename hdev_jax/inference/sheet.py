@@ -67,7 +67,8 @@ class Sheet:
         **Arguments:** `segments`, for the channels and gears they have; `vehicle_names`, of the log's vehicle ids, for
         coefficients that are declared per vehicle.
 
-        **Raises:** `InputError` for a key that is needed and missing; `ValueError` for an entry behind the target.
+        **Raises:** `InputError` for a key that is needed and missing, and a gear of the log that the sheet has no ratio
+        for; `ValueError` for an entry behind the target.
         """
         if entry not in _ENTRIES[target]:
             raise ValueError(f"{target} cannot be computed from entry {entry!r}; use one of {_ENTRIES[target]}")
@@ -101,11 +102,16 @@ class Sheet:
                     f"sheet {self.path}: driveline.gear_ratios has {len(self.gear_ratios)} gears, but the log has no "
                     "column 'gear'; one ratio, or a log with gears, is expected"
                 )
-            if (most := most_group(segments, ("gear",))) > len(self.gear_ratios):
-                raise InputError(
-                    f"sheet {self.path}: driveline.gear_ratios has {len(self.gear_ratios)} gears, but the log is in "
-                    f"gear {most}; a ratio for each gear is expected"
-                )
+            self.check_gears(segments)
+
+    def check_gears(self, segments: Segments) -> None:
+        """Raise `InputError` where the log is in a gear beyond the declared ratios; one ratio holds for all."""
+        ratios, most = len(self.gear_ratios or ()), most_group(segments, ("gear",))
+        if 1 < ratios < most:
+            raise InputError(
+                f"sheet {self.path}: driveline.gear_ratios has {ratios} gears, but the log is in gear {most}; a ratio "
+                "for each gear is expected"
+            )
 
 
 def read_sheet(path: str | Path, *, library: Mapping[str, type[Effect]] = LIBRARY) -> Sheet:

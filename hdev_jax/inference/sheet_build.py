@@ -50,6 +50,7 @@ class Builder:
 
     def build(self) -> Built:
         """The chain from its entry to the target, then the sheet's effects."""
+        self.sheet.check_gears(self.segments)
         driveline, machine = self._efficiencies()
         effects: list[Effect] = self._road() if self.entry == "road" else []
         mass = self._mass()

@@ -89,6 +89,16 @@ def test_a_gear_that_the_map_lacks_is_refused(tmp_path):
         learn_map(car(true_map()), rows.without("gear"), np.zeros(50), true_map())
 
 
+@pytest.mark.parametrize("gears", [(1,), (1, 2, 3)])
+def test_a_gear_without_a_ratio_is_refused(tmp_path, gears):
+    rows = log(50)
+    rows = rows.with_channels(gear=np.where(np.arange(50) == 7, 3.0, rows.channels["gear"]))
+    write(tmp_path, gears, 1e5)  # a map of one gear holds for all, the sheet has two ratios
+    with pytest.raises(InputError, match=r"gear_ratios has 2 gears, but the log is in gear 3; a ratio") as e:
+        read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh")
+    assert "\n" not in str(e.value)
+
+
 def of_shape(speeds: int, torques: int) -> EfficiencyMap:
     m = true_map()
     return EfficiencyMap(m.gears, m.speeds_radps[:speeds], m.torques_nm[:torques], m.values[:, :speeds, :torques])
