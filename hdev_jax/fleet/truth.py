@@ -19,10 +19,11 @@ from itertools import pairwise
 import numpy as np
 
 from hdev_jax.fleet.driving import FINAL_DRIVE, GEAR_RATIOS, WHEEL_RADIUS_M, Drive
-from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
 
 __all__ = ["Truth", "power_w", "shaft_channels"]
 
+G_MPS2 = 9.80665  # standard gravity, CGPM 1901
+AIR_DENSITY_KGPM3 = 1.225  # ISO 2533, sea level, 15 °C
 Columns = Mapping[str, np.ndarray]
 Effects = Mapping[str, Mapping[str, float]]
 
@@ -102,10 +103,10 @@ def wheel_force_n(drive: Drive, truth: Truth, fx: Effects) -> np.ndarray:
     mass = c["mass_kg"] * (1 + fx.get("mass_scale", {}).get("scale", 0.0))
     slope = drive.grade_at(fx["grade_lag"]["lag_s"]) if "grade_lag" in fx else c["grade_rad"]
     slope = slope + fx.get("grade_bias", {}).get("bias_rad", 0.0)
-    weight = mass * GRAVITY_MPS2 * np.cos(slope)
+    weight = mass * G_MPS2 * np.cos(slope)
     c_rr = _coefficient(truth, "c_rr", c["trip"], fx)
     force = mass * accel * (1 + fx.get("rotating_mass", {}).get("factor", 0.0))
-    force = force + mass * GRAVITY_MPS2 * np.sin(slope) + weight * c_rr
+    force = force + mass * G_MPS2 * np.sin(slope) + weight * c_rr
     force = force + _drag_n(c, _coefficient(truth, "cda_m2", c["trip"], fx), fx, vi, vf)
     if "rolling_speed" in fx:
         force = force + weight * fx["rolling_speed"]["per_mps2"] * v2
