@@ -266,13 +266,20 @@ def test_metrics_are_checked():
 
 def test_only_code_counts_towards_what_is_kept(tmp_path):
     text = '"""What it is."""\n\n\nclass A:\n    """An A."""\n\n\ndef f(x):\n    """Twice."""\n    return 2 * x  # so\n'
-    codes = []
-    for k, (old, new) in enumerate(
-        [("", ""), ("Twice", "Two times"), ("# so", "# why"), ("An A", "One"), ("2 *", "3 *")]
-    ):
-        (tmp_path / f"{k}.py").write_text(text.replace(old, new))
-        codes.append(store._code(tmp_path / f"{k}.py"))
-    assert codes[0] == codes[1] == codes[2] == codes[3] != codes[4]
+    edits = {
+        "none": ("", ""),
+        "docstring": ("Twice", "Two times"),
+        "comment": ("# so", "# why"),
+        "code": ("2 *", "3 *"),
+    }
+    task, whole = {}, {}
+    for edit, (old, new) in edits.items():
+        file = tmp_path / edit / "made" / "module.py"
+        file.parent.mkdir(parents=True)
+        file.write_text(text.replace(old, new))
+        task[edit], whole[edit] = (store._digest((file,), collect) for collect in (False, True))
+    assert task["none"] == task["docstring"] == task["comment"] != task["code"]
+    assert len(set(whole.values())) == len(edits), "a whole run tells every file as it is"
 
 
 @pytest.mark.parametrize("name", store.experiments_here())
