@@ -17,7 +17,7 @@ from experiments.data import MissingDataError, fingerprint
 from experiments.pinn_buses import bus_sources
 from experiments.pinn_data import Data, load
 from experiments.pinn_diagnosed import diagnosed, found_effects
-from experiments.pinn_models import bayesian, boosted, kernel, names_of, said
+from experiments.pinn_models import bayesian, boosted, kernel, known, names_of, said, trainable
 from experiments.pinn_networks import trained
 from experiments.pinn_scores import scores
 from hdev_jax.errors import InputError
@@ -225,7 +225,8 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     task = tasks[0]
     if task["model"]["kind"] == "vehicles":
         return [_by_vehicle(data, task)]
-    rows, use = data.rows(names_of(task["model"]["features"], data), tuple(task["effects"]))
+    names = names_of(task["model"]["features"], data)
+    rows, use = data.rows(names, trainable(effects), known(data, json.dumps(effects)))
     if task["model"]["kind"] == "lightgbm":
         return [{"lightgbm": scores(data, use, boosted(rows, use, t["seed"])), "counts": data.counts()} for t in tasks]
     return trained(data, rows, use, tasks, Model(**task["model"]))

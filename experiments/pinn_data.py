@@ -54,17 +54,27 @@ class Data:
     vehicles: tuple[Member, ...]
     trained: int
 
-    def rows(self, features: Sequence[str], effects: Sequence[str] = ()) -> tuple[Rows, np.ndarray]:
+    def rows(
+        self,
+        features: Sequence[str],
+        effects: Sequence[str] = (),
+        known: Sequence[tuple[Vehicle, np.ndarray]] = (),
+    ) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
 
         Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`).
+        **Arguments:** `effects`, those that are trained; `known`, of each vehicle what to take in the place of what its
+        sheet says, and the energy of each row that no row tells by itself [Wh].
         """
         made = [at_null(LIBRARY[e]) for e in effects]
+        known = known or [(m.vehicle, np.zeros(len(m.energy_wh))) for m in self.vehicles]
         parts = []
-        for k, (m, car) in enumerate(zip(self.vehicles, self._calibrated, strict=True)):
-            number = min(k, self.trained)
+        for k, (m, (car, moved), fit) in enumerate(zip(self.vehicles, known, self._calibrated, strict=True)):
             s = dataclasses.replace(m.segments, trip=m.routes)
-            one = rows_of(m.vehicle, s, m.energy_wh, number=number, features=features, effects=made, calibrated=car)
+            one = rows_of(
+                car, s, m.energy_wh, number=min(k, self.trained), features=features, effects=made, calibrated=fit,
+                moved_wh=moved,
+            )  # fmt: skip
             parts.append(one)
         return concatenated(parts), self.column("use")
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from experiments.pinn_data import Data, Member
-from hdev_jax.learn.pinn_rows import row_wise
 from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle
 
@@ -20,9 +19,7 @@ __all__ = ["diagnosed", "found_effects", "united"]
 @cache
 def found_effects(data: Data, vehicles: tuple[str, ...], routes: int) -> dict[str, dict[str, float]]:
     """Effects that the diagnoses of these vehicles find on so many of their training routes, in the order of how often,
-    with the median of each shape; sizes are left open.
-
-    Those that act across rows are no part of it, nor limits, whose size is their threshold.
+    with the median of each shape; sizes and thresholds are left open.
     """
     chosen = [m for m in data.vehicles if (m.id in vehicles or vehicles == ("all",)) and len(m.where(0))]
     return united([diagnosed(m, routes, seed=0)[1] for m in chosen])
@@ -33,10 +30,8 @@ def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
     out = {}
     for id in sorted({e for f in found for e in f}, key=lambda e: (-sum(e in f for f in found), e)):
         kind = LIBRARY[id]
-        if not row_wise(kind) or not any(p.kind == "size" for p in kind.parameters):
-            continue
         having = [f[id] for f in found if id in f]
-        shapes = [p.name for p in kind.parameters if p.kind != "size"]
+        shapes = [p.name for p in kind.parameters if p.kind not in ("size", "limit")]
         out[id] = {n: float(np.median([h[n] for h in having if n in h])) for n in shapes if any(n in h for h in having)}
     return out
 

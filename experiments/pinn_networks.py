@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from experiments.pinn_data import Data
-from experiments.pinn_models import names_of, networks, sized
+from experiments.pinn_models import names_of, networks, sized, trainable
 from experiments.pinn_scores import scores
 from hdev_jax import progress
 from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
@@ -25,10 +25,10 @@ def trained(
     recipe = Recipe(features=names_of(spec.features, data), **choices)
     plan = Plan(tasks[0]["epochs"], spec.batch, 0.5, tasks[0]["patience"], stop_after=tasks[0]["stop_after"])
     members = [(t["seed"] * 1000 + k, t["weights"]) for t in tasks for k in range(spec.members)]
+    effects = tasks[0]["effects"]
+    opened = sized({e: effects[e] for e in trainable(effects)})
     try:
-        ensemble = networks(
-            rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=sized(tasks[0]["effects"])
-        )
+        ensemble = networks(rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=opened)
     except DivergedError as e:
         progress.step(f"{tasks[0]['name']}: {e}")
         return [{"diverged": True} for _ in tasks]
@@ -46,7 +46,7 @@ def trained(
         ends = ensemble.trained.scores.reshape(len(members), -1)[i * spec.members]
         out[-1] |= {
             "counts": data.counts(),
-            "effects": list(tasks[0]["effects"]),
+            "effects": list(effects),
             "epochs": int(np.isfinite(ends).sum()),
         }
     return out

@@ -24,7 +24,7 @@ __all__ = ["coefficients", "grid", "shares", "table"]
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
         "kernel": "physics, effects by closed form", "diagnosed": "physics, as diagnosed"}  # fmt: skip
-GIVEN = ("ours and the closed form are given the list of effects that the fleet hides, limits apart; what diagnoses of "
+GIVEN = ("ours and the closed form are given the list of effects that the fleet hides; what diagnoses of "
          "training routes name by themselves is in models that say so")  # fmt: skip
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",

@@ -1,15 +1,24 @@
 """The networks' experiment: who is trained on what, deltas of models, scores that add up."""
 
+import dataclasses
+import json
+
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn import Config, chosen, tasks, together
-from experiments.pinn_data import load
+from experiments.pinn_data import Data, load
 from experiments.pinn_diagnosed import united
+from experiments.pinn_models import kernel, known, said, trainable
 from experiments.pinn_scores import pooled, scores
 from hdev_jax.errors import InputError
+from hdev_jax.learn.pinn import Pinn, Recipe, predict
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
+from hdev_jax.physics.battery import RegenLimit
+from hdev_jax.physics.sensors import MassScale, TimeSkew
 
 
 def config(name, *sets):
@@ -104,13 +113,50 @@ def test_scores_are_those_of_all_rows_and_add_up_over_vehicles():
 
 
 def test_effects_of_several_diagnoses_are_one_list():
-    """The commonest first, shapes at their median, sizes left open; nothing across rows, no limit."""
+    """The commonest first, shapes at their median, sizes and thresholds left open."""
     found = [
         {"tyre_warmup": {"excess": 0.3, "distance_m": 4000.0}, "grade_lag": {"lag_s": 0.5}, "headwind": {"scale": 1.0}},
         {"tyre_warmup": {"excess": 0.5, "distance_m": 8000.0}, "regen_limit": {"power_w": 9e4}},
     ]
-    assert united(found) == {"tyre_warmup": {"distance_m": 6000.0}, "headwind": {}}
+    whole = {"tyre_warmup": {"distance_m": 6000.0}, "grade_lag": {}, "headwind": {}, "regen_limit": {}}
+    assert united(found) == whole
     assert united([]) == {}
+    assert trainable(whole) == ("tyre_warmup", "headwind")
+
+
+def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them():
+    """Planted, with the fleet's noise, in the place of what the fleet's vehicle really has."""
+    effects = {"headwind": {}, "mass_scale": {}, "regen_limit": {}, "time_skew": {}}
+    data = load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B"))
+    a, b = data.vehicles
+    planted = a.vehicle.plus(MassScale(0.03), RegenLimit(1.5e5), TimeSkew(0.3, 0.0))
+    noise = 3.0 * np.random.default_rng(0).standard_normal(len(a.use))
+    a = dataclasses.replace(a, energy_wh=said(planted, a) + noise)
+    data = Data((a, b), 1)
+    car, (one, other) = kernel(a, effects), known(data, json.dumps(effects))
+    limit = float(car.effect("regen_limit").power_w)
+    assert limit == pytest.approx(1.5e5, rel=0.01)
+    assert float(car.effect("time_skew").skew_s) == pytest.approx(0.3, abs=0.02)
+    assert float(car.effect("mass_scale").scale) == pytest.approx(0.03, abs=0.005)
+
+    assert float(one.vehicle.effect("regen_limit").power_w) == pytest.approx(limit)
+    assert {"headwind", "mass_scale", "time_skew"}.isdisjoint(e.id for e in one.vehicle.effects)
+    assert one.moved_wh == pytest.approx(said(car, a) - said(car.minus("time_skew"), a))
+    trips = [np.sum(one.moved_wh[a.routes == t]) for t in np.unique(a.routes)]
+    assert np.sum(np.abs(one.moved_wh)) > 10 * np.sum(np.abs(trips)) > 0, "a delay moves energy from row to row"
+
+    masses = float(b.vehicle.mass_kg) / float(a.vehicle.mass_kg)
+    assert float(other.vehicle.effect("regen_limit").power_w) == pytest.approx(limit * masses)
+    assert not other.moved_wh.any()
+
+    plain, use = data.rows(("speed_mps",))
+    rows, _ = data.rows(("speed_mps",), trainable(effects), (one, other))
+    assert np.asarray(rows.moved_wh) == pytest.approx(np.concatenate([one.moved_wh, other.moved_wh]), rel=1e-6)
+    recipe = Recipe(features=("speed_mps",), units=(4,))
+    model, memory = eqx.nn.make_with_state(Pinn)(recipe, 1, scale_wh=1.0, key=jax.random.key(0))
+    lone = jax.tree.map(lambda x: x[use == 0], eqx.tree_at(lambda r: r.car, rows, plain.car))
+    without = predict(model, memory, plain.take(use == 0)).physics_wh
+    assert predict(model, memory, lone).physics_wh - without == pytest.approx(lone.moved_wh, abs=0.01)
 
 
 def test_effects_as_diagnosed_ask_for_vehicles_to_diagnose():

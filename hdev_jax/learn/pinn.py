@@ -183,7 +183,7 @@ class Pinn(eqx.Module):
             heads = Heads(heads.energy, said.coefficients)
         c_rr, cda = self.coefficients(heads, rows)
         law = energy if r.physics == "battery" else wheel_energy
-        physics = law(with_coefficients(rows.car, c_rr, cda, *self.effects_of(rows)), rows.segments)
+        physics = law(with_coefficients(rows.car, c_rr, cda, *self.effects_of(rows)), rows.segments) + rows.moved_wh
         residual = self.scale_wh * heads.energy if r.energy_head else jnp.zeros_like(physics)
         base = {
             "residual": physics, "alone": jnp.zeros_like(physics), "table": energy(rows.car, rows.segments)
