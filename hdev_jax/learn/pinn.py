@@ -270,11 +270,23 @@ class Objective:
             whole = lambda x: jnp.sum((w * x).reshape(shape), axis=1)  # noqa: E731
             sd = jnp.sqrt(whole(p.sd_wh**2) + (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + 1e-6)
             data = data + jnp.sum(_normal(whole(error), sd) * (whole(w) > 0)) / count
-        sizes = [*map(_centred, model.own_sizes.values()), *model.sizes.values()]
-        logs = jnp.sum(_centred(model.own) ** 2) + jnp.sum(model.common**2)
-        prior = 0.5 * logs / _LOG_SD**2 + 0.5 * sum(jnp.sum(x**2) for x in sizes)
+        prior = 0.5 * jnp.sum(model.common**2) / _LOG_SD**2 + _between_vehicles(model.own, _LOG_SD)
+        prior += sum(0.5 * jnp.sum(x**2) for x in model.sizes.values())
+        prior += sum(_between_vehicles(x, 1.0) for x in model.own_sizes.values())
         by_row = jnp.sum(w[:, None] * heads.coefficients**2) / count
         return data, physics, prior / self.rows + 0.01 * by_row
+
+
+def _between_vehicles(own: Array, usual: float) -> Array:
+    """Minus the logarithm of the density of what vehicles have of their own [vehicle, …], but for a constant.
+
+    Each column is normal about the mean with an sd that is unknown but for being of the size of `usual`: with an
+    inverse gamma of one degree of freedom for its square, integrated out, it is a multivariate Cauchy (Gelman et al.,
+    Bayesian Data Analysis, 3.2). So a coefficient that is alike in all vehicles is told by all of their rows together.
+    """
+    vehicles = own.shape[0]
+    squares = jnp.sum(_centred(own) ** 2, axis=0)
+    return 0.5 * (vehicles + 1) * jnp.sum(jnp.log1p(squares / usual**2))
 
 
 def _normal(error: Column, sd: Column) -> Array:

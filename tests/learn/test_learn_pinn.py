@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from learn_trucks import FEATURES, TABLE, energy_by_hand, road, truck_rows
 from scipy.special import expit, logit
-from scipy.stats import norm
+from scipy.stats import multivariate_t, norm
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads
@@ -175,8 +175,10 @@ def test_the_likelihood_and_its_stretches_by_hand(rows):
             off_by = np.exp(float(model.drift)) * law[part].sum()
             data += minus(error[part].sum(), np.sqrt((sd[part] ** 2).sum() + off_by**2))
     square = lambda x: float(np.sum(np.square(x)))  # noqa: E731
-    sizes = square(model.sizes["auxiliary_power.power_w"]) + square(own_sizes)
-    prior = 0.5 * (square(about_mean(model.own)) + square(model.common)) / 0.3**2 + 0.5 * sizes
+    prior = 0.5 * square(model.common) / 0.3**2 + 0.5 * square(model.sizes["auxiliary_power.power_w"])
+    for column, usual in ((about_mean(model.own)[:, 0], 0.3), (about_mean(model.own)[:, 1], 0.3), (own_sizes, 1.0)):
+        cauchy = multivariate_t(shape=usual**2 * np.eye(len(column)), df=1)
+        prior += cauchy.logpdf(np.zeros(len(column))) - cauchy.logpdf(column)
     terms = (data / 80, minus(off, loose).sum() / 80, prior / 1000 + 0.01 * square(coefficients) / 80)
     np.testing.assert_allclose(found, np.dot(lam, terms), rtol=1e-4)
 
