@@ -35,6 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from experiments.pinn_closed import known
 from experiments.pinn_data import load
 from hdev_jax.learn.heads import Network
 from hdev_jax.learn.pinn import C_RR_LIMIT, Objective, Pinn, Recipe, predict, ready
@@ -281,7 +282,7 @@ def same_loss(torch: Any, learner: Learner) -> float:
 def fleet_rows(count: int, routes: int) -> tuple[Rows, int]:
     """So many rows, features to scale, and the number of vehicles."""
     data = load("fleet", 0, routes, (), 1.0, None, 0, ("all",))
-    rows, _ = data.rows(FEATURES["channels"])
+    rows, _ = data.rows(FEATURES["channels"], (), known(data, "{}"))
     scale = Scale.of(np.asarray(rows.features, float))
     rows = eqx.tree_at(lambda r: r.features, rows, np.asarray(scale.apply(rows.features), np.float32))
     return rows.take(np.random.default_rng(0).integers(0, len(rows), count)), data.trained

@@ -15,9 +15,10 @@ from experiments import pinn_pages
 from experiments.config import Strict
 from experiments.data import MissingDataError, fingerprint
 from experiments.pinn_buses import bus_sources
+from experiments.pinn_closed import kernel, known, said, trainable
 from experiments.pinn_data import Data, load
 from experiments.pinn_diagnosed import diagnosed, found_effects
-from experiments.pinn_models import bayesian, boosted, kernel, known, names_of, said, trainable
+from experiments.pinn_models import bayesian, boosted, names_of
 from experiments.pinn_networks import trained
 from experiments.pinn_scores import scores
 from hdev_jax.errors import InputError
@@ -29,8 +30,8 @@ from hdev_jax.rundir import Run
 __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = (
-    "pinn.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_models.py", "pinn_networks.py", "pinn_scores.py",
-    "pinn_buses.py", "paper1_halves.py",
+    "pinn.py", "pinn_closed.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_models.py", "pinn_networks.py",
+    "pinn_scores.py", "pinn_buses.py", "paper1_halves.py",
 )  # fmt: skip
 
 

@@ -55,25 +55,21 @@ class Data:
     trained: int
 
     def rows(
-        self,
-        features: Sequence[str],
-        effects: Sequence[str] = (),
-        known: Sequence[tuple[Vehicle, np.ndarray]] = (),
+        self, features: Sequence[str], effects: Sequence[str], known: Sequence[tuple[Vehicle, np.ndarray]]
     ) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
 
         Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`).
-        **Arguments:** `effects`, those that are trained; `known`, of each vehicle what to take in the place of what its
-        sheet says, and the energy of each row that no row tells by itself [Wh].
+        **Arguments:** `effects`, those that are trained; `known`, each vehicle as it is declared and what effects
+        across rows add to each of its rows [Wh] (`experiments.pinn_closed.known`).
         """
         made = [at_null(LIBRARY[e]) for e in effects]
-        known = known or [(m.vehicle, np.zeros(len(m.energy_wh))) for m in self.vehicles]
         parts = []
-        for k, (m, (car, moved), fit) in enumerate(zip(self.vehicles, known, self._calibrated, strict=True)):
+        for k, (m, (car, across), fit) in enumerate(zip(self.vehicles, known, self._calibrated, strict=True)):
             s = dataclasses.replace(m.segments, trip=m.routes)
             one = rows_of(
                 car, s, m.energy_wh, number=min(k, self.trained), features=features, effects=made, calibrated=fit,
-                moved_wh=moved,
+                across_wh=across,
             )  # fmt: skip
             parts.append(one)
         return concatenated(parts), self.column("use")
@@ -82,11 +78,9 @@ class Data:
     def _calibrated(self) -> list[Vehicle]:
         """Each vehicle with c_rr, C_d·A and auxiliary load by closed form from its training rows; one without any has
         the others' median ratios to their tables, and their median load."""
+        self.trains()
         fits = [calibrated(m) if np.any(m.use == 0) else None for m in self.vehicles]
-        known = [f for f in fits if f is not None]
-        if not known:
-            raise InputError("no vehicle has a training route; hold out less, or take more routes")
-        ratio = np.median(known, axis=0)
+        ratio = np.median([f for f in fits if f is not None], axis=0)
         out = []
         for m, f in zip(self.vehicles, fits, strict=True):
             c_rr, cda, load = ratio if f is None else f
@@ -101,6 +95,11 @@ class Data:
         """Those of the effects whose channels this data has."""
         s = self.vehicles[0].segments
         return {k: v for k, v in effects.items() if unavailable(LIBRARY[k], s, "road") is None}
+
+    def trains(self) -> None:
+        """Raises `InputError` where no vehicle has a training row."""
+        if not any(np.any(m.use == 0) for m in self.vehicles):
+            raise InputError("no vehicle has a training route; hold out less, or take more routes")
 
     def column(self, name: str) -> np.ndarray:
         """A column of all vehicles, one after the other."""

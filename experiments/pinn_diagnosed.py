@@ -15,11 +15,15 @@ from hdev_jax.physics import LIBRARY, Vehicle
 
 __all__ = ["diagnosed", "found_effects", "united"]
 
+_OF_TRIPS = ("at_trip", "in_mode")  # parameters that say something of the trips of one log
+
 
 @cache
 def found_effects(data: Data, vehicles: tuple[str, ...], routes: int) -> dict[str, dict[str, float]]:
     """Effects that the diagnoses of these vehicles find on so many of their training routes, in the order of how often,
     with the median of each shape; sizes and thresholds are left open.
+
+    What began at some trip, or holds in some, is of one vehicle's log and no part of it.
     """
     chosen = [m for m in data.vehicles if (m.id in vehicles or vehicles == ("all",)) and len(m.where(0))]
     return united([diagnosed(m, routes, seed=0)[1] for m in chosen])
@@ -30,6 +34,8 @@ def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
     out = {}
     for id in sorted({e for f in found for e in f}, key=lambda e: (-sum(e in f for f in found), e)):
         kind = LIBRARY[id]
+        if any(p.name in _OF_TRIPS for p in kind.parameters):
+            continue
         having = [f[id] for f in found if id in f]
         shapes = [p.name for p in kind.parameters if p.kind not in ("size", "limit")]
         out[id] = {n: float(np.median([h[n] for h in having if n in h])) for n in shapes if any(n in h for h in having)}

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from experiments.pinn_closed import sized, trainable
 from experiments.pinn_data import Data
-from experiments.pinn_models import names_of, networks, sized, trainable
+from experiments.pinn_models import names_of, networks
 from experiments.pinn_scores import scores
 from hdev_jax import progress
 from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
@@ -95,4 +96,4 @@ def _at_bound(recipe: Recipe, table: np.ndarray, own: Sequence[Any], at: np.ndar
 def _at_battery(rows: Any, mean: dict[str, np.ndarray]) -> np.ndarray:
     """Battery energy with coefficients that were learned against the energy at the wheels."""
     car = with_coefficients(rows.car, np.asarray(mean["c_rr"], np.float32), np.asarray(mean["cda_m2"], np.float32))
-    return np.asarray(energy(car, rows.segments), float)
+    return np.asarray(energy(car, rows.segments) + rows.across_wh, float)

@@ -5,20 +5,24 @@ import json
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import pinn
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn import Config, chosen, tasks, together
+from experiments.pinn_closed import kernel, known, said, trainable
 from experiments.pinn_data import Data, load
 from experiments.pinn_diagnosed import united
-from experiments.pinn_models import kernel, known, said, trainable
 from experiments.pinn_scores import pooled, scores
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn import Pinn, Recipe, predict
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
+from hdev_jax.physics import Grouped
 from hdev_jax.physics.battery import RegenLimit
-from hdev_jax.physics.sensors import MassScale, TimeSkew
+from hdev_jax.physics.losses import GearEfficiency
+from hdev_jax.physics.sensors import GradeLag, MassScale, SamplingFilter, TimeSkew
 
 
 def config(name, *sets):
@@ -113,50 +117,126 @@ def test_scores_are_those_of_all_rows_and_add_up_over_vehicles():
 
 
 def test_effects_of_several_diagnoses_are_one_list():
-    """The commonest first, shapes at their median, sizes and thresholds left open."""
+    """The commonest first, shapes at their median, sizes and thresholds left open; nothing of one log's trips."""
     found = [
         {"tyre_warmup": {"excess": 0.3, "distance_m": 4000.0}, "grade_lag": {"lag_s": 0.5}, "headwind": {"scale": 1.0}},
         {"tyre_warmup": {"excess": 0.5, "distance_m": 8000.0}, "regen_limit": {"power_w": 9e4}},
+        {"step_change": {"power_w": 900.0, "at_trip": 3.0}, "time_skew": {"skew_s": 2.0, "cubic": 1.0}},
+        {"sampling_filter": {"tau_s": 9.0}},
     ]
-    whole = {"tyre_warmup": {"distance_m": 6000.0}, "grade_lag": {}, "headwind": {}, "regen_limit": {}}
+    whole = {
+        "tyre_warmup": {"distance_m": 6000.0}, "grade_lag": {}, "headwind": {}, "regen_limit": {},
+        "sampling_filter": {}, "time_skew": {"cubic": 1.0},
+    }  # fmt: skip
     assert united(found) == whole
     assert united([]) == {}
     assert trainable(whole) == ("tyre_warmup", "headwind")
 
 
+def planted(data, noise_wh, *effects, noise_share=0.0):
+    """The data with another first vehicle, which has these effects."""
+    m, *others = data.vehicles
+    y = said(m.vehicle.plus(*effects), m)
+    z = np.random.default_rng(0).standard_normal(len(y))
+    return Data((dataclasses.replace(m, energy_wh=y + z * (noise_wh + noise_share * np.abs(y))), *others), data.trained)
+
+
+@pytest.mark.parametrize(
+    ("effects", "listed", "wanted"),
+    [
+        ((SamplingFilter(0.0, 0.0, 20.0),), {"sampling_filter": {}}, {("sampling_filter", "tau_s"): (20.0, 0.5)}),
+        (
+            (TimeSkew(4.0, 0.0), GradeLag(6.0)), {"mass_scale": {}, "grade_lag": {}, "time_skew": {}},
+            {("time_skew", "skew_s"): (4.0, 0.2), ("grade_lag", "lag_s"): (6.0, 0.3)},
+        ),
+        (
+            (TimeSkew(-2.0, 1.0), RegenLimit(8e3)), {"time_skew": {"cubic": 1.0}, "regen_limit": {}},
+            {("time_skew", "skew_s"): (-2.0, 0.05), ("time_skew", "cubic"): (1.0, 0.0),
+             ("regen_limit", "power_w"): (8e3, 300.0)},
+        ),
+        ((RegenLimit(1e5),), {"regen_limit": {"power_w": 9e4}}, {("regen_limit", "power_w"): (9e4, 0.0)}),
+        ((), {"regen_limit": {}, "time_skew": {}}, {("regen_limit", "power_w"): (1e12, 0.0),
+                                                    ("time_skew", "skew_s"): (0.0, 0.0)}),
+    ],
+    ids=["a filter", "two delays", "a cubic and a limit below the grid", "given", "none planted"],
+)  # fmt: skip
+def test_thresholds_are_found_wherever_they_lie_and_none_where_none_is(effects, listed, wanted):
+    data = planted(load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B")), 3.0, *effects)
+    car = kernel(data.vehicles[0], listed)
+    for (id, name), (value, within) in wanted.items():
+        assert float(getattr(car.effect(id), name)) == pytest.approx(value, abs=within), id
+
+
+def test_each_gear_has_its_own_size():
+    data = load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B"))
+    gears = np.zeros(13)
+    gears[10:] = 0.03
+    data = planted(data, 1.0, GearEfficiency(Grouped(jnp.asarray(gears), "gear")))
+    found = np.asarray(kernel(data.vehicles[0], {"gear_efficiency": {}}).effect("gear_efficiency").delta.values)
+    rows = np.bincount(np.asarray(data.vehicles[0].segments.channels["gear"], int)[data.vehicles[0].use == 0])
+    for gear in np.flatnonzero(rows > 100):
+        assert found[gear] == pytest.approx(gears[gear], abs=0.006), gear
+
+
 def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them():
-    """Planted, with the fleet's noise, in the place of what the fleet's vehicle really has."""
+    """Planted, with the fleet's noise of the energy, in the place of what the fleet's vehicle really has."""
     effects = {"headwind": {}, "mass_scale": {}, "regen_limit": {}, "time_skew": {}}
     data = load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B"))
+    data = planted(data, 3.0, MassScale(0.03), RegenLimit(1.5e5), TimeSkew(0.3, 0.0), noise_share=0.01)
     a, b = data.vehicles
-    planted = a.vehicle.plus(MassScale(0.03), RegenLimit(1.5e5), TimeSkew(0.3, 0.0))
-    noise = 3.0 * np.random.default_rng(0).standard_normal(len(a.use))
-    a = dataclasses.replace(a, energy_wh=said(planted, a) + noise)
-    data = Data((a, b), 1)
     car, (one, other) = kernel(a, effects), known(data, json.dumps(effects))
     limit = float(car.effect("regen_limit").power_w)
     assert limit == pytest.approx(1.5e5, rel=0.01)
-    assert float(car.effect("time_skew").skew_s) == pytest.approx(0.3, abs=0.02)
+    assert float(car.effect("time_skew").skew_s) == pytest.approx(0.3, abs=0.03)
     assert float(car.effect("mass_scale").scale) == pytest.approx(0.03, abs=0.005)
 
     assert float(one.vehicle.effect("regen_limit").power_w) == pytest.approx(limit)
     assert {"headwind", "mass_scale", "time_skew"}.isdisjoint(e.id for e in one.vehicle.effects)
-    assert one.moved_wh == pytest.approx(said(car, a) - said(car.minus("time_skew"), a))
-    trips = [np.sum(one.moved_wh[a.routes == t]) for t in np.unique(a.routes)]
-    assert np.sum(np.abs(one.moved_wh)) > 10 * np.sum(np.abs(trips)) > 0, "a delay moves energy from row to row"
+    assert one.across_wh == pytest.approx(said(car, a) - said(car.minus("time_skew"), a))
+    trips = [np.sum(one.across_wh[a.routes == t]) for t in np.unique(a.routes)]
+    assert np.sum(np.abs(one.across_wh)) > 10 * np.sum(np.abs(trips)) > 0, "a delay moves energy from row to row"
 
     masses = float(b.vehicle.mass_kg) / float(a.vehicle.mass_kg)
     assert float(other.vehicle.effect("regen_limit").power_w) == pytest.approx(limit * masses)
-    assert not other.moved_wh.any()
+    assert not other.across_wh.any()
 
-    plain, use = data.rows(("speed_mps",))
-    rows, _ = data.rows(("speed_mps",), trainable(effects), (one, other))
-    assert np.asarray(rows.moved_wh) == pytest.approx(np.concatenate([one.moved_wh, other.moved_wh]), rel=1e-6)
+    spoilt = dataclasses.replace(a, energy_wh=np.where(a.use == 0, a.energy_wh, -1e4))
+    again = known(Data((spoilt, b), 1), json.dumps(effects))
+    assert np.array_equal(again[0].across_wh, one.across_wh), "energies of rows that are not trained on say nothing"
+    assert float(again[0].vehicle.effect("regen_limit").power_w) == limit
+
+
+def test_a_networks_physics_has_the_thresholds_and_what_acts_across_rows():
+    """An untrained network says what the sheet says, with both."""
+    effects = {"regen_limit": {}, "time_skew": {}}
+    data = load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B"))
+    data = planted(data, 3.0, RegenLimit(6e4), TimeSkew(0.3, 0.0))
+    rows, use = data.rows(("speed_mps",), trainable(effects), known(data, json.dumps(effects)))
+    at = np.flatnonzero(use == 2)
     recipe = Recipe(features=("speed_mps",), units=(4,))
     model, memory = eqx.nn.make_with_state(Pinn)(recipe, 1, scale_wh=1.0, key=jax.random.key(0))
-    lone = jax.tree.map(lambda x: x[use == 0], eqx.tree_at(lambda r: r.car, rows, plain.car))
-    without = predict(model, memory, plain.take(use == 0)).physics_wh
-    assert predict(model, memory, lone).physics_wh - without == pytest.approx(lone.moved_wh, abs=0.01)
+    physics = np.asarray(predict(model, memory, rows.take(at)).physics_wh)
+    off = physics - data.vehicles[0].energy_wh[at]
+    assert np.sqrt(np.mean(off**2)) < 4.0
+    plain, _ = data.rows(("speed_mps",), (), known(data, "{}"))
+    without = np.asarray(predict(model, memory, plain.take(at)).physics_wh) - data.vehicles[0].energy_wh[at]
+    assert np.sqrt(np.mean(without**2)) > 8.0
+
+
+def test_a_task_trains_with_the_effects_of_its_config(monkeypatch):
+    """What the networks are given is `known` of the config's effects."""
+    given = {}
+    monkeypatch.setattr(pinn, "trained", lambda data, rows, use, tasks, model: given.update(rows=rows) or [{}])
+    sets = ("routes=24", 'variants=["A"]', 'only=["ours"]', "diagnosed=[]", "effects={regen_cutoff={}, time_skew={}}")
+    (task,) = tasks(config("paper1/table2", *sets))
+    pinn.run(task)
+    data = load("fleet", 1, 24, (), 1.0, None, 0, ("A",))
+    (one,) = known(data, json.dumps({"regen_cutoff": {}, "time_skew": {}}))
+    assert given["rows"].across_wh == pytest.approx(one.across_wh, rel=1e-6)
+    assert given["rows"].car.has("regen_cutoff")
+    held = Data(tuple(dataclasses.replace(m, use=np.full(len(m.use), 2)) for m in data.vehicles), 1)
+    with pytest.raises(InputError, match="no vehicle has a training route"):
+        known(held, "{}")
 
 
 def test_effects_as_diagnosed_ask_for_vehicles_to_diagnose():

@@ -24,6 +24,7 @@ __all__ = ["C_RR_LIMIT", "Choices", "Objective", "Pinn", "Prediction", "Recipe",
 
 C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
 _LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
+_SPREAD_DOF = 0.1  # degrees of freedom of what is known beforehand of how far vehicles are apart
 _BY_ROW = 0.5  # how far the network's head moves a free coefficient, in logarithms, for an output of 1
 
 
@@ -183,11 +184,12 @@ class Pinn(eqx.Module):
             heads = Heads(heads.energy, said.coefficients)
         c_rr, cda = self.coefficients(heads, rows)
         law = energy if r.physics == "battery" else wheel_energy
-        physics = law(with_coefficients(rows.car, c_rr, cda, *self.effects_of(rows)), rows.segments) + rows.moved_wh
+        physics = law(with_coefficients(rows.car, c_rr, cda, *self.effects_of(rows)), rows.segments)
+        if r.physics == "battery":  # at the wheels nothing is known of it
+            physics = physics + rows.across_wh
         residual = self.scale_wh * heads.energy if r.energy_head else jnp.zeros_like(physics)
-        base = {
-            "residual": physics, "alone": jnp.zeros_like(physics), "table": energy(rows.car, rows.segments)
-        }[r.predicted]  # fmt: skip
+        tables = energy(rows.car, rows.segments) + rows.across_wh
+        base = {"residual": physics, "alone": jnp.zeros_like(physics), "table": tables}[r.predicted]
         floor, share = jnp.exp(self.noise[0]) * self.scale_wh, jnp.exp(self.noise[1])
         sd = jnp.sqrt(floor**2 + (share * physics) ** 2)
         if r.loss == "squares":
@@ -280,13 +282,14 @@ class Objective:
 def _between_vehicles(own: Array, usual: float) -> Array:
     """Minus the logarithm of the density of what vehicles have of their own [vehicle, …], but for a constant.
 
-    Each column is normal about the mean with an sd that is unknown but for being of the size of `usual`: with an
-    inverse gamma of one degree of freedom for its square, integrated out, it is a multivariate Cauchy (Gelman et al.,
-    Bayesian Data Analysis, 3.2). So a coefficient that is alike in all vehicles is told by all of their rows together.
+    Each column is normal about the mean, with a variance that has the scaled inverse χ² distribution about `usual`²,
+    of so few degrees of freedom that the data say what it is: integrated out, a multivariate Student t (Gelman et al.,
+    Bayesian Data Analysis, 3.2) of one dimension less than there are vehicles, the mean being taken out. So a
+    coefficient that is alike in all vehicles is told by all of their rows together.
     """
-    vehicles = own.shape[0]
     squares = jnp.sum(_centred(own) ** 2, axis=0)
-    return 0.5 * (vehicles + 1) * jnp.sum(jnp.log1p(squares / usual**2))
+    power = 0.5 * (_SPREAD_DOF + own.shape[0] - 1)
+    return power * jnp.sum(jnp.log1p(squares / (_SPREAD_DOF * usual**2)))
 
 
 def _normal(error: Column, sd: Column) -> Array:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from learn_trucks import FEATURES, TABLE, energy_by_hand, road, truck_rows
+from scipy.linalg import helmert
 from scipy.special import expit, logit
 from scipy.stats import multivariate_t, norm
 
@@ -176,9 +177,11 @@ def test_the_likelihood_and_its_stretches_by_hand(rows):
             data += minus(error[part].sum(), np.sqrt((sd[part] ** 2).sum() + off_by**2))
     square = lambda x: float(np.sum(np.square(x)))  # noqa: E731
     prior = 0.5 * square(model.common) / 0.3**2 + 0.5 * square(model.sizes["auxiliary_power.power_w"])
-    for column, usual in ((about_mean(model.own)[:, 0], 0.3), (about_mean(model.own)[:, 1], 0.3), (own_sizes, 1.0)):
-        cauchy = multivariate_t(shape=usual**2 * np.eye(len(column)), df=1)
-        prior += cauchy.logpdf(np.zeros(len(column))) - cauchy.logpdf(column)
+    owns = (*np.asarray(model.own).T, model.own_sizes["auxiliary_power.power_w"])
+    for own, usual in zip(owns, (0.3, 0.3, 1.0), strict=True):
+        contrasts = helmert(len(own)) @ np.asarray(own)
+        student = multivariate_t(shape=usual**2 * np.eye(len(contrasts)), df=0.1)
+        prior += student.logpdf(0 * contrasts) - student.logpdf(contrasts)
     terms = (data / 80, minus(off, loose).sum() / 80, prior / 1000 + 0.01 * square(coefficients) / 80)
     np.testing.assert_allclose(found, np.dot(lam, terms), rtol=1e-4)
 
