@@ -50,8 +50,11 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
         return
     fig = figure(6.4, 3.8)
     axes = fig.add_subplot()
+    lengths = sorted({t["trips"] for t, _ in single})
     for method in _methods(rivals):
-        for trips, dashes in zip(sorted({t["trips"] for t, _ in single}), ("--", "-", ":", "-."), strict=False):
+        for k, (trips, dashes) in enumerate(zip(lengths, ("--", "-", ":", "-."), strict=False)):
+            # where one method stands alone, colours tell the lengths apart
+            colour = COLOURS[method] if rivals else list(COLOURS.values())[k]
             points = []
             for size in sorted({t["size"] for t, _ in single}):
                 hits = [
@@ -61,12 +64,13 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
                     points.append((size, np.mean(hits), *wilson(sum(hits), len(hits))))
             if points:
                 x, y, low, high = np.array(points).T
-                axes.plot(x, 100 * y, dashes, color=COLOURS[method], marker="o", ms=4,
+                beside = x * 1.03 ** (k - (len(lengths) - 1) / 2)  # so that no interval hides another
+                axes.plot(beside, 100 * y, dashes, color=colour, marker="o", ms=4,
                           label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
-                axes.fill_between(x, 100 * low, 100 * high, color=COLOURS[method], alpha=0.12, lw=0)
-                axes.vlines(x, 100 * low, 100 * high, color=COLOURS[method], lw=1)
-    axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(0, 102),
-             ylabel="named exactly [%]", title="Synthetic logs with one planted effect")  # fmt: skip
+                axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
+    axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)",
+             ylim=(0, 102) if rivals else (50, 101), ylabel="named exactly [%]",
+             title="Synthetic logs with one planted effect")  # fmt: skip
     sizes = sorted({t["size"] for t, _ in single})
     axes.set_xticks(sizes, [f"{s:g}" for s in sizes])
     axes.minorticks_off()
@@ -94,7 +98,7 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
             axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
     axes.axhline(5, color="#333", lw=0.8, ls=":")
     axes.set_xticks(range(len(noises)), [n.replace("_", " ") for n in noises], fontsize=8)
-    axes.set(ylabel="something named [%]", ylim=(0, 102), title="Synthetic logs with nothing missing")
+    axes.set(ylabel="something named [%]", ylim=(0, 102 if rivals else 10), title="Synthetic logs with nothing missing")
     tidy(axes)
     fig.legend(fontsize=7, loc="outside right center")
     save_figure(run, fig, "false_discoveries")
