@@ -51,23 +51,23 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     fig = figure(6.4, 3.8)
     axes = fig.add_subplot()
     lengths = sorted({t["trips"] for t, _ in single})
-    for method in _methods(rivals):
-        for k, (trips, dashes) in enumerate(zip(lengths, ("--", "-", ":", "-."), strict=False)):
-            # where one method stands alone, colours tell the lengths apart
-            colour = COLOURS[method] if rivals else list(COLOURS.values())[k]
-            points = []
-            for size in sorted({t["size"] for t, _ in single}):
-                hits = [
-                    outcome(t["effects"], r, method)[0] for t, r in single if (t["size"], t["trips"]) == (size, trips)
-                ]
-                if hits:
-                    points.append((size, np.mean(hits), *wilson(sum(hits), len(hits))))
-            if points:
-                x, y, low, high = np.array(points).T
-                beside = x * 1.03 ** (k - (len(lengths) - 1) / 2)  # so that no interval hides another
-                axes.plot(beside, 100 * y, dashes, color=colour, marker="o", ms=4,
-                          label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
-                axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
+    series = [(m, trips) for m in _methods(rivals) for trips in lengths]
+    dashes = dict(zip(lengths, ("--", "-", ":", "-."), strict=False))
+    for k, (method, trips) in enumerate(series):
+        points = []
+        for size in sorted({t["size"] for t, _ in single}):
+            hits = [outcome(t["effects"], r, method)[0] for t, r in single if (t["size"], t["trips"]) == (size, trips)]
+            if hits:
+                points.append((size, np.mean(hits), *wilson(sum(hits), len(hits))))
+        if not points:
+            continue
+        # where one method stands alone, colours tell the lengths apart
+        colour = COLOURS[method] if rivals else list(COLOURS.values())[k]
+        x, y, low, high = np.array(points).T
+        beside = x * 1.02 ** (k - (len(series) - 1) / 2)  # so that no interval hides another
+        axes.plot(beside, 100 * y, dashes[trips], color=colour, marker="o", ms=4,
+                  label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
+        axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
     axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)",
              ylim=(0, 102) if rivals else (50, 101), ylabel="named exactly [%]",
              title="Synthetic logs with one planted effect")  # fmt: skip
