@@ -1,6 +1,7 @@
 """Figures of the planted study: power against size, false discoveries against noise, confusion between causes."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,8 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     axes = fig.add_subplot()
     lengths = sorted({t["trips"] for t, _ in single})
     series = [(m, trips) for m in _methods(rivals) for trips in lengths]
-    dashes = dict(zip(lengths, ("--", "-", ":", "-."), strict=False))
+    dashes = dict(zip(lengths, cycle(("--", "-", ":", "-."))))
+    colours, lowest = list(COLOURS.values()), 0.0 if rivals else 50.0
     for k, (method, trips) in enumerate(series):
         points = []
         for size in sorted({t["size"] for t, _ in single}):
@@ -62,15 +64,15 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
         if not points:
             continue
         # where one method stands alone, colours tell the lengths apart
-        colour = COLOURS[method] if rivals else list(COLOURS.values())[k]
+        colour = COLOURS[method] if rivals else colours[k % len(colours)]
         x, y, low, high = np.array(points).T
         beside = x * 1.02 ** (k - (len(series) - 1) / 2)  # so that no interval hides another
         axes.plot(beside, 100 * y, dashes[trips], color=colour, marker="o", ms=4,
                   label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
         axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
-    axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)",
-             ylim=(0, 102) if rivals else (50, 101), ylabel="named exactly [%]",
-             title="Synthetic logs with one planted effect")  # fmt: skip
+        lowest = min(lowest, 95 * float(np.min(low)))
+    axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(lowest, 102),
+             ylabel="named exactly [%]", title="Synthetic logs with one planted effect")  # fmt: skip
     sizes = sorted({t["size"] for t, _ in single})
     axes.set_xticks(sizes, [f"{s:g}" for s in sizes])
     axes.minorticks_off()
@@ -89,6 +91,7 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     methods = [m for m in _methods(rivals) if m != "ours_first"]  # no name is right here, with classes or without
     fig = figure(6.8, 3.6)
     axes = fig.add_subplot()
+    highest = 10.0
     for i, method in enumerate(methods):
         for k, noise in enumerate(noises):
             hits = [outcome([], r, method)[1] for t, r in empty if t["noise"] == noise]
@@ -96,9 +99,10 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
             x, y = k + 0.8 * (i + 0.5) / len(methods) - 0.4, float(np.mean(hits))
             axes.bar(x, 100 * y, 0.75 / len(methods), color=COLOURS[method], label=LABELS[method] if k == 0 else None)
             axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
+            highest = max(highest, 102 * high)
     axes.axhline(5, color="#333", lw=0.8, ls=":")
     axes.set_xticks(range(len(noises)), [n.replace("_", " ") for n in noises], fontsize=8)
-    axes.set(ylabel="something named [%]", ylim=(0, 102 if rivals else 10), title="Synthetic logs with nothing missing")
+    axes.set(ylabel="something named [%]", ylim=(0, highest), title="Synthetic logs with nothing missing")
     tidy(axes)
     fig.legend(fontsize=7, loc="outside right center")
     save_figure(run, fig, "false_discoveries")
