@@ -3,9 +3,11 @@
 import difflib
 import hashlib
 import importlib.util
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from hdev_jax import progress
 from hdev_jax.diagnosis.candidates import FIXED, plan_of
-from hdev_jax.diagnosis.facts import facts_of
+from hdev_jax.diagnosis.facts import GROUPS, facts_of
 from hdev_jax.diagnosis.problem import Problem, prepare
 from hdev_jax.diagnosis.programs import computed
 from hdev_jax.diagnosis.split import Split, split_trips
@@ -23,7 +25,8 @@ from hdev_jax.inference import padded
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
-from hdev_jax.physics.effect import STAGES
+from hdev_jax.physics.effect import KINDS, STAGES
+from hdev_jax.physics.library import DECLARED
 from hdev_jax.rundir import Run
 
 __all__ = ["Opening", "Paths", "chosen_effects", "command_line", "known_effects", "opened", "tried"]
@@ -42,7 +45,7 @@ def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as e:
+    except (Exception, SystemExit) as e:  # a script that ends itself has not been read to its end
         raise InputError(f"--effects {file}: does not run: {type(e).__name__}: {e}") from e
     own = [
         c for c in vars(module).values()
@@ -62,14 +65,24 @@ def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
 def _malformed(effect: type[Effect]) -> str | None:
     """Why a user's class is no effect, in one phrase; None where it is one."""
     stage, parameters = getattr(effect, "stage", None), effect.parameters
+    declared = {c.id for c in DECLARED}
     if not (isinstance(effect.id, str) and effect.id.isascii() and effect.id.isidentifier()):
         return f"id is {effect.id!r}; letters, digits and underscores are expected"
+    if effect.id in declared:
+        return f"id {effect.id!r} is a part of the declared model; give yours a name of its own"
     if stage not in STAGES:
         return f"stage is {stage!r}; one of {', '.join(STAGES)} is expected"
     if not isinstance(getattr(effect, "equation", None), str):
         return "equation is missing; a line of text is expected"
     if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
         return "parameters is something else than a tuple of hdev_jax.physics.Parameter"
+    if not _texts(effect.needs) or not _texts(effect.lacks):
+        return f"needs is {effect.needs!r} and lacks {effect.lacks!r}; a tuple of channels' names each is expected"
+    if effect.searched:
+        return f"searched is {effect.searched!r}; only effects of the library are looked for in a way of their own"
+    for p in parameters:
+        if why := _malformed_parameter(p):
+            return f"parameter {p.name!r}: {why}"
     if all(p.kind in FIXED for p in parameters):
         return "parameters holds no size and no limit, so nothing of it could be found"
     try:
@@ -79,16 +92,42 @@ def _malformed(effect: type[Effect]) -> str | None:
     return None
 
 
+def _texts(names: Any) -> bool:
+    return isinstance(names, tuple | list) and all(isinstance(n, str) for n in names)
+
+
+def _malformed_parameter(p: Parameter) -> str | None:
+    """Why a parameter could never be fitted or tried, in one phrase; None where it can."""
+    numbers = (p.null, p.scale, p.lower, p.upper, p.least, *p.grid)
+    if not all(isinstance(x, Real) and not math.isnan(x) for x in numbers):
+        return "null, scale, lower, upper, least and the values of grid are numbers"
+    if p.kind not in KINDS:
+        return f"kind is {p.kind!r}; one of {', '.join(KINDS)} is expected"
+    if p.by not in ("", *GROUPS):
+        return f"by is {p.by!r}; empty or one of {', '.join(GROUPS)} is expected"
+    if p.scale == 0 or math.isinf(p.scale):
+        return f"scale is {p.scale:g}; a typical size other than 0 is expected"
+    if not p.lower < p.upper:
+        return f"lower is {p.lower:g} and upper {p.upper:g}; a range is expected"
+    if p.kind == "size" and not p.lower <= p.null <= p.upper:
+        return f"null is {p.null:g}, outside its range {p.lower:g} to {p.upper:g}"
+    if p.kind != "size" and not p.grid and p.name != "at_trip":  # whose values are the log's trips
+        return f"a {p.kind} without a grid is never tried; give it values to try"
+    return None
+
+
 def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None) -> None:
     """Work out the columns of a user's own effects on every row of the log, before anything is fitted.
 
-    Raises `InputError` that names the class, for one that fails there or does not give a number in every row.
+    Raises `InputError` that names the class, for one that fails there, does not give a number in every row, or changes
+    the prediction while all of its sizes are null.
     """
     own = [c for k, c in known.items() if k not in LIBRARY]
     if not own:
         return
     car = problem.vehicle.minus(*(c.id for c in own if problem.vehicle.has(c.id)))
     rows, facts = padded(problem.segments, problem.measured), facts_of(problem.segments)
+    plain = problem.predict(car)
     for c in own:
         where = f"--effects {file}: class {c.__name__}"
         bad = np.zeros(rows.rows, dtype=bool)
@@ -96,6 +135,7 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
             plan = plan_of(car, [c], facts, problem.target, searched=True)
             for column in computed(plan.recipes, rows.segments, problem.target):
                 bad |= ~np.isfinite(column[: rows.rows])
+            null = plain if c.id in plan.left_out else problem.predict(car.plus(at_null(c, gears=facts.gears)))
         except Exception as e:
             hint = "; every channel that it reads belongs in its needs" if isinstance(e, KeyError) else ""
             raise InputError(f"{where}: fails on this log: {type(e).__name__}: {e}{hint}") from e
@@ -105,6 +145,11 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
             raise InputError(
                 f"{where}: it or its slope is no finite number in {bad.sum()} of {rows.rows} rows, the first in trip "
                 f"{trip} at {at:g} s; a number is expected in every row, also of a branch that is not taken"
+            )
+        if not np.allclose(null, plain, rtol=1e-5, atol=1e-9 * float(np.max(np.abs(plain)))):
+            raise InputError(
+                f"{where}: changes the prediction by up to {np.max(np.abs(null - plain)):.3g} {problem.unit} while its "
+                "sizes are null; what it adds is expected to be 0 there"
             )
 
 

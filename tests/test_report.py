@@ -235,6 +235,23 @@ def test_page_leads_with_the_answer(verdict, tmp_path):
     assert "12 more candidates" in text or "13 more candidates" in text
 
 
+@pytest.mark.parametrize(
+    ("clusters", "scored", "said"),
+    [
+        ({"kind": "block", "count": 1}, True, "Not decidable on this log: with 1 stretch of driving for training"),
+        ({"kind": "block", "count": 2}, True, "Not decidable on this log: with 2 stretches of driving for training"),
+        ({"kind": "block", "count": 3}, True, "Nothing is missing: none of the 20 effects"),
+        ({"kind": "block", "count": 3}, False, "Nothing was tried: the log shows none of the effects"),
+    ],
+)
+def test_nothing_is_missing_only_where_it_could_have_been_found(clusters, scored, said):
+    data = fake("nothing_missing")
+    data.summary["clusters"] = clusters
+    if not scored:
+        data.summary["candidates"] = [{**c, "score": None} for c in data.summary["candidates"]]
+    assert said in answer(data)
+
+
 def test_one_of_a_class_names_the_others_and_how_to_tell(tmp_path):
     data = fake()
     data.summary["effects"][0] |= {"verdict": "one_of_class", "indistinguishable_from": ["crosswind", "drafting"]}

@@ -478,6 +478,24 @@ def test_effects_that_do_not_exist(options, words, given, out, capsys):
         ("def half(:\n", ["SyntaxError"]),
         ("import no_such_module_at_all\n", ["no_such_module_at_all"]),
         ("x = 1\n", ["no subclass"]),
+        ("import sys\nsys.exit(0)\n", ["does not run", "SystemExit"]),
+        (USER_EFFECT.replace("slow_drift", "rolling"), ["SlowDrift", "'rolling'", "declared model"]),
+        (
+            USER_EFFECT.replace("    equation", '    needs: ClassVar = "gear"\n    equation'),
+            ["SlowDrift", "needs", "'gear'"],
+        ),
+        (
+            USER_EFFECT.replace("    equation", '    searched: ClassVar = "trips"\n    equation'),
+            ["SlowDrift", "'trips'"],
+        ),
+        (USER_EFFECT.replace("0.0, 100.0", "100.0, 0.0"), ["'w_per_s'", "lower is 100", "upper 0"]),
+        (USER_EFFECT.replace("0.0, 100.0", "1.0, 100.0"), ["'w_per_s'", "null is 0", "1 to 100"]),
+        (USER_EFFECT.replace("1.0, 0.0, 100.0", "0.0, 0.0, 100.0"), ["'w_per_s'", "scale is 0"]),
+        (USER_EFFECT.replace("0.0, 100.0)", '0.0, 100.0, kind="siz")'), ["'w_per_s'", "'siz'", "limit"]),
+        (USER_EFFECT.replace("0.0, 100.0)", '0.0, 100.0, by="axle")'), ["'w_per_s'", "'axle'", "road_surface"]),
+        (USER_EFFECT.replace("0.0, 100.0)", '0.0, 100.0, kind="limit")'), ["'w_per_s'", "grid"]),
+        (USER_EFFECT.replace("0.0, 100.0", "float('nan'), 100.0"), ["'w_per_s'", "numbers"]),
+        (USER_EFFECT.replace("self.w_per_s *", "(50.0 + self.w_per_s) *"), ["SlowDrift", "sizes are null"]),
         (USER_EFFECT.replace("slow_drift", "headwind"), ["headwind", "in the library already"]),
         (USER_EFFECT.replace("slow_drift", "slow.drift"), ["SlowDrift", "'slow.drift'", "letters"]),
         (USER_EFFECT.replace('"battery"', '"gearbox"'), ["SlowDrift", "'gearbox'", "driveline"]),
@@ -542,6 +560,19 @@ def test_a_misspelt_column(verb, right, wrong, given, files, tmp_path, capsys):
     argv = [] if verb == "check" else ["--out", tmp_path / "result"]
     line = refused(capsys, verb, log, *given[1:], *argv)
     assert all(w in line for w in (f"'{wrong}'", right)), line
+    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+
+
+@pytest.mark.parametrize("unknown", [65535, 4294967295])
+@pytest.mark.parametrize("channel", ["gear", "road_surface"])
+def test_an_id_that_no_gear_has(channel, unknown, given, files, tmp_path, capsys):
+    """An instrument's word for "unknown": a coefficient for each id up to it would be made."""
+    log = pd.read_csv(files["log"])
+    log[channel] = 1
+    log.loc[3, channel] = unknown
+    log.to_csv(tmp_path / "log.csv", index=False)
+    line = refused(capsys, "diagnose", tmp_path / "log.csv", *given[1:], "--out", tmp_path / "result")
+    assert all(w in line for w in (channel, "beyond 64 in 1 rows", "trip T01")), line
     assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
 
 

@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.facts import Facts, facts_of
 from hdev_jax.diagnosis.ranking import LEFT_OUT, best_of, plausible
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import adjusted, clusters_needed, clusters_to_tell, ruled_out
+from hdev_jax.diagnosis.significance import adjusted, clusters_needed, clusters_to_tell, least_clusters, ruled_out
 from hdev_jax.diagnosis.sums import Ground, both_looks
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
@@ -173,7 +173,7 @@ class View:
         for id_, s in sorted(self.best.items(), key=lambda kv: -kv[1].gain):
             if state.vehicle.has(id_):
                 continue
-            why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_))
+            why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_), self.evidence.count)
             by_rows = not s.plain and bool(s.p_model <= self.level(id_, fdr))
             needed, between = self._needed(s, fdr), self.between(s.candidate)
             out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, needed, between, by_rows))
@@ -206,9 +206,11 @@ class View:
         return needed if needed is not None and needed > count else None
 
 
-def _why_not(s: Score, q: float, absorbed_by: str | None) -> str:
+def _why_not(s: Score, q: float, absorbed_by: str | None, clusters: int) -> str:
     if absorbed_by:
         return f"absorbed: this log cannot tell it from {absorbed_by}"
+    if clusters < (least := least_clusters(len(s.beta))):
+        return f"not decidable: {least} trips or stretches of time are needed at least, {clusters} to train on"
     if not plausible(s):
         return "its best size has the wrong sign or is out of range"
     if s.left_out_gain <= LEFT_OUT:

@@ -27,6 +27,7 @@ __all__ = ["told_apart"]
 
 MOST_SHADOWS = 4
 SECONDS_PER_WH_OF_A_KW = 3.6
+CONSTANTS = {("auxiliary_power", "power_w"), ("power_gain", "offset_w")}  # loads that read nothing and choose nothing
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 
@@ -62,7 +63,7 @@ def told_apart(
         elif np.any(left.cycle_w):
             told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, fresh(), c, tell))
         gone = told["superfluous"] if told else []
-        shadow = gone[0] if gone else _shadow(problem, state, predicted, train, left)
+        shadow = next(iter(gone), None) if told else _shadow(problem, state, predicted, train, left)
         if shadow is None or round_ == MOST_SHADOWS:
             break
         tell(f"taking {shadow} out: what is left is larger than what it explains")
@@ -123,18 +124,13 @@ def _shadow(
 ) -> str | None:
     """A found effect that may be no more than the mean of the structure that is left, the latest first.
 
-    The mean of a cause that the library does not hold is a load that reads no channel and chooses nothing, neither
-    when it is there nor from which trip on. One that explains less than what is left (`left.rms`) is no cause of its
-    own. Both are of training rows: no choice sees the others.
+    The mean of a cause that the library does not hold is one of the `CONSTANTS`. One that explains less than what is
+    left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
     """
     mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
     for k, f in reversed(list(enumerate(state.found))):
-        effect = f.score.candidate.effect
         gain = max(mse[k] - mse[k + 1], 0.0)
-        told = effect.needs or effect.searched or any(p.kind == "choice" for p in effect.parameters)
-        constant = effect.stage == "battery" and not told
-        reads_nothing = effect.id == "power_gain" or constant
-        if reads_nothing and gain < left.rms**2:
+        if {(f.id, size) for size in f.score.candidate.sizes} <= CONSTANTS and gain < left.rms**2:
             return f.id
     return None
 

@@ -6,13 +6,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-__all__ = ["adjusted", "clusters_needed", "clusters_to_tell", "effective_number", "ruled_out", "wald"]
+__all__ = ["adjusted", "clusters_needed", "clusters_to_tell", "effective_number", "least_clusters", "ruled_out", "wald"]
+
+
+def least_clusters(k: int) -> int:
+    """With how many clusters a test of `k` numbers begins to say anything."""
+    return k + 2
 
 
 def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
     """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F)."""
     g, k = left_out.shape
-    if g <= k + 1:
+    if g < least_clusters(k):
         return 1.0
     spread = left_out - beta
     covariance = (g - 1) / g * spread.T @ spread
@@ -26,7 +31,7 @@ def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None
 
     **Returns:** None where twenty times as many would not do.
     """
-    if clusters <= k + 1:
+    if clusters < least_clusters(k):
         return None
     statistic = float(stats.f.isf(p, k, clusters - k))
     more = np.arange(clusters, 20 * clusters + 1)

@@ -93,8 +93,8 @@ def remainder(
     noise = estimate_noise(train.residual, train.trip, train.duration_s, levels=False)
     white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
     period = _period(train, noise)
-    steps = _change_point(white, train.trip)
-    level = _levels(train, noise)
+    change = _change_point(white, train.trip)
+    level = _levels(train)
     parts, depends, sizes = [], [], [0.0]
     if p_learner < LEVEL and share_train > LEAST_SHARE:
         sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
@@ -107,10 +107,13 @@ def remainder(
         depends.append("time_s")
         clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
         parts.append(f"a {clock} cycle of about {amplitude:.3g} {train.cycle_unit}")
-    if steps is not None:
-        where, minutes = steps
+    if change is not None:
+        where, row = change
+        before = (train.trip == where) & (np.arange(len(train.trip)) <= row)
+        sizes.append(_shift(train.residual, before, (train.trip == where) & ~before))
         depends.append("time_s")
-        parts.append(f"a change inside trip {trip_names[where]} after {minutes(train):.0f} min")
+        minutes = float(np.sum(train.duration_s[before]) / 60.0)
+        parts.append(f"a change inside trip {trip_names[where]} after {minutes:.0f} min")
     if level is not None:
         where, size, sd = level
         sizes.append(sd)
@@ -244,8 +247,9 @@ def _period(rows: Rows, noise: Noise) -> Period | None:
     return hit
 
 
-def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[Rows], float]] | None:
-    """The trip in which the whitened residual shifts, by the maximum of its bridge (Kolmogorov's distribution)."""
+def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, int] | None:
+    """The trip in which the whitened residual shifts and the row after which it does, by the maximum of its bridge
+    (Kolmogorov's distribution)."""
     best: tuple[float, int, int] | None = None
     slices = list(trip_slices(trip))
     for t, s in slices:
@@ -258,31 +262,36 @@ def _change_point(white: np.ndarray, trip: np.ndarray) -> tuple[int, Callable[[R
             best = (float(abs(path[k])), t, s.start + k)
     if best is None or stats.kstwobign.sf(best[0]) * len(slices) > LEVEL / 10:
         return None
-    _, t, row = best
-
-    def minutes(rows: Rows) -> float:
-        inside = (rows.trip == t) & (np.arange(len(rows.trip)) <= row)
-        return float(np.sum(rows.duration_s[inside]) / 60.0)
-
-    return t, minutes
+    return best[1:]
 
 
-def _levels(rows: Rows, plain: Noise) -> tuple[int, float, float] | None:
+def _shift(residual: np.ndarray, before: np.ndarray, after: np.ndarray) -> float:
+    """Root mean square, over all rows, of what the means of a trip's two parts differ from the trip's own by."""
+    n, m = int(before.sum()), int(after.sum())
+    if not n or not m:
+        return 0.0
+    step = float(np.mean(residual[after]) - np.mean(residual[before]))
+    return abs(step) * float(np.sqrt(n * m / (n + m) / len(residual)))
+
+
+def _levels(rows: Rows) -> tuple[int, float, float] | None:
     """Trips of a level of their own, if coloured noise could not have made it: (worst, its level, sd of levels).
 
-    The likelihood ratio of the noise with random levels against `plain`, the noise without, each with an order of its
-    own; half a χ², since a variance at its bound is no two-sided question (Self and Liang 1987).
+    Levels are about what all rows have in common, which is no difference between trips. The likelihood ratio of the
+    noise with random levels against the noise without, each with an order of its own; half a χ², since a variance at
+    its bound is no two-sided question (Self and Liang 1987).
     """
     long = {t: s for t, s in trip_slices(rows.trip) if s.stop - s.start >= 8}  # fewer rows have no level
     if len(long) < 4:
         return None
-    noise = estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=True)
+    about = rows.residual - np.mean(rows.residual)
+    plain, noise = (estimate_noise(about, rows.trip, rows.duration_s, levels=x) for x in (False, True))
     gain = noise.log_likelihood - plain.log_likelihood
     if 0.5 * stats.chi2.sf(2.0 * max(gain, 0.0), 1) > LEVEL / 10:
         return None
     # the share is one of a grid that holds the least itself: rounding must not decide
-    if noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(rows.residual**2):
+    if noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(about**2):
         return None
-    means = {t: float(np.mean(rows.residual[s])) for t, s in long.items()}
+    means = {t: float(np.mean(about[s])) for t, s in long.items()}
     worst = max(means, key=lambda t: abs(means[t]))
     return worst, means[worst], noise.level_sd

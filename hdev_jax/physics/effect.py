@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -14,10 +14,12 @@ from hdev_jax.segments import Segments
 if TYPE_CHECKING:
     from hdev_jax.physics.vehicle import Vehicle
 
-__all__ = ["STAGES", "Effect", "Grouped", "Parameter", "Point", "Real", "Stage", "resolve"]
+__all__ = ["KINDS", "STAGES", "Effect", "Grouped", "Parameter", "Point", "Real", "Stage", "resolve"]
 
 Stage = Literal["sensors", "road", "driveline", "machine", "battery"]
 STAGES: tuple[Stage, ...] = ("sensors", "road", "driveline", "machine", "battery")
+Kind = Literal["size", "shape", "limit", "choice"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 Real = Float[Array, ""]
 
 
@@ -40,7 +42,7 @@ class Parameter:
     scale: float
     lower: float = -float("inf")
     upper: float = float("inf")
-    kind: Literal["size", "shape", "limit", "choice"] = "size"
+    kind: Kind = "size"
     grid: tuple[float, ...] = ()
     least: float = 0.0
     by: Literal["", "gear", "road_surface"] = ""

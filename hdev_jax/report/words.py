@@ -4,6 +4,7 @@ import math
 from numbers import Real
 from typing import Any
 
+from hdev_jax.diagnosis.significance import least_clusters
 from hdev_jax.diagnosis.split import LAST_THIRD
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
@@ -202,6 +203,16 @@ def _suspects(data: ReportData) -> str:
     return f"with {there} {unit} for training this log cannot decide on {names.verbose_join(named)}"
 
 
+def _too_few(summary: dict[str, Any]) -> str:
+    """Said where nothing could have been found, whatever is missing; empty otherwise."""
+    clusters, least = summary.get("clusters") or {}, least_clusters(1)
+    if (there := clusters.get("count", least)) >= least:
+        return ""
+    unit = "trip" if clusters.get("kind") == "trip" else "stretch"
+    have = f"1 {unit}" if there == 1 else f"{there} {unit}{'s' if unit == 'trip' else 'es'}"
+    return f"with {have} of driving for training nothing can be told from chance ({least} at least are needed)"
+
+
 def _unnamed(data: ReportData) -> str:
     """Whether the library has no word for what is left, or has one that did not clear the bar."""
     if suspects := _suspects(data):
@@ -227,8 +238,10 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     else:
         tried = sum(c.get("score") is not None for c in s.get("candidates", []))
         test = s["after"]["test"]
-        if suspects := _suspects(data):
+        if suspects := _suspects(data) or _too_few(s):
             text = f"\x02Not decidable on this log\x03: {suspects}; "
+        elif not tried:
+            text = "\x02Nothing was tried\x03: the log shows none of the effects that were asked for; "
         else:
             text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
         text += (

@@ -75,15 +75,18 @@ def test_a_formula_that_explains_test_rows_alone_is_none(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("effect", "rms", "gone"),
+    ("effect", "sizes", "rms", "gone"),
     [
-        ("power_gain", 0.0, False), ("power_gain", 0.1, False), ("power_gain", 2.0, True),
-        ("auxiliary_power", 2.0, True), ("step_change", 2.0, False), ("standstill_load", 2.0, False),
-        ("hvac_power", 2.0, False),
+        ("power_gain", ("offset_w",), 0.0, False), ("power_gain", ("offset_w",), 0.1, False),
+        ("power_gain", ("offset_w",), 2.0, True), ("auxiliary_power", ("power_w",), 2.0, True),
+        ("power_gain", ("gain",), 2.0, False), ("power_gain", ("gain", "offset_w"), 2.0, False),
+        *((k, tuple(p.name for p in c.parameters), 2.0, False) for k, c in LIBRARY.items()
+          if k not in ("power_gain", "auxiliary_power")),
     ],
 )  # fmt: skip
-def test_a_constant_goes_where_more_than_it_explains_is_left(effect, rms, gone):
-    candidate = SimpleNamespace(effect=LIBRARY[effect])
+def test_a_constant_goes_where_more_than_it_explains_is_left(effect, sizes, rms, gone):
+    """Loads that read nothing and choose nothing alone: a limit or a gain is no mean of what is left."""
+    candidate = SimpleNamespace(effect=LIBRARY[effect], sizes=sizes)
     state = bare(Search, found=[SimpleNamespace(id=effect, score=SimpleNamespace(candidate=candidate))])
     problem, train = bare(Problem, measured=np.r_[np.ones(10), np.full(5, 9.0)]), np.arange(15) < 10
     predicted = [np.zeros(15), np.where(train, 1.0, 0.0)]  # explains the training rows: a gain of 1

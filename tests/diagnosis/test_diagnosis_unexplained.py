@@ -11,7 +11,7 @@ from planted import ROAD_SIDE
 from hdev_jax.diagnosis.expression import TERM, DescribedForce, Factor, _coefficient_unit, find_expression, monomials
 from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _period, _scale
+from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _period, _scale, remainder
 from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Clusters, calibrate, cluster_rows, padded
@@ -76,7 +76,26 @@ def test_noise_has_no_cycle(rho, trips):
 def test_slow_noise_has_no_levels_of_trips(rho, trips):
     rng = np.random.default_rng(5)
     logs = [residual(rng, trips, 250, rho=rho) for _ in range(20)]
-    assert all(_levels(rows, _without_levels(rows)) is None for rows in logs)
+    assert all(_levels(rows) is None for rows in logs)
+
+
+@pytest.mark.parametrize("trips", [9, 24])
+def test_an_offset_of_all_trips_is_no_level_of_each(trips):
+    rng = np.random.default_rng(6)
+    plain = [residual(rng, trips, 250, rho=0.9) for _ in range(10)]
+    assert all(_levels(rows_of(rows.residual + 5.0, rows.clusters)) is None for rows in plain)
+
+
+def test_a_change_in_a_trip_has_a_size():
+    """One alone tells how much is left: what decides whether coefficients of whitened rows are told."""
+    rng = np.random.default_rng(7)
+    rows = residual(rng, 24, 400, rho=0.0)
+    trips = [f"T{k}" for k in range(24)]
+    late = (rows.trip == 2) & (np.arange(len(rows.trip)) % 400 >= 150)
+    left = remainder(rows_of(rows.residual + 1.5 * late, rows.clusters), rows, ["x"], "Wh", trips, seed=0)
+    assert "a change inside trip T2 after 5 min" in left.signature
+    # the means of the two parts about the trip's own, over all rows
+    assert left.rms == pytest.approx(1.5 * np.sqrt(150 * 250 / 400 / 9600), rel=0.15)
 
 
 def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
@@ -85,7 +104,7 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     level = np.repeat(rng.normal(0, 2.0, 8), 200)
     trip, values = np.r_[rows.trip, 8, 8, 8], np.r_[rows.residual + level, 0.1, 0.0, -0.1]
     short = rows_of(values, Clusters(trip, 9, "trip"))
-    found = _levels(short, _without_levels(short))
+    found = _levels(short)
     assert found is not None
     assert found[2] == pytest.approx(np.std(level), rel=0.3)
 
