@@ -72,7 +72,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
         axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
         lowest = min(lowest, 95 * float(np.min(low)))
     axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(lowest, 102),
-             ylabel="named exactly [%]", title="Synthetic logs with one planted effect")  # fmt: skip
+             ylabel="named exactly [%]", title="Synthetic logs of road segments with one planted effect")  # fmt: skip
     sizes = sorted({t["size"] for t, _ in single})
     axes.set_xticks(sizes, [f"{s:g}" for s in sizes])
     axes.minorticks_off()

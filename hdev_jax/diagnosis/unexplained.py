@@ -15,7 +15,7 @@ from hdev_jax.segments import trip_slices
 
 __all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 
-LEVEL = 1e-3  # for each of the looks below; there are four, so false alarms stay under one in two hundred logs
+LEVEL = 1e-3  # for each of the four looks below, as far as their p hold; docs/planted.md counts false alarms by noise
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
