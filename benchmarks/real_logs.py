@@ -17,8 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import real_page
 from real_withheld import WITHHELD, compare_logs, write_adapter
+
+from hdev_jax.prediction import told_together
 
 __all__ = ["Job", "jobs", "kept", "main"]
 
@@ -132,7 +135,9 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     there = {**ran, "adapter": Path(ran["adapter"]).name}
     if differs := [k for k, v in asked.items() if (there.get(k) or []) != v]:
         raise SystemExit(f"{out} holds another run ({', '.join(differs)}): name another --work, or remove it")
-    return {**result, "cost": _json(work / f"{job.name}.cost.json"), "ran": ran}
+    covariance = _json(out / "predictive.json")["covariance"]
+    together = told_together(covariance["names"], np.array(covariance["matrix"]))
+    return {**result, "cost": _json(work / f"{job.name}.cost.json"), "ran": ran, "together": together}
 
 
 def _run(job: Job, work: Path, place: str) -> None:

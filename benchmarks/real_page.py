@@ -15,6 +15,7 @@ from real_tables import (
     found_table,
     left_table,
     named,
+    pooled_interval,
     pooled_rmse,
     signature,
     size_rows,
@@ -41,7 +42,9 @@ what it concludes when a channel that the log has is kept from it. Made by
     python benchmarks/real_logs.py --work DIR --write
 
 from the diagnosis.json of each run. Everything here is measured; nothing is synthetic. Every error is on trips that no
-choice has seen, and predictions are free of measured power (no feedback)."""
+choice has seen, and predictions are free of measured power (no feedback). Both logs are public, and effects of the
+library were added with them in view: this page says what the loop makes of measured data, not how it does on a log that
+nobody has seen; the synthetic study does (planted.md)."""
 READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with what was found.
 - *found*: the loop added the effect. *one of a class*: it added one of several that this log cannot tell apart.
 - The number behind it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
@@ -94,9 +97,14 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             b, a = (pooled_rmse([r[when]["test"] for r in runs.values()]) for when in ("before", "after"))
             always = [i for i in found_ids(next(iter(runs.values()))) if all(i in found_ids(r) for r in runs.values())]
             open_ = sum(r["unexplained"]["significant"] for r in runs.values())
+            by_trip: dict[str, list[Any]] = {}
+            for trip, m in (x for r in runs.values() for x in r["after"]["test_by_trip"].items()):
+                by_trip.setdefault(trip, []).append(m)
+            low, high = pooled_interval(by_trip)
             out.append(
-                f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW, pooled over {len(runs)} {each}. Every one of them "
-                f"finds {named(always)}. In {open_} of {len(runs)} the loop says that something more is missing."
+                f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW (90 %: {low:.2f} to {high:.2f}, from how {len(by_trip)} "
+                f"test trips differ), pooled over {len(runs)} {each}. Every one of them finds {named(always)}. In "
+                f"{open_} of {len(runs)} the loop says that something more is missing."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)
@@ -137,7 +145,11 @@ def _agreement(runs: Runs, caution: str) -> list[str]:
     if apart:
         said = names.verbose_join([f"{' or '.join(f'`{p}`' for p in r.paths)} ({r.furthest():.1f} sd)" for r in apart])
         text += f" The others are further apart: {said}."
-    return [f"{text} {caution}"]
+    lines = [f"{text} {caution}"]
+    if together := {k: r["together"] for k, r in runs.items() if r["together"]}:
+        lines += ["", "Coefficients that a training set knows together far better than one by one:", ""]
+        lines += [f"- {k}: {line}." for k, said in together.items() for line in said]
+    return lines
 
 
 def _left_notes(runs: Runs) -> list[str]:

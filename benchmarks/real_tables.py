@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from hdev_jax.report import names, words
 
@@ -18,6 +19,7 @@ __all__ = [
     "left_table",
     "named",
     "nearest",
+    "pooled_interval",
     "pooled_rmse",
     "signature",
     "size_rows",
@@ -181,8 +183,8 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
              words.number(u["noise_floor_rmse"]), share, on, signature(u), nearest(r)]
         )  # fmt: skip
     return table(
-        [head, "verdict", f"test RMSE after [{unit}]", "of it nothing predicts", "a flexible learner still predicts",
-         "depends on", "what it looks like", "nearest candidate turned down"],
+        [head, "verdict", f"test RMSE after [{unit}]", "left beside the flexible learner",
+         "a flexible learner still predicts", "depends on", "what it looks like", "nearest candidate turned down"],
         rows,
     )  # fmt: skip
 
@@ -192,6 +194,18 @@ def signature(unexplained: Mapping[str, Any]) -> str:
     text = str(unexplained["signature"]).removeprefix("What is left: ").removeprefix("What is left ").rstrip(".")
     formula = unexplained.get("expression")
     return f"{text}; formula: `{formula}`" if formula else text
+
+
+def pooled_interval(by_trip: Mapping[str, Sequence[Mapping[str, Any]]]) -> tuple[float, float]:
+    """90 % interval of `pooled_rmse`: trips, with all METRICS blocks of each, are left out in turn (jackknife;
+    Student's t of one degree of freedom less than there are trips). Raises `ValueError` for fewer than two trips."""
+    if len(by_trip) < 2:
+        raise ValueError("one trip says nothing of how trips differ; at least two are expected")
+    whole = pooled_rmse([m for blocks in by_trip.values() for m in blocks])
+    without = [pooled_rmse([m for k, b in by_trip.items() if k != left for m in b]) for left in by_trip]
+    n = len(without)
+    half = float(stats.t.ppf(0.95, n - 1) * np.sqrt((n - 1) / n * np.sum((np.array(without) - np.mean(without)) ** 2)))
+    return whole - half, whole + half
 
 
 def pooled_rmse(blocks: Sequence[Mapping[str, Any]]) -> float:

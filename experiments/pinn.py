@@ -250,7 +250,7 @@ def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
         return out
     out["bayesian"] = scored(bayesian(m)[0])
     if task["effects"]:
-        out["kernel"] = scores(data, m.use, said(kernel(m, task["effects"]), m), only=k)
+        out["kernel"] = scores(data, m.use, said(kernel(m, task["effects"]).vehicle, m), only=k)
     if task["diagnosed_routes"]:
         car, out["found"], out["coefficients"] = diagnosed(m, task["diagnosed_routes"], seed=0)
         out["diagnosed"] = scores(data, m.use, said(car, m), only=k)

@@ -1,11 +1,11 @@
 """The kernel with a list of effects, by closed form on a vehicle's training rows; what networks take over from it.
 
 Sizes are linear, or nearly, and have a closed form. A threshold (where a battery stops charging, how late a reading is)
-is not: it is searched between closed forms of all else.
+is not: it is searched between closed forms of all else. A trip's mass is off by its own share.
 """
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,16 +13,18 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper1_halves import fitted
+from experiments.paper1_halves import MASS_SD, coefficient, fitted
 from experiments.pinn_data import Data, Member
-from hdev_jax.inference import Fit, effect_coefficients, padded, predict
+from hdev_jax.inference import Fit, ParameterTable, Rows, effect_coefficients, jacobian, linear_fit, padded, predict
 from hdev_jax.learn.pinn import Sized
 from hdev_jax.learn.pinn_rows import row_wise
 from hdev_jax.physics import LIBRARY, Effect, Parameter, Vehicle, at_null, most_group
+from hdev_jax.segments import Segments
 
-__all__ = ["Known", "kernel", "known", "said", "sized", "trainable"]
+__all__ = ["Closed", "Known", "kernel", "known", "said", "sized", "trainable"]
 
 _ROUNDS = 5  # of a search: the threshold's grid, then each time a quarter of the steps about the best
+_LEAST_TRIPS = 4  # whose masses have a variance
 _LEAST_GAIN = 10.0  # variances of the noise: what a threshold has to take off the sum of squares
 
 
@@ -45,18 +47,36 @@ def sized(effects: Mapping[str, Mapping[str, float]]) -> tuple[Sized, ...]:
     return tuple(out)
 
 
-def said(vehicle: Vehicle, m: Member) -> np.ndarray:
-    """Energy of every row of a vehicle by the kernel [Wh]."""
-    rows = padded(m.segments, m.energy_wh)
+def said(vehicle: Vehicle, m: Member, segments: Segments | None = None) -> np.ndarray:
+    """Energy of every row of a vehicle by the kernel [Wh]; of `segments` in the place of its log."""
+    rows = padded(m.segments if segments is None else segments, m.energy_wh)
     return np.asarray(predict(vehicle, rows.segments, "energy_wh"))[: rows.rows]
 
 
-def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Vehicle:
+class Closed(NamedTuple):
+    """A vehicle's kernel in closed form; by how much each row's mass is off (0 where the trip is not trained on) and
+    the standard deviation of that over trips, as shares of the logged mass."""
+
+    vehicle: Vehicle
+    payload: np.ndarray
+    payload_sd: float
+
+    def weighed(self, m: Member) -> Segments:
+        """The vehicle's log with its trips' masses as they were found."""
+        return _weighed(m.segments, self.payload)
+
+
+def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
     """The whole kernel, efficiency map included, with these effects; parameters that are not given are fitted to the
-    training rows. A shape that is not given has its usual value."""
+    training rows. A shape that is not given has its usual value.
+
+    Sizes in closed form, thresholds by search between, and where the mass is among the effects what each trip's is off
+    by about the mean: a random effect of the trips, whose variance the trips tell (EM; Laird and Ware 1982). Otherwise
+    a few trips that are heavier than logged would be told as drag and rolling resistance.
+    """
     train = m.where(0)
     segments, energy = m.segments.take(train), m.energy_wh[train]
-    rows, row_s = padded(segments, energy), float(np.median(np.asarray(segments.duration_s)))
+    row_s = float(np.median(np.asarray(segments.duration_s)))
     car, table, searches = m.vehicle, m.table, []
     for id, given in effects.items():
         e = _as_given(id, given, m)
@@ -66,16 +86,31 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Vehicle:
         groups = tuple(str(g) for g in range(1, most_group(m.segments, by) + 1))
         table = table.plus(*effect_coefficients(e, sizes, shapes=False, groups=groups))
         searches += [_Search(id, p, row_s) for p in e.parameters if p.kind == "limit" and p.name not in given]
+    limits = {f"effects.{s.id}.{s.p.name}": True for s in searches}
+    trips = _Trips.of(segments) if "scale" in _open(effects, "mass_scale") and segments.has("mass_kg") else None
 
-    def fit(car: Vehicle) -> Vehicle:
-        return table.insert(car, fitted(car, table, segments, energy, "energy_wh", paper=True).values)
+    def fit(car: Vehicle, s: Segments) -> Vehicle:
+        return table.insert(car, fitted(car, table, s, energy, "energy_wh", paper=True).values)
 
-    car = fit(car)
-    for _ in range(_ROUNDS if searches else 0):
-        for search in searches:
-            car = search.best(car, rows)
-        car = fit(car)
-    return car
+    car = fit(car, segments)
+    for _ in range(_ROUNDS if searches or trips else 0):
+        now = segments if trips is None else trips.weighed(segments)
+        if searches:
+            left = _Left(car, table.with_free(**limits), padded(now, energy))
+            for search in searches:
+                car = search.best(car, left)
+        car = fit(car, now)
+        trips = trips and trips.again(car, segments, energy)
+    if trips is None:
+        return Closed(car, np.zeros(len(m.use)), 0.0)
+    payload = np.zeros(len(m.use))
+    payload[train] = trips.off[trips.of_row]
+    return Closed(fit(car, trips.weighed(segments)), payload, trips.sd)
+
+
+def _open(effects: Mapping[str, Mapping[str, float]], id: str) -> set[str]:
+    """Parameters of a listed effect that are not given."""
+    return {p.name for p in LIBRARY[id].parameters} - {*effects[id]} if id in effects else set()
 
 
 def _as_given(id: str, given: Mapping[str, float], m: Member) -> Effect:
@@ -87,6 +122,58 @@ def _as_given(id: str, given: Mapping[str, float], m: Member) -> Effect:
     return e
 
 
+def _weighed(segments: Segments, off: np.ndarray) -> Segments:
+    return segments.with_channels(mass_kg=np.asarray(segments.channels["mass_kg"]) * (1.0 + off))
+
+
+class _Trips(NamedTuple):
+    """What each trip's mass is off by about the vehicle's mean, as a share, and its standard deviation over trips."""
+
+    of_row: np.ndarray
+    off: np.ndarray
+    sd: float
+
+    @classmethod
+    def of(cls, segments: Segments) -> "_Trips | None":
+        """Before anything is known of them; None where trips are too few to have a variance."""
+        names, of_row = np.unique(np.asarray(segments.trip), return_inverse=True)
+        return cls(of_row, np.zeros(len(names)), MASS_SD) if len(names) >= _LEAST_TRIPS else None
+
+    def weighed(self, segments: Segments) -> Segments:
+        """The rows with these masses."""
+        return _weighed(segments, self.off[self.of_row])
+
+    def again(self, car: Vehicle, segments: Segments, energy: np.ndarray) -> "_Trips":
+        """One step of EM: each trip's mass with all else as it is, then the variance that they have."""
+        mean = float(car.effect("mass_scale").scale)
+        own = ParameterTable((coefficient("effects.mass_scale.scale", "1", mean, self.sd, positive=False),))
+        rows = padded(segments, energy)
+        found = linear_fit(car, own, lambda: [Rows(rows, self.of_row, self.of_row)], "energy_wh", groups=len(self.off))
+        off, sd = (found.values[:, 0] - mean) / (1.0 + mean), found.sd[:, 0] / (1.0 + mean)
+        return _Trips(self.of_row, off, float(np.sqrt(np.mean(off**2 + sd**2))))
+
+
+class _Left:
+    """What a threshold leaves of the squares once all other coefficients have moved along as they would."""
+
+    def __init__(self, car: Vehicle, table: ParameterTable, rows: Fit):
+        self.rows, self.names = rows, [c.path for c in table.free]
+        self.columns = np.asarray(rows.weight)[:, None] * jacobian(car, table, rows.segments, "energy_wh")
+        self.count = float(np.sum(rows.weight))
+
+    def without(self, path: str) -> Callable[[Vehicle], float]:
+        """The sum of squares of a vehicle, the coefficient at `path` being held where the vehicle has it."""
+        own = self.columns[:, [n != path for n in self.names]]
+        size = np.linalg.norm(own, axis=0)
+        base, _ = np.linalg.qr(own[:, size > 0] / size[size > 0])
+
+        def left(car: Vehicle) -> float:
+            off = np.asarray(self.rows.weight * (self.rows.measured - predict(car, self.rows.segments, "energy_wh")))
+            return float(np.sum((off - base @ (base.T @ off)) ** 2))
+
+        return left
+
+
 class _Search:
     """A threshold's values that are tried next: first its grid, then finer steps about the best of the last."""
 
@@ -94,12 +181,12 @@ class _Search:
         self.id, self.p = id, p
         self.span = [x * (row_s if p.in_rows else 1.0) for x in p.grid]
 
-    def best(self, car: Vehicle, rows: Fit) -> Vehicle:
+    def best(self, car: Vehicle, squares: _Left) -> Vehicle:
         """The vehicle with the value that leaves the least squares; with the null value if none takes off enough."""
-        null = float(self.p.null)
-        left = {x: self._left(car, x, rows) for x in (null, *self.span)}
+        null, of = float(self.p.null), squares.without(f"effects.{self.id}.{self.p.name}")
+        left = {x: of(self._at(car, x)) for x in (null, *self.span)}
         value = min(left, key=lambda x: left[x])
-        noise = left[value] / float(np.sum(rows.weight))
+        noise = left[value] / squares.count
         if value != null or self.p.smooth:
             self._finer(value, left)
         return self._at(car, value if left[null] - left[value] > _LEAST_GAIN * noise else null)
@@ -116,17 +203,16 @@ class _Search:
     def _at(self, car: Vehicle, value: float) -> Vehicle:
         return eqx.tree_at(lambda c: getattr(c.effect(self.id), self.p.name), car, jnp.asarray(value))
 
-    def _left(self, car: Vehicle, value: float, rows: Fit) -> float:
-        off = rows.measured - predict(self._at(car, value), rows.segments, "energy_wh")
-        return float(jnp.sum(rows.weight * off**2))
-
 
 class Known(NamedTuple):
     """What networks take over from the closed form: a `vehicle`, as declared but with its thresholds that act within a
-    row, and what effects that act across rows add to each row (`across_wh`)."""
+    row; by row what effects that act across rows add (`across_wh`), what the mass is off by (`payload`, a share) and
+    what a mass that nobody found out is worth, one standard deviation (`loose_wh`)."""
 
     vehicle: Vehicle
     across_wh: np.ndarray
+    payload: np.ndarray
+    loose_wh: np.ndarray
 
 
 @cache
@@ -134,29 +220,45 @@ def known(data: Data, effects: str) -> tuple[Known, ...]:
     """Of each vehicle, what its training rows tell (`kernel`) of the effects that no network can train.
 
     A vehicle without such rows has the others' medians of thresholds, of a power for each kilogram of the declared
-    mass, and nothing of what acts across rows. **Arguments:** `effects`, by id with what is given of their parameters,
-    as JSON, so that the answer can be kept. Raises `InputError` where no vehicle has a training row.
+    mass, and of how far trips' masses are apart; and nothing of what acts across rows. **Arguments:** `effects`, by
+    id with what is given of their parameters, as JSON, so that the answer can be kept. Raises `InputError` where no
+    vehicle has a training row.
     """
     data.trains()
     listed: dict[str, dict[str, float]] = json.loads(effects)
     across = [e for e in listed if not row_wise(LIBRARY[e])]
     within = [e for e in listed if e not in across and e not in trainable(listed)]
     names = [(e, p) for e in within for p in LIBRARY[e].parameters]
-    needed = bool(names or across)
-    fits = [kernel(m, listed) if needed and np.any(m.use == 0) else None for m in data.vehicles]
+    free = bool(names or across or "scale" in _open(listed, "mass_scale"))
+    fits = [kernel(m, listed) if free and np.any(m.use == 0) else None for m in data.vehicles]
     found = np.array([
-        [np.nan if f is None else float(getattr(f.effect(e), p.name)) / _unit(m, p) for e, p in names]
+        [np.nan if f is None else float(getattr(f.vehicle.effect(e), p.name)) / _unit(m, p) for e, p in names]
         for f, m in zip(fits, data.vehicles, strict=True)
     ])  # fmt: skip
     found = np.where(np.isnan(found), np.nanmedian(found, axis=0, keepdims=True) if names else found, found)
+    payload_sd = float(np.median([f.payload_sd for f in fits if f is not None] or [0.0]))
     out = []
     for m, f, own in zip(data.vehicles, fits, found, strict=True):
         values: dict[str, dict[str, Any]] = {e: {} for e in within}
         for (e, p), x in zip(names, own, strict=True):
             values[e][p.name] = jnp.asarray(x * _unit(m, p))
-        moved = said(f, m) - said(f.minus(*across), m) if f is not None and across else np.zeros(len(m.energy_wh))
-        out.append(Known(m.vehicle.plus(*(LIBRARY[e](**v) for e, v in values.items())), moved))
+        car = m.vehicle.plus(*(LIBRARY[e](**v) for e, v in values.items()))
+        moved, payload, sd = np.zeros(len(m.use)), np.zeros(len(m.use)), payload_sd
+        if f is not None:
+            payload, sd = f.payload, f.payload_sd
+            if across:
+                weighed = f.weighed(m) if np.any(payload) else m.segments
+                moved = said(f.vehicle, m, weighed) - said(f.vehicle.minus(*across), m, weighed)
+        out.append(Known(car, moved, payload, _loose(car if f is None else f.vehicle, m, payload, sd)))
     return tuple(out)
+
+
+def _loose(car: Vehicle, m: Member, payload: np.ndarray, sd: float) -> np.ndarray:
+    """What a mass that is one `sd` higher adds to each row's energy, of trips whose mass was not found [Wh]."""
+    if sd == 0:
+        return np.zeros(len(m.use))
+    moved = said(car, m, _weighed(m.segments, np.full(len(m.use), sd))) - said(car, m)
+    return np.where(payload == 0, np.abs(moved), 0.0)
 
 
 def _unit(m: Member, p: Parameter) -> float:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,6 +19,9 @@ from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.learn.pinn_rows import Rows, concatenated, rows_of
 from hdev_jax.physics import LIBRARY, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
+
+if TYPE_CHECKING:
+    from experiments.pinn_closed import Known
 
 __all__ = ["Data", "Member", "load"]
 
@@ -55,21 +58,22 @@ class Data:
     trained: int
 
     def rows(
-        self, features: Sequence[str], effects: Sequence[str], known: Sequence[tuple[Vehicle, np.ndarray]]
+        self, features: Sequence[str], effects: Sequence[str], known: Sequence["Known"]
     ) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
 
         Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`).
-        **Arguments:** `effects`, those that are trained; `known`, each vehicle as it is declared and what effects
-        across rows add to each of its rows [Wh] (`experiments.pinn_closed.known`).
+        **Arguments:** `effects`, those that are trained; `known`, what is taken over of each vehicle.
         """
         made = [at_null(LIBRARY[e]) for e in effects]
         parts = []
-        for k, (m, (car, across), fit) in enumerate(zip(self.vehicles, known, self._calibrated, strict=True)):
+        for k, (m, own, fit) in enumerate(zip(self.vehicles, known, self._calibrated, strict=True)):
             s = dataclasses.replace(m.segments, trip=m.routes)
+            if np.any(own.payload):
+                s = s.with_channels(mass_kg=np.asarray(s.channels["mass_kg"]) * (1.0 + own.payload))
             one = rows_of(
-                car, s, m.energy_wh, number=min(k, self.trained), features=features, effects=made, calibrated=fit,
-                across_wh=across,
+                own.vehicle, s, m.energy_wh, number=min(k, self.trained), features=features, effects=made,
+                calibrated=fit, across_wh=own.across_wh, loose_wh=own.loose_wh,
             )  # fmt: skip
             parts.append(one)
         return concatenated(parts), self.column("use")

@@ -1,6 +1,7 @@
 """The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips that no fit has seen."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -18,10 +19,11 @@ from hdev_jax.logs import read_log
 from hdev_jax.opening import Paths, digest, known_effects, tried
 from hdev_jax.rundir import Run, atomic_file
 
-__all__ = ["predict", "write_predictive"]
+__all__ = ["predict", "told_together", "write_predictive"]
 
 BESIDE = "predictive.json"  # what a fitted sheet has beside it
 Noise = Literal["normal", "student_t"]
+TOGETHER = 0.95  # correlation of two coefficients, from which on neither is read by itself
 LIKE = 1.5  # times as long: rows of another log whose noise is still like
 
 
@@ -43,9 +45,22 @@ def write_predictive(
         "spread": asdict(spread),
     }
     run.path(BESIDE).write_text(json.dumps(known, indent=1, allow_nan=False) + "\n")
+    notes = told_together([c.name for c in fit.table.free], np.asarray(fit.covariance))
     if clusters.kind == "block":
-        return ["one training trip: how trips differ from each other is not in the intervals of hdev predict"]
-    return []
+        notes.append("one training trip: how trips differ from each other is not in the intervals of hdev predict")
+    return notes
+
+
+def told_together(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[str]:
+    """A sentence for each pair of coefficients that a log knows together far better than one by one."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = covariance / np.outer(sd, sd)
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > TOGETHER, 1)), strict=True)
+    return [
+        f"{names[i]} and {names[k]} are known together far better than one by one (correlation "
+        f"{correlation[i, k]:+.2f}): read neither by itself"
+        for i, k in pairs
+    ]
 
 
 def predict(

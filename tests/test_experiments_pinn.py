@@ -162,7 +162,7 @@ def planted(data, noise_wh, *effects, noise_share=0.0):
 )  # fmt: skip
 def test_thresholds_are_found_wherever_they_lie_and_none_where_none_is(effects, listed, wanted):
     data = planted(load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B")), 3.0, *effects)
-    car = kernel(data.vehicles[0], listed)
+    car = kernel(data.vehicles[0], listed).vehicle
     for (id, name), (value, within) in wanted.items():
         assert float(getattr(car.effect(id), name)) == pytest.approx(value, abs=within), id
 
@@ -172,7 +172,7 @@ def test_each_gear_has_its_own_size():
     gears = np.zeros(13)
     gears[10:] = 0.03
     data = planted(data, 1.0, GearEfficiency(Grouped(jnp.asarray(gears), "gear")))
-    found = np.asarray(kernel(data.vehicles[0], {"gear_efficiency": {}}).effect("gear_efficiency").delta.values)
+    found = np.asarray(kernel(data.vehicles[0], {"gear_efficiency": {}}).vehicle.effect("gear_efficiency").delta.values)
     rows = np.bincount(np.asarray(data.vehicles[0].segments.channels["gear"], int)[data.vehicles[0].use == 0])
     for gear in np.flatnonzero(rows > 100):
         assert found[gear] == pytest.approx(gears[gear], abs=0.006), gear
@@ -184,7 +184,8 @@ def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them(
     data = load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B"))
     data = planted(data, 3.0, MassScale(0.03), RegenLimit(1.5e5), TimeSkew(0.3, 0.0), noise_share=0.01)
     a, b = data.vehicles
-    car, (one, other) = kernel(a, effects), known(data, json.dumps(effects))
+    closed, (one, other) = kernel(a, effects), known(data, json.dumps(effects))
+    car, weighed = closed.vehicle, closed.weighed(a)
     limit = float(car.effect("regen_limit").power_w)
     assert limit == pytest.approx(1.5e5, rel=0.01)
     assert float(car.effect("time_skew").skew_s) == pytest.approx(0.3, abs=0.03)
@@ -192,7 +193,7 @@ def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them(
 
     assert float(one.vehicle.effect("regen_limit").power_w) == pytest.approx(limit)
     assert {"headwind", "mass_scale", "time_skew"}.isdisjoint(e.id for e in one.vehicle.effects)
-    assert one.across_wh == pytest.approx(said(car, a) - said(car.minus("time_skew"), a))
+    assert one.across_wh == pytest.approx(said(car, a, weighed) - said(car.minus("time_skew"), a, weighed))
     trips = [np.sum(one.across_wh[a.routes == t]) for t in np.unique(a.routes)]
     assert np.sum(np.abs(one.across_wh)) > 10 * np.sum(np.abs(trips)) > 0, "a delay moves energy from row to row"
 

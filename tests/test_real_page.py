@@ -51,7 +51,7 @@ def result(effects: list[dict], rmse: float = 9.0, turned_down=(), left: str | N
         },
         "verdict": "effects_found" if left is None else "effects_found_and_unexplained_structure",
         "subsets": {"standing still": {"before": block(5.0)["test"], "after": block(4.0)["test"]}},
-        "cost": {"seconds": 60.0, "peak_gib": 1.0},
+        "cost": {"seconds": 60.0, "peak_gib": 1.0}, "together": [],
     }  # fmt: skip
 
 
@@ -100,6 +100,22 @@ def test_the_page_tells_all_runs_and_draws_them(results, tmp_path):
     real_page.write(tmp_path, text, figures)
     assert not old.exists()
     assert (tmp_path / "real_logs.md").read_text() == text
+
+
+def test_the_interval_of_a_pooled_error_is_of_trips():
+    """Rows of one trip say nothing of the next: with few trips that differ it is wide, however many rows they have."""
+    from real_tables import pooled_interval, pooled_rmse
+
+    errors = {"A": 1.0, "B": 2.0, "C": 1.5, "D": 1.2}
+    blocks = {k: [{"mse": e**2, "n": 10**6}] * 3 for k, e in errors.items()}
+    low, high = pooled_interval(blocks)
+    mse = np.array([e**2 for e in errors.values()])
+    assert (low + high) / 2 == pytest.approx(pooled_rmse([m for b in blocks.values() for m in b]))
+    # of a mean of squares by hand, and by the root's slope
+    expected = 2.353 * np.std(mse, ddof=1) / 2 / (2 * np.sqrt(mse.mean()))
+    assert (high - low) / 2 == pytest.approx(expected, rel=0.1)
+    with pytest.raises(ValueError, match="at least two"):
+        pooled_interval({"A": blocks["A"]})
 
 
 def test_the_page_of_one_part_is_a_page(results):
@@ -256,8 +272,12 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
             "asked_train": [name[-1]],
         }  # fmt: skip
         (work / name / "config.toml").write_text(tomli_w.dumps(config))
+        covariance = {"names": ["iron", "offset"], "matrix": [[1.0, -0.99], [-0.99, 1.0]]}
+        (work / name / "predictive.json").write_text(json.dumps({"covariance": covariance}))
     assert real_logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
-    assert "trained on trip" in (docs / "real_logs.md").read_text()
+    page = (docs / "real_logs.md").read_text()
+    assert "trained on trip" in page
+    assert "- 2: iron and offset are known together far better than one by one (correlation -0.99)" in page
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
     (work / "niro_2").rename(work / "niro_3")
     with pytest.raises(SystemExit, match="holds another run"):

@@ -17,6 +17,7 @@ import pytest
 from hdev_jax import cli
 from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.opening import opened
+from hdev_jax.prediction import told_together
 from hdev_jax.rundir import Run
 
 CHECKER = Path(__file__).parents[2] / "shared" / "check_diagnosis.py"
@@ -230,6 +231,16 @@ def test_what_lies_beside_a_sheet_and_is_at_fault(edit, words, first, files, tmp
     assert words in said
     assert str(beside) in said
     assert not out.exists()
+
+
+def test_coefficients_that_cancel_are_said_to():
+    """Two with a correlation of −0.99 and one beside them."""
+    sd = np.array([2.0, 0.5, 30.0])
+    correlation = np.array([[1.0, -0.99, 0.1], [-0.99, 1.0, 0.3], [0.1, 0.3, 1.0]])
+    (said,) = told_together(["iron", "offset", "drag"], correlation * np.outer(sd, sd))
+    assert "iron and offset" in said
+    assert "(correlation -0.99)" in said
+    assert told_together(["iron"], np.zeros((1, 1))) == []
 
 
 def test_intervals_say_where_they_are_from(first, files, tmp_path):

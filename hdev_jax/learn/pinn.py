@@ -191,7 +191,7 @@ class Pinn(eqx.Module):
         tables = energy(rows.car, rows.segments) + rows.across_wh
         base = {"residual": physics, "alone": jnp.zeros_like(physics), "table": tables}[r.predicted]
         floor, share = jnp.exp(self.noise[0]) * self.scale_wh, jnp.exp(self.noise[1])
-        sd = jnp.sqrt(floor**2 + (share * physics) ** 2)
+        sd = jnp.sqrt(floor**2 + (share * physics) ** 2 + jnp.asarray(rows.loose_wh) ** 2)
         if r.loss == "squares":
             sd = jnp.full_like(sd, jnp.nan)
         return Prediction(base + residual, physics, residual, c_rr, cda, sd), heads, memory
@@ -270,7 +270,8 @@ class Objective:
         shape = batch.weight.shape
         if model.recipe.stretch > 1:
             whole = lambda x: jnp.sum((w * x).reshape(shape), axis=1)  # noqa: E731
-            sd = jnp.sqrt(whole(p.sd_wh**2) + (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + 1e-6)
+            shared = (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + whole(rows.loose_wh) ** 2
+            sd = jnp.sqrt(whole(p.sd_wh**2 - rows.loose_wh**2) + shared + 1e-6)
             data = data + jnp.sum(_normal(whole(error), sd) * (whole(w) > 0)) / count
         prior = 0.5 * jnp.sum(model.common**2) / _LOG_SD**2 + _between_vehicles(model.own, _LOG_SD)
         prior += sum(0.5 * jnp.sum(x**2) for x in model.sizes.values())

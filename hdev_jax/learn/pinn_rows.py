@@ -57,7 +57,8 @@ class Rows(eqx.Module):
     """Rows of any number of vehicles, in float32. `car` has a value of each coefficient for each row.
 
     `vehicle` counts the vehicles that a model was trained on; one that it was not has the number after the last.
-    `weight` is 0 for a row that only fills an array; `across_wh` is energy that effects across rows add to it.
+    `weight` is 0 for a row that only fills an array; `across_wh` is energy that effects across rows add to it;
+    `loose_wh` the standard deviation of what its whole trip shares and nothing in the log tells (a mass that is off).
     """
 
     features: Float[Array, "*row feature"] | Float[np.ndarray, "*row feature"]
@@ -67,6 +68,7 @@ class Rows(eqx.Module):
     vehicle: Ids
     weight: Column
     across_wh: Column
+    loose_wh: Column
 
     def __len__(self) -> int:
         return self.energy_wh.shape[0]
@@ -119,13 +121,15 @@ def rows_of(
     effects: Sequence[Effect] = (),
     calibrated: Vehicle | None = None,
     across_wh: np.ndarray | None = None,
+    loose_wh: np.ndarray | None = None,
 ) -> Rows:
     """The rows of one declared vehicle.
 
     **Arguments:** `vehicle`, as it is declared, entered at the road; `number`, its place among the vehicles;
     `features`, names of `FEATURES`; `effects`, those whose channels are to be worked out by trip; `calibrated`, the
     vehicle at whose force the efficiency is read and whose energy is a feature, in the place of the declared one;
-    `across_wh` [row], what effects across rows add to each row's energy, which its own channels cannot tell (none: 0).
+    `across_wh` [row], what effects across rows add to each row's energy, which its own channels cannot tell (none: 0);
+    `loose_wh` [row], the standard deviation of what a trip's rows share and the log does not tell (none: 0).
 
     **Raises:** `InputError` for a vehicle that is not entered at the road or lacks rolling or aero, for an effect that
     acts across rows, for an unknown feature and for a channel that a feature needs and the log lacks.
@@ -160,7 +164,7 @@ def rows_of(
     return Rows(
         np.stack(columns, axis=1).astype(np.float32), jax.tree.map(small, s), jax.tree.map(small, car),
         np.asarray(energy_wh, np.float32), np.full(n, number, np.int32), np.ones(n, np.float32),
-        np.zeros(n, np.float32) if across_wh is None else np.asarray(across_wh, np.float32),
+        *(np.zeros(n, np.float32) if x is None else np.asarray(x, np.float32) for x in (across_wh, loose_wh)),
     )  # fmt: skip
 
 
