@@ -4,7 +4,7 @@ Everything is whitened (`whiten.py`), so a cluster's rows enter only through its
 columns and residual. Gains, clustered tests, left-out gains, resampling and sign placebos are algebra on these.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -13,11 +13,12 @@ from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.significance import wald
+from hdev_jax.diagnosis.significance import least_clusters, wald
 from hdev_jax.segments import trip_slices
 
 __all__ = ["ABSORBED", "Evidence", "Score"]
 
+AT_ONCE = 2_000_000  # numbers of the matrices of candidates that are scored together: 16 MB
 ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
 
 
@@ -45,6 +46,12 @@ class Score:
         return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
 
 
+def _solved(a: Float[np.ndarray, "*way n n"], b: Float[np.ndarray, "*way n"]) -> Float[np.ndarray, "*way n"]:
+    """Solutions of normal equations in units of each column's own length."""
+    d = np.sqrt(np.maximum(np.einsum("...ii->...i", a), 1e-300))
+    return np.linalg.solve(a / (d[..., :, None] * d[..., None, :]), (b / d)[..., None])[..., 0] / d
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Gram matrices by cluster of [Jacobian | candidates | residual], and the prior on the Jacobian's part.
@@ -64,6 +71,7 @@ class Evidence:
     precision: Float[np.ndarray, " base"]
     pull: Float[np.ndarray, " base"]
     _kept: dict[int, np.ndarray] = field(init=False, repr=False, compare=False, default_factory=dict)
+    _missed: dict[int, np.ndarray] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -103,27 +111,32 @@ class Evidence:
         every = range(len(self.variances))
         return np.stack([plain - (by_trip * self._shrink(v)[:, None]).T @ self.levels for v in every])
 
+    def _with_base(self, at: np.ndarray) -> np.ndarray:
+        """Places of the base columns before those at `at` [*way k]."""
+        base = np.broadcast_to(np.arange(self.base), (*at.shape[:-1], self.base))
+        return np.concatenate([base, at], axis=-1).astype(int)
+
     def _normal(self, gram: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrices and right-hand sides for the base columns and those at `at`."""
-        index = np.r_[np.arange(self.base), at].astype(int)
-        a = gram[..., index[:, None], index[None, :]].copy()
-        b = gram[..., index, -1].copy()
+        """Normal matrices [*gram *way n n] and right-hand sides for the base columns and those at `at` [*way k]."""
+        index = self._with_base(at)
+        a = gram[..., index[..., :, None], index[..., None, :]]
+        b = gram[..., index, -1]
         diagonal = np.arange(self.base)
         a[..., diagonal, diagonal] += self.precision
         b[..., : self.base] -= self.pull
-        every = np.arange(len(index))
+        every = np.arange(index.shape[-1])
         a[..., every, every] *= 1.0 + 1e-10
         a[..., every, every] += 1e-300
         return a, b
 
     def _fit(self, gram: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Log-likelihood up to a constant and coefficients, for each variance."""
+        """Log-likelihood up to a constant [variance *way] and coefficients, for each variance."""
         a, b = self._normal(gram, at)
+        alone = (-0.5 * gram[..., -1, -1] - self.cost).reshape(-1, *(1,) * (at.ndim - 1))
         if not a.shape[-1]:
-            return -0.5 * gram[..., -1, -1] - self.cost, b
-        d = np.sqrt(np.einsum("...ii->...i", a))
-        x = np.linalg.solve(a / (d[..., :, None] * d[..., None, :]), (b / d)[..., None])[..., 0] / d
-        return -0.5 * gram[..., -1, -1] + 0.5 * np.einsum("...i,...i->...", b, x) - self.cost, x
+            return alone, b
+        x = _solved(a, b)
+        return alone + 0.5 * np.einsum("...i,...i->...", b, x), x
 
     def base_likelihood(self, gram: np.ndarray) -> float:
         """Log-likelihood of the base alone at its best variance, `gram` from `totals`."""
@@ -135,9 +148,36 @@ class Evidence:
         v = int(np.argmax(likelihood))
         return float(likelihood[v]) - (self.base_likelihood(gram) if before is None else before), x[v, self.base :]
 
-    def left(self, gram: np.ndarray, at: Sequence[int]) -> float:
-        """Smallest share of the columns that is left after projecting the base columns off."""
-        return min(self.span(gram, k)[0] for k in at) if self.base else 1.0
+    def gains(self, gram: np.ndarray, ways: Sequence[Sequence[int]]) -> Float[np.ndarray, " way"]:
+        """Gains of many ways to have an effect, each by its columns, as `gain` of each."""
+        out, before = np.empty(len(ways)), self.base_likelihood(gram)
+        for places, at in self._alike(ways, len(self.variances)):
+            out[places] = np.max(self._fit(gram, at)[0], axis=0) - before
+        return out
+
+    def _alike(self, ways: Sequence[Sequence[int]], cells: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Places among the ways and columns [way k] of those that have equally many, no more at a time than memory
+        holds of `cells` matrices for each."""
+        count = np.array([len(w) for w in ways], dtype=int)
+        for k in np.unique(count):
+            places, size = np.flatnonzero(count == k), cells * (self.base + int(k) + 1) ** 2
+            for part in np.array_split(places, -(-len(places) * size // AT_ONCE)):
+                yield part, self.base + np.array([ways[i] for i in part], dtype=int)
+
+    @cached_property
+    def _lefts(self) -> Float[np.ndarray, " column"]:
+        """Share of each candidate column that is left after projecting the base columns off."""
+        gram = self.totals()[0]
+        square, cross = np.diag(gram)[self.base : -1], gram[: self.base, self.base : -1]
+        d = np.sqrt(np.maximum(np.diag(gram)[: self.base], 1e-300))
+        there = np.isfinite(square) & np.all(np.isfinite(cross), axis=0)
+        c = np.where(there, cross, 0.0) / d[:, None]
+        x = np.linalg.lstsq(gram[: self.base, : self.base] / np.outer(d, d), c, rcond=1e-10)[0]
+        return 1.0 - np.sum(c * x, axis=0) / np.maximum(np.where(there, square, 1.0), 1e-300)
+
+    def left(self, at: Sequence[int]) -> float:
+        """Smallest share of the candidate columns that is left after projecting the base columns off."""
+        return float(np.min(self._lefts[list(at)])) if self.base else 1.0
 
     def span(self, gram: np.ndarray, at: int) -> tuple[float, Float[np.ndarray, " base"]]:
         """Share of a column that is left after projecting the base columns off, and the weights of those, each of
@@ -166,23 +206,30 @@ class Evidence:
 
     def score(self, candidate: Candidate) -> Score:
         """All tests of one candidate."""
-        totals = self.totals()
-        at = self.base + np.asarray(candidate.columns)
-        k, g = len(at), self.count
-        gain, _ = self.gain(totals, candidate.columns)
-        p_model = float(stats.chi2.sf(2 * max(gain, 0.0), k))
-        likelihood, x = self._fit(totals, at)
-        v = int(np.argmax(likelihood))
-        beta = x[v, self.base :]
-        own = int(np.argmax(self._fit(totals, np.empty(0, int))[0]))  # the base at the variance that suits the base
-        full, base = self._jackknife(at, v), self._jackknife(np.empty(0, int), own)
-        left_out = float(np.sum(self._loss(full, np.r_[np.arange(self.base), at], v))) + self.cost[v]
-        left_out_base = float(np.sum(self._loss(base, np.arange(self.base), own))) + self.cost[own]
-        p_cluster = wald(beta, full[:, self.base :]) if g > k + 1 else 1.0
-        return Score(
-            candidate, beta, gain, p_model, p_cluster, float(left_out_base - left_out),
-            self.left(totals, candidate.columns),
-        )  # fmt: skip
+        return self.scores([candidate])[0]
+
+    def scores(self, candidates: Sequence[Candidate]) -> list[Score]:
+        """All tests of each candidate."""
+        totals, g = self.totals(), self.count
+        base, _ = self._fit(totals, np.empty(0, int))
+        own = int(np.argmax(base))  # the base at the variance that suits the base
+        before, missed = float(base[own]), float(np.sum(self._base_loss(own))) + self.cost[own]
+        out: dict[int, Score] = {}
+        for places, at in self._alike([c.columns for c in candidates], g):
+            likelihood, x = self._fit(totals, at)
+            suits = np.argmax(likelihood, axis=0)
+            for v in np.unique(suits).tolist():
+                here = np.flatnonzero(suits == v)
+                beta, gain = x[v, here, self.base :], likelihood[v, here] - before
+                full = self._jackknife(at[here], v)
+                left_out = missed - np.sum(self._loss(full, self._with_base(at[here]), v), axis=0) - self.cost[v]
+                p_model = stats.chi2.sf(2 * np.maximum(gain, 0.0), at.shape[-1])
+                p_cluster = wald(beta, full[..., self.base :])
+                for i, k in enumerate(places[here]):
+                    c = candidates[k]
+                    numbers = (float(y[i]) for y in (gain, p_model, p_cluster, left_out))
+                    out[int(k)] = Score(c, beta[i], *numbers, self.left(c.columns))
+        return [out[k] for k in range(len(candidates))]
 
     def estimate(self, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
         """A candidate's coefficients and their standard errors from clusters left out in turn."""
@@ -215,25 +262,38 @@ class Evidence:
         return x[v], model * np.outer(scale, scale)
 
     def plain_score(self, candidate: Candidate) -> Score:
-        """A candidate's tests where rows are as they were measured and only clusters count as independent.
+        """A candidate's tests where rows are as they were measured and only clusters count as independent."""
+        return self.plain_scores([candidate])[0]
+
+    def plain_scores(self, candidates: Sequence[Candidate]) -> list[Score]:
+        """Tests of each candidate where rows are as they were measured and only clusters count as independent.
 
         Weights that suit the noise inside trips may drown what differs between them (a temperature that moves slowly
         and is measured late). The gain is the likelihood ratio of as many observations as there are clusters.
         """
-        at = self.base + np.asarray(candidate.columns)
-        _, x = self._fit(self.totals(), at)
-        full, base = self._jackknife(at, 0), self._jackknife(np.empty(0, int), 0)
-        beta, g, k = x[0, self.base :], self.count, len(at)
-        p = wald(beta, full[:, self.base :])
-        # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
-        statistic = min(float(stats.f.isf(max(p, 1e-60), k, g - k)), 1e12) * k / (g - k) if g > k + 1 else 0.0
-        better = self._loss(base, np.arange(self.base), 0) - self._loss(full, np.r_[np.arange(self.base), at], 0)
-        t = float(np.mean(better) / (np.std(better) + 1e-300) * np.sqrt(g))
-        gain = 0.5 * g * float(np.log1p(statistic))
-        # as much of it as clusters keep that are left out of the fit
-        kept = float(np.sum(better)) / max(self.gain(self.totals(), candidate.columns)[0], 1e-300)
-        left_out = gain * min(kept, 1.0) if t > 1.0 else 0.0
-        return Score(candidate, beta, gain, p, p, left_out, self.left(self.totals(), candidate.columns), plain=True)
+        totals, g = self.totals(), self.count
+        out: dict[int, Score] = {}
+        for places, at in self._alike([c.columns for c in candidates], g):
+            k = at.shape[-1]
+            likelihood, x = self._fit(totals, at)
+            full, beta = self._jackknife(at, 0), x[0, :, self.base :]
+            p = wald(beta, full[..., self.base :])
+            # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
+            statistic = np.zeros(len(places))
+            if g >= least_clusters(k):
+                statistic = np.minimum(stats.f.isf(np.maximum(p, 1e-60), k, g - k), 1e12) * k / (g - k)
+            better = self._base_loss(0)[:, None] - self._loss(full, self._with_base(at), 0)
+            t = np.mean(better, axis=0) / (np.std(better, axis=0) + 1e-300) * np.sqrt(g)
+            gain = 0.5 * g * np.log1p(statistic)
+            # as much of it as clusters keep that are left out of the fit
+            whole = np.max(likelihood, axis=0) - self.base_likelihood(totals)
+            kept = np.sum(better, axis=0) / np.maximum(whole, 1e-300)
+            left_out = np.where(t > 1.0, gain * np.minimum(kept, 1.0), 0.0)
+            for i, j in enumerate(places):
+                c = candidates[j]
+                numbers = (float(y[i]) for y in (gain, p, p, left_out))
+                out[int(j)] = Score(c, beta[i], *numbers, self.left(c.columns), plain=True)
+        return [out[k] for k in range(len(candidates))]
 
     def beside(self, other: Sequence[int], own: Sequence[int]) -> float:
         """p of a candidate's columns against zero when another's are in, with jackknifed clusters."""
@@ -242,7 +302,7 @@ class Evidence:
             return 1.0
         _, x = self._fit(self.totals(), at)
         skip = self.base + len(other)
-        return wald(x[0, skip:], self._jackknife(at, 0)[:, skip:])
+        return float(wald(x[0, skip:], self._jackknife(at, 0)[:, skip:]))
 
     def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
         """The same evidence with the candidate's columns given a sign in each cluster."""
@@ -260,24 +320,28 @@ class Evidence:
         likelihood, x = self._fit(self.totals(), np.empty(0, int))
         v = int(np.argmax(likelihood))
         index = np.asarray(at)
-        return wald(x[v, index] + values, self._jackknife(np.empty(0, int), v)[:, index] + values)
+        return float(wald(x[v, index] + values, self._jackknife(np.empty(0, int), v)[:, index] + values))
 
-    def _jackknife(self, at: np.ndarray, v: int) -> np.ndarray:
-        """Coefficients of base and `at` columns with each cluster left out in turn."""
-        index = np.r_[np.arange(self.base), at, self.grams.shape[-1] - 1].astype(int)
-        grams = self.by_cluster(v)[:, index[:, None], index[None, :]]
-        a, b = self._normal(grams.sum(axis=0) - grams, np.arange(self.base, len(index) - 1))
-        if not a.shape[-1]:
-            return b
-        d = np.sqrt(np.maximum(np.einsum("gii->gi", a), 1e-300))
-        return np.linalg.solve(a / (d[:, :, None] * d[:, None, :]), (b / d)[..., None])[..., 0] / d
+    def _jackknife(self, at: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way n"]:
+        """Coefficients of base and `at` columns [*way k] with each cluster left out in turn."""
+        index = np.concatenate([self._with_base(at), np.full((*at.shape[:-1], 1), self.grams.shape[-1] - 1)], axis=-1)
+        grams = self.by_cluster(v)[:, index[..., :, None], index[..., None, :]]
+        a, b = self._normal(grams.sum(axis=0) - grams, np.arange(self.base, index.shape[-1] - 1))
+        return _solved(a, b) if a.shape[-1] else b
 
-    def _loss(self, x: np.ndarray, index: np.ndarray, v: int) -> np.ndarray:
-        """Half the sum of squares of each cluster under its own left-out coefficients."""
+    def _loss(self, x: np.ndarray, index: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way"]:
+        """Half the sum of squares of each cluster under its own left-out coefficients of columns `index` [*way n]."""
         grams = self.by_cluster(v)
-        inner, cross = grams[:, index[:, None], index[None, :]], grams[:, index, -1]
-        quadratic = np.einsum("gi,gij,gj->g", x, inner, x)
-        return 0.5 * (grams[:, -1, -1] - 2 * np.einsum("gi,gi->g", x, cross) + quadratic)
+        inner, cross = grams[:, index[..., :, None], index[..., None, :]], grams[:, index, -1]
+        own = grams[:, -1, -1].reshape(-1, *(1,) * (index.ndim - 1))
+        fitted = np.matmul(inner, x[..., None])[..., 0] - 2.0 * cross
+        return 0.5 * (own + np.einsum("...i,...i->...", x, fitted))
+
+    def _base_loss(self, v: int) -> Float[np.ndarray, " cluster"]:
+        """`_loss` of the base alone, the same for every candidate."""
+        if v not in self._missed:
+            self._missed[v] = self._loss(self._jackknife(np.empty(0, int), v), np.arange(self.base), v)
+        return self._missed[v]
 
     def sign_placebos(self, s: Score, rng: np.random.Generator, draws: int) -> Float[np.ndarray, " draw"]:
         """Gains of the same columns with each cluster's sign drawn at random: what no consistent effect would give."""

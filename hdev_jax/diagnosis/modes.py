@@ -187,7 +187,7 @@ def _left_out(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarr
         off, on = likelihood(t, x, 0.0) + np.log1p(-share), likelihood(t, x, size) + np.log(share)
         gain += float(np.logaddexp(off, on)) - likelihood(t, without, 0.0)
         sizes.append([size])
-    return gain, wald(fitted(np.ones(n))[1][-1:], np.array(sizes))
+    return gain, float(wald(fitted(np.ones(n))[1][-1:], np.array(sizes)))
 
 
 def _stability(every: Every, precision: np.ndarray, pull: np.ndarray, level: float) -> float:

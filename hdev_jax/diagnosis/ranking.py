@@ -1,6 +1,6 @@
 """The best way to have each effect: what is plausible, what it is worth, and how many ways were tried."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -41,28 +41,36 @@ def best_of(
 ) -> tuple[dict[str, Score], dict[str, float]]:
     """The best plausible way to have each effect, and how many independent ways were tried."""
     totals = evidence.totals()
-    before = evidence.base_likelihood(totals)
-    tried: dict[str, int] = {}
+    squares = np.diag(totals[0])[evidence.base : -1]
+    there = np.isfinite(squares) & (squares > 1e-20)
+    every = [c for c in candidates if there[list(c.columns)].all()]
     ranked: dict[str, list[tuple[float, Candidate]]] = {}
-    for c in candidates:
-        squares = totals[0, evidence.base + np.asarray(c.columns), evidence.base + np.asarray(c.columns)]
-        if not np.all(np.isfinite(squares) & (squares > 1e-20)):
-            continue
-        gain, _ = evidence.gain(totals, c.columns, before)
-        tried[c.id] = tried.get(c.id, 0) + 1
-        ranked.setdefault(c.id, []).append((worth(gain, c), c))
+    for c, gain in zip(every, evidence.gains(totals, [c.columns for c in every]), strict=True):
+        ranked.setdefault(c.id, []).append((worth(float(gain), c), c))
+    leading = {id_: [c for _, c in _leading(entries)] for id_, entries in ranked.items()}
+    steady = {
+        id_: [c for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
+        for id_, entries in ranked.items()
+    }
+    scored = _by_id(leading, evidence.scores([c for cs in leading.values() for c in cs]))
+    scored_plain = _by_id(steady, plain.plain_scores([c for cs in steady.values() for c in cs]))
     best, ways = {}, {}
     for id_, entries in ranked.items():
         apart = evidence.projected(np.unique([k for _, c in entries for k in c.columns]))
-        ways[id_] = min(float(tried[id_]), effective_number(apart))
-        looks = [_clearest([evidence.score(c) for _, c in _leading(entries)])]
-        scores = [plain.plain_score(c) for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
-        if scores:
+        ways[id_] = min(float(len(entries)), effective_number(apart))
+        looks = [_clearest(scored[id_])]
+        if scores := scored_plain[id_]:
             looks.append(_clearest(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
         # what both looks see is told by the whitened rows, which see it better
         able = [s for s in looks if plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
         best[id_] = min(able, key=lambda s: (s.p > CERTAIN, s.p if s.p > CERTAIN else 0.0))
     return best, ways
+
+
+def _by_id(groups: Mapping[str, Sequence[Candidate]], scores: Sequence[Score]) -> dict[str, list[Score]]:
+    """Scores of all groups' candidates, one group after the other, by group again."""
+    each = iter(scores)
+    return {id_: [next(each) for _ in candidates] for id_, candidates in groups.items()}
 
 
 def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:

@@ -14,16 +14,17 @@ def least_clusters(k: int) -> int:
     return k + 2
 
 
-def wald(beta: Float[np.ndarray, " k"], left_out: Float[np.ndarray, "cluster k"]) -> float:
+def wald(beta: Float[np.ndarray, "*way k"], left_out: Float[np.ndarray, "cluster *way k"]) -> Float[np.ndarray, "*way"]:
     """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F)."""
-    g, k = left_out.shape
+    g, k = left_out.shape[0], left_out.shape[-1]
     if g < least_clusters(k):
-        return 1.0
-    spread = left_out - beta
-    covariance = (g - 1) / g * spread.T @ spread
-    d = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    w = float((beta / d) @ np.linalg.pinv(covariance / np.outer(d, d), rcond=1e-10) @ (beta / d))
-    return float(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
+        return np.ones(beta.shape[:-1])
+    spread = np.moveaxis(left_out - beta, 0, -2)
+    covariance = (g - 1) / g * np.matmul(np.swapaxes(spread, -1, -2), spread)
+    d = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 1e-300))
+    inverse = np.linalg.pinv(covariance / (d[..., :, None] * d[..., None, :]), rcond=1e-10)
+    w = np.einsum("...i,...ij,...j->...", beta / d, inverse, beta / d)
+    return np.asarray(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
 
 
 def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
