@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from hdev_jax.diagnosis.facts import GROUPS
 from hdev_jax.diagnosis.metrics import sum_weight
 from hdev_jax.errors import InputError
-from hdev_jax.inference import ParameterTable, padded, predict
+from hdev_jax.inference import Fit, ParameterTable, padded, predict
 from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
 from hdev_jax.logs import Log
 from hdev_jax.physics import Vehicle
@@ -56,9 +57,13 @@ class Problem:
         """What each row weighs in a sum."""
         return sum_weight(self.target, np.asarray(self.segments.duration_s), np.asarray(self.segments.distance_m))
 
+    @cached_property
+    def _padded(self) -> Fit:
+        return padded(self.segments, self.measured)
+
     def predict(self, vehicle: Vehicle, segments: Segments | None = None) -> np.ndarray:
         """The target's column by this vehicle on every row of the log, or of `segments` in its place."""
-        rows = padded(self.segments if segments is None else segments, self.measured)
+        rows = self._padded if segments is None else padded(segments, self.measured)
         return np.asarray(predict(vehicle, rows.segments, self.target))[: rows.rows]
 
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,12 +93,13 @@ def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, targ
         out[:, k] = np.nan_to_num(column, posinf=0.0, neginf=0.0)
 
 
-@eqx.filter_jit
+# not `eqx.filter_jit`: every leaf is an array, and sorting them out takes longer than the column of a short log
+@partial(jax.jit, static_argnums=(1, 2))
 def _predict(car: Vehicle, structure: Structure, target: Target, segments: Segments, values: Any) -> Array:
     return insert(car, structure, jnp.asarray(values)).predict(segments, target)
 
 
-@eqx.filter_jit
+@partial(jax.jit, static_argnums=(1, 2))
 def _slope(car: Vehicle, structure: Structure, target: Target, segments: Segments, values: Any, tangent: Any) -> Array:
     def predict(x: Array) -> Array:
         return insert(car, structure, x).predict(segments, target)
