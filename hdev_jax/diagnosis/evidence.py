@@ -226,9 +226,10 @@ class Evidence:
                 p_model = stats.chi2.sf(2 * np.maximum(gain, 0.0), at.shape[-1])
                 p_cluster = wald(beta, full[..., self.base :])
                 for i, k in enumerate(places[here]):
-                    c = candidates[k]
-                    numbers = (float(y[i]) for y in (gain, p_model, p_cluster, left_out))
-                    out[int(k)] = Score(c, beta[i], *numbers, self.left(c.columns))
+                    out[int(k)] = Score(
+                        candidates[k], beta[i], float(gain[i]), float(p_model[i]), float(p_cluster[i]),
+                        float(left_out[i]), self.left(candidates[k].columns),
+                    )  # fmt: skip
         return [out[k] for k in range(len(candidates))]
 
     def estimate(self, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
@@ -290,9 +291,10 @@ class Evidence:
             kept = np.sum(better, axis=0) / np.maximum(whole, 1e-300)
             left_out = np.where(t > 1.0, gain * np.minimum(kept, 1.0), 0.0)
             for i, j in enumerate(places):
-                c = candidates[j]
-                numbers = (float(y[i]) for y in (gain, p, p, left_out))
-                out[int(j)] = Score(c, beta[i], *numbers, self.left(c.columns), plain=True)
+                out[int(j)] = Score(
+                    candidates[j], beta[i], float(gain[i]), float(p[i]), float(p[i]), float(left_out[i]),
+                    self.left(candidates[j].columns), plain=True,
+                )  # fmt: skip
         return [out[k] for k in range(len(candidates))]
 
     def beside(self, other: Sequence[int], own: Sequence[int]) -> float:
