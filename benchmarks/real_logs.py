@@ -135,7 +135,9 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     there = {**ran, "adapter": Path(ran["adapter"]).name}
     if differs := [k for k, v in asked.items() if (there.get(k) or []) != v]:
         raise SystemExit(f"{out} holds another run ({', '.join(differs)}): name another --work, or remove it")
-    covariance = _json(out / "predictive.json")["covariance"]
+    covariance = _json(out / "predictive.json").get("covariance")
+    if covariance is None:
+        raise SystemExit(f"{out} lacks predictive.json: remove the folder, and the run is made again")
     together = told_together(covariance["names"], np.array(covariance["matrix"]))
     return {**result, "cost": _json(work / f"{job.name}.cost.json"), "ran": ran, "together": together}
 

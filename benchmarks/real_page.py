@@ -100,11 +100,13 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             by_trip: dict[str, list[Any]] = {}
             for trip, m in (x for r in runs.values() for x in r["after"]["test_by_trip"].items()):
                 by_trip.setdefault(trip, []).append(m)
-            low, high = pooled_interval(by_trip)
+            within = ""
+            if len(by_trip) > 1:
+                low, high = pooled_interval(by_trip)
+                within = f" (90 %: {low:.2f} to {high:.2f}, from how {len(by_trip)} test trips differ)"
             out.append(
-                f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW (90 %: {low:.2f} to {high:.2f}, from how {len(by_trip)} "
-                f"test trips differ), pooled over {len(runs)} {each}. Every one of them finds {named(always)}. In "
-                f"{open_} of {len(runs)} the loop says that something more is missing."
+                f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. Every one of "
+                f"them finds {named(always)}. In {open_} of {len(runs)} the loop says that something more is missing."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)

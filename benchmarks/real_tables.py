@@ -197,15 +197,16 @@ def signature(unexplained: Mapping[str, Any]) -> str:
 
 
 def pooled_interval(by_trip: Mapping[str, Sequence[Mapping[str, Any]]]) -> tuple[float, float]:
-    """90 % interval of `pooled_rmse`: trips, with all METRICS blocks of each, are left out in turn (jackknife;
-    Student's t of one degree of freedom less than there are trips). Raises `ValueError` for fewer than two trips."""
+    """90 % interval of `pooled_rmse`: trips, with all METRICS blocks of each, are left out in turn (jackknife of the
+    logarithm; Student's t of one degree of freedom less than there are trips). Raises `ValueError` for fewer than two.
+    """
     if len(by_trip) < 2:
         raise ValueError("one trip says nothing of how trips differ; at least two are expected")
     whole = pooled_rmse([m for blocks in by_trip.values() for m in blocks])
     without = [pooled_rmse([m for k, b in by_trip.items() if k != left for m in b]) for left in by_trip]
-    n = len(without)
-    half = float(stats.t.ppf(0.95, n - 1) * np.sqrt((n - 1) / n * np.sum((np.array(without) - np.mean(without)) ** 2)))
-    return whole - half, whole + half
+    n, off = len(without), np.log(without) - np.mean(np.log(without))  # an error is above 0, and so is its interval
+    factor = float(np.exp(stats.t.ppf(0.95, n - 1) * np.sqrt((n - 1) / n * np.sum(off**2))))
+    return whole / factor, whole * factor
 
 
 def pooled_rmse(blocks: Sequence[Mapping[str, Any]]) -> float:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.paper1_halves import MASS_SD, coefficient, fitted
-from experiments.pinn_data import Data, Member
+from experiments.pinn_data import Data, Member, weighed
 from hdev_jax.inference import Fit, ParameterTable, Rows, effect_coefficients, jacobian, linear_fit, padded, predict
 from hdev_jax.learn.pinn import Sized
 from hdev_jax.learn.pinn_rows import row_wise
@@ -55,7 +55,8 @@ def said(vehicle: Vehicle, m: Member, segments: Segments | None = None) -> np.nd
 
 class Closed(NamedTuple):
     """A vehicle's kernel in closed form; by how much each row's mass is off (0 where the trip is not trained on) and
-    the standard deviation of that over trips, as shares of the logged mass."""
+    the standard deviation of that over trips, as shares of the logged mass (NaN: too few trips to tell; 0: the mass is
+    as it is given)."""
 
     vehicle: Vehicle
     payload: np.ndarray
@@ -63,7 +64,7 @@ class Closed(NamedTuple):
 
     def weighed(self, m: Member) -> Segments:
         """The vehicle's log with its trips' masses as they were found."""
-        return _weighed(m.segments, self.payload)
+        return weighed(m.segments, self.payload)
 
 
 def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
@@ -87,7 +88,8 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
         table = table.plus(*effect_coefficients(e, sizes, shapes=False, groups=groups))
         searches += [_Search(id, p, row_s) for p in e.parameters if p.kind == "limit" and p.name not in given]
     limits = {f"effects.{s.id}.{s.p.name}": True for s in searches}
-    trips = _Trips.of(segments) if "scale" in _open(effects, "mass_scale") and segments.has("mass_kg") else None
+    opened = "scale" in _open(effects, "mass_scale") and segments.has("mass_kg")
+    trips = _Trips.of(segments) if opened else None
 
     def fit(car: Vehicle, s: Segments) -> Vehicle:
         return table.insert(car, fitted(car, table, s, energy, "energy_wh", paper=True).values)
@@ -102,7 +104,7 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
         car = fit(car, now)
         trips = trips and trips.again(car, segments, energy)
     if trips is None:
-        return Closed(car, np.zeros(len(m.use)), 0.0)
+        return Closed(car, np.zeros(len(m.use)), np.nan if opened else 0.0)
     payload = np.zeros(len(m.use))
     payload[train] = trips.off[trips.of_row]
     return Closed(fit(car, trips.weighed(segments)), payload, trips.sd)
@@ -122,10 +124,6 @@ def _as_given(id: str, given: Mapping[str, float], m: Member) -> Effect:
     return e
 
 
-def _weighed(segments: Segments, off: np.ndarray) -> Segments:
-    return segments.with_channels(mass_kg=np.asarray(segments.channels["mass_kg"]) * (1.0 + off))
-
-
 class _Trips(NamedTuple):
     """What each trip's mass is off by about the vehicle's mean, as a share, and its standard deviation over trips."""
 
@@ -141,12 +139,13 @@ class _Trips(NamedTuple):
 
     def weighed(self, segments: Segments) -> Segments:
         """The rows with these masses."""
-        return _weighed(segments, self.off[self.of_row])
+        return weighed(segments, self.off[self.of_row])
 
     def again(self, car: Vehicle, segments: Segments, energy: np.ndarray) -> "_Trips":
         """One step of EM: each trip's mass with all else as it is, then the variance that they have."""
         mean = float(car.effect("mass_scale").scale)
-        own = ParameterTable((coefficient("effects.mass_scale.scale", "1", mean, self.sd, positive=False),))
+        sd = self.sd * (1.0 + mean)
+        own = ParameterTable((coefficient("effects.mass_scale.scale", "1", mean, sd, positive=False),))
         rows = padded(segments, energy)
         found = linear_fit(car, own, lambda: [Rows(rows, self.of_row, self.of_row)], "energy_wh", groups=len(self.off))
         off, sd = (found.values[:, 0] - mean) / (1.0 + mean), found.sd[:, 0] / (1.0 + mean)
@@ -154,12 +153,13 @@ class _Trips(NamedTuple):
 
 
 class _Left:
-    """What a threshold leaves of the squares once all other coefficients have moved along as they would."""
+    """What a threshold leaves of the squares once all other coefficients have moved along as the rows would have
+    them."""
 
     def __init__(self, car: Vehicle, table: ParameterTable, rows: Fit):
         self.rows, self.names = rows, [c.path for c in table.free]
         self.columns = np.asarray(rows.weight)[:, None] * jacobian(car, table, rows.segments, "energy_wh")
-        self.count = float(np.sum(rows.weight))
+        self.free = max(float(np.sum(rows.weight)) - len(self.names), 1.0)  # rows less what is fitted to them
 
     def without(self, path: str) -> Callable[[Vehicle], float]:
         """The sum of squares of a vehicle, the coefficient at `path` being held where the vehicle has it."""
@@ -186,7 +186,7 @@ class _Search:
         null, of = float(self.p.null), squares.without(f"effects.{self.id}.{self.p.name}")
         left = {x: of(self._at(car, x)) for x in (null, *self.span)}
         value = min(left, key=lambda x: left[x])
-        noise = left[value] / squares.count
+        noise = left[value] / squares.free
         if value != null or self.p.smooth:
             self._finer(value, left)
         return self._at(car, value if left[null] - left[value] > _LEAST_GAIN * noise else null)
@@ -207,7 +207,7 @@ class _Search:
 class Known(NamedTuple):
     """What networks take over from the closed form: a `vehicle`, as declared but with its thresholds that act within a
     row; by row what effects that act across rows add (`across_wh`), what the mass is off by (`payload`, a share) and
-    what a mass that nobody found out is worth, one standard deviation (`loose_wh`)."""
+    what one standard deviation of a mass that nobody found out adds (`loose_wh`)."""
 
     vehicle: Vehicle
     across_wh: np.ndarray
@@ -236,29 +236,30 @@ def known(data: Data, effects: str) -> tuple[Known, ...]:
         for f, m in zip(fits, data.vehicles, strict=True)
     ])  # fmt: skip
     found = np.where(np.isnan(found), np.nanmedian(found, axis=0, keepdims=True) if names else found, found)
-    payload_sd = float(np.median([f.payload_sd for f in fits if f is not None] or [0.0]))
+    told = [f.payload_sd for f in fits if f is not None and np.isfinite(f.payload_sd)]
+    usual = float(np.median(told)) if told else MASS_SD * ("scale" in _open(listed, "mass_scale"))
     out = []
     for m, f, own in zip(data.vehicles, fits, found, strict=True):
         values: dict[str, dict[str, Any]] = {e: {} for e in within}
         for (e, p), x in zip(names, own, strict=True):
             values[e][p.name] = jnp.asarray(x * _unit(m, p))
         car = m.vehicle.plus(*(LIBRARY[e](**v) for e, v in values.items()))
-        moved, payload, sd = np.zeros(len(m.use)), np.zeros(len(m.use)), payload_sd
-        if f is not None:
-            payload, sd = f.payload, f.payload_sd
-            if across:
-                weighed = f.weighed(m) if np.any(payload) else m.segments
-                moved = said(f.vehicle, m, weighed) - said(f.vehicle.minus(*across), m, weighed)
-        out.append(Known(car, moved, payload, _loose(car if f is None else f.vehicle, m, payload, sd)))
+        moved, payload = np.zeros(len(m.use)), np.zeros(len(m.use))
+        if f is None or np.isnan(f.payload_sd):  # of no trip
+            loose = _loose(car if f is None else f.vehicle, m, usual)
+        else:
+            payload, loose = f.payload, np.where(m.use == 0, 0.0, _loose(f.vehicle, m, f.payload_sd))
+        if f is not None and across:
+            moved = said(f.vehicle, m, f.weighed(m)) - said(f.vehicle.minus(*across), m, f.weighed(m))
+        out.append(Known(car, moved, payload, loose))
     return tuple(out)
 
 
-def _loose(car: Vehicle, m: Member, payload: np.ndarray, sd: float) -> np.ndarray:
-    """What a mass that is one `sd` higher adds to each row's energy, of trips whose mass was not found [Wh]."""
+def _loose(car: Vehicle, m: Member, sd: float) -> np.ndarray:
+    """What a mass that is by a share of `sd` higher adds to each row's energy [Wh]."""
     if sd == 0:
         return np.zeros(len(m.use))
-    moved = said(car, m, _weighed(m.segments, np.full(len(m.use), sd))) - said(car, m)
-    return np.where(payload == 0, np.abs(moved), 0.0)
+    return said(car, m, weighed(m.segments, np.full(len(m.use), sd))) - said(car, m)
 
 
 def _unit(m: Member, p: Parameter) -> float:

@@ -23,7 +23,7 @@ from hdev_jax.segments import Segments
 if TYPE_CHECKING:
     from experiments.pinn_closed import Known
 
-__all__ = ["Data", "Member", "load"]
+__all__ = ["Data", "Member", "load", "weighed"]
 
 # What no network and no learner is told: it would tell the force of the drive, and with it the energy.
 TELLS = ("requested_torque_nm", "brake_pressure_pa", "halt_brake", "door_open", "passengers", "gear_middle")
@@ -69,8 +69,7 @@ class Data:
         parts = []
         for k, (m, own, fit) in enumerate(zip(self.vehicles, known, self._calibrated, strict=True)):
             s = dataclasses.replace(m.segments, trip=m.routes)
-            if np.any(own.payload):
-                s = s.with_channels(mass_kg=np.asarray(s.channels["mass_kg"]) * (1.0 + own.payload))
+            s = weighed(s, own.payload)
             one = rows_of(
                 own.vehicle, s, m.energy_wh, number=min(k, self.trained), features=features, effects=made,
                 calibrated=fit, across_wh=own.across_wh, loose_wh=own.loose_wh,
@@ -114,6 +113,13 @@ class Data:
         use = self.column("use")
         names = ("training", "validation", "test", "unseen", "unused")
         return {n: int(np.sum(use == k)) for k, n in enumerate(names)}
+
+
+def weighed(segments: Segments, off: np.ndarray) -> Segments:
+    """The rows with a logged mass that is off by these shares; as they are where the log has none."""
+    if not segments.has("mass_kg"):
+        return segments
+    return segments.with_channels(mass_kg=np.asarray(segments.channels["mass_kg"]) * (1.0 + off))
 
 
 def calibrated(m: Member) -> np.ndarray:

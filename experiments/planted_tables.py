@@ -21,7 +21,8 @@ Group = list[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their results
 COVERED = (0.85, 0.95)  # of 90 % intervals, after selection
 ORACLE = 0.90  # of the logs within NEAR_ORACLE of the error of an oracle that knows the cause
 NEAR_ORACLE = 1.05
-# What a row of a setting holds, by table: caption and columns, beside its name and its number of logs.
+# What a row of a setting holds, by table: caption and columns, beside its name and its number of logs. Settings that
+# a table's first column says nothing of are not in it.
 TABLES = {
     "planted": (
         "Planted effects: what each setting asks for",
@@ -30,7 +31,7 @@ TABLES = {
     ),
     "planted_errors": (
         "Planted effects: sizes of what was named, errors, time",
-        ("size_within_3_sd", "size_covered_90", "within_5_percent_of_oracle", "after_over_noise", "seconds"),
+        ("within_5_percent_of_oracle", "after_over_noise", "size_within_3_sd", "size_covered_90", "seconds"),
     ),
     "planted_names": (
         "Planted effects: names with classes and without",
@@ -39,14 +40,16 @@ TABLES = {
     ),
     "planted_undecided": (
         "Planted effects: what is absorbed, and what more trips would tell",
-        ("furthest_coefficient_sd", "called_not_decidable", "names_not_decidable", "clusters", "clusters_needed"),
+        ("asked", "furthest_coefficient_sd", "called_not_decidable", "names_not_decidable", "clusters",
+         "clusters_needed"),
     ),
 }  # fmt: skip
 LEGEND = (
     "As asked: the share of logs that name all and only what was planted (one entry each: the id, or a class of at "
     "most three that holds it); with nothing planted, that name nothing; of a cause outside the library, that name "
     "nothing false; of what a coefficient absorbs, that say so; of what only trips tell, that more trips would. Its "
-    "interval is Wilson's; met compares the share with what is wanted, met by interval the interval's lower end",
+    "interval is Wilson's. Met: this share, that without a class and that called unexplained are what is wanted of "
+    "each; met by interval: the lower ends of their intervals are",
     "Something false: logs that name an effect which was not planted. Called unexplained: logs in which structure is "
     "left, which levels of trips are too, though they are noise there",
     "Named first: classes set aside, what each entry is called. No class: each entry is one name. Separable: logs in "
@@ -73,7 +76,7 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
             told = {"met": row["as_asked"] >= least, "met_by_interval": row["interval_95"][0] >= least}
             rows.append({**row, "wanted": least, **told})
     for table, (caption, columns) in TABLES.items():
-        part = [{k: r[k] for k in ("name", "n", *columns)} for r in rows if any(r[k] is not None for k in columns)]
+        part = [{k: r[k] for k in ("name", "n", *columns)} for r in rows if r[columns[0]] is not None]
         write_tables(run, table, part, f"{caption}; synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
     able = [(t, r) for t, r in done if config.cases[t["case"]].asked == "named"]
     sized = [*_covered(able), *_near_oracle(able)]
@@ -179,12 +182,13 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     first = sum({x["id"] for x in r["named"]} == set(scores.names(t["effects"])) for t, r in hits)
     alone = sum(_alone(r) for _, r in hits)
     apart = [(t, r) for t, r in group if r["alike"] and not any(r["alike"].values())]
-    alone_apart = np.mean([scores.exact(t["effects"], r["named"]) and _alone(r) for t, r in apart]) if apart else None
+    alone_apart = [scores.exact(t["effects"], r["named"]) and _alone(r) for t, r in apart]
     unexplained = sum(r["unexplained"] for _, r in group)
-    enough = [
-        least is None or share is None or share >= least
-        for least, share in ((case.wanted, as_asked / n), (case.wanted_alone, alone_apart),
-                             (case.wanted_unexplained, unexplained / n))
+    wanted = [
+        (least, hits, count)
+        for least, hits, count in ((case.wanted, as_asked, n), (case.wanted_alone, sum(alone_apart), len(apart)),
+                                   (case.wanted_unexplained, unexplained, n))
+        if least is not None and count
     ]  # fmt: skip
     pairs = [s for _, r in group for s in r["sizes"]] if case.asked == "named" else []
     z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
@@ -199,13 +203,14 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "as_asked": as_asked / n,
         "interval_95": list(wilson(as_asked, n)),
         "wanted": case.wanted,
-        "met": all(enough) if case.wanted is not None else None,
-        "met_by_interval": wilson(as_asked, n)[0] >= case.wanted if case.wanted is not None else None,
+        "asked": case.asked.replace("_", " ") if case.asked != "named" else None,
+        "met": all(k / m >= least for least, k, m in wanted) if case.wanted is not None else None,
+        "met_by_interval": all(wilson(k, m)[0] >= least for least, k, m in wanted) if case.wanted is not None else None,
         "named_exactly": len(hits) / n if named else None,
         "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,
         "separable": len(apart) / n if named else None,  # no other effect could be told from it by any test
-        "no_class_of_separable": float(alone_apart) if named and alone_apart is not None else None,
+        "no_class_of_separable": float(np.mean(alone_apart)) if named and apart else None,
         "no_class_wanted": case.wanted_alone,
         "redrawn": sum(r["redrawn"] for _, r in group),
         "something_false": sum(scores.false(t["effects"], r["named"]) for t, r in group) / n,

@@ -32,6 +32,8 @@ from hdev_jax.rundir import Run
 __all__ = ["Opening", "Paths", "chosen_effects", "command_line", "known_effects", "opened", "tried"]
 
 Paths = Sequence[str | Path]
+HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
+ROUNDING = 1e4  # units in the last place of the largest prediction, for two that are said to be the same
 
 
 def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
@@ -65,30 +67,47 @@ def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
 def _malformed(effect: type[Effect]) -> str | None:
     """Why a user's class is no effect, in one phrase; None where it is one."""
     stage, parameters = getattr(effect, "stage", None), effect.parameters
-    declared = {c.id for c in DECLARED}
     if not (isinstance(effect.id, str) and effect.id.isascii() and effect.id.isidentifier()):
         return f"id is {effect.id!r}; letters, digits and underscores are expected"
-    if effect.id in declared:
+    if effect.id in {c.id for c in DECLARED}:
         return f"id {effect.id!r} is a part of the declared model; give yours a name of its own"
     if stage not in STAGES:
         return f"stage is {stage!r}; one of {', '.join(STAGES)} is expected"
     if not isinstance(getattr(effect, "equation", None), str):
         return "equation is missing; a line of text is expected"
-    if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
-        return "parameters is something else than a tuple of hdev_jax.physics.Parameter"
-    if not _texts(effect.needs) or not _texts(effect.lacks):
-        return f"needs is {effect.needs!r} and lacks {effect.lacks!r}; a tuple of channels' names each is expected"
+    for name in ("needs", "lacks", "entries"):
+        if not _texts(value := getattr(effect, name)):
+            return f"{name} is {value!r}; a tuple of names is expected"
+    if not effect.entries or set(effect.entries) - {*Effect.entries}:
+        return f"entries is {effect.entries!r}; some of {', '.join(Effect.entries)} are expected"
     if effect.searched:
         return f"searched is {effect.searched!r}; only effects of the library are looked for in a way of their own"
+    if not any(getattr(effect, hook) is not getattr(Effect, hook) for hook in HOOKS):
+        return f"it has no hook of its own ({', '.join(HOOKS)}), so it does nothing"
+    if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
+        return "parameters is something else than a tuple of hdev_jax.physics.Parameter"
+    return _malformed_parameters(effect, parameters)
+
+
+def _malformed_parameters(effect: type[Effect], parameters: Sequence[Parameter]) -> str | None:
+    if odd := [p.name for p in parameters if not isinstance(p.name, str)]:
+        return f"a parameter's name is {odd[0]!r}; text is expected"
+    names = [p.name for p in parameters]
+    if twice := {n for n in names if names.count(n) > 1}:
+        return f"two parameters are called {min(twice)}"
     for p in parameters:
         if why := _malformed_parameter(p):
             return f"parameter {p.name!r}: {why}"
+        if p.of and p.of not in names:
+            return f"parameter {p.name!r}: of is {p.of!r}; one of {', '.join(names)} is expected"
     if all(p.kind in FIXED for p in parameters):
         return "parameters holds no size and no limit, so nothing of it could be found"
+    if odd := [n for variant in effect.variants for n in variant if n not in names]:
+        return f"variants has {odd[0]!r}; sets of {', '.join(names)} are expected"
     try:
         at_null(effect)
     except Exception as e:
-        return f"cannot be made with its parameters ({', '.join(p.name for p in parameters)}): {type(e).__name__}: {e}"
+        return f"cannot be made with its parameters ({', '.join(names)}): {type(e).__name__}: {e}"
     return None
 
 
@@ -98,6 +117,8 @@ def _texts(names: Any) -> bool:
 
 def _malformed_parameter(p: Parameter) -> str | None:
     """Why a parameter could never be fitted or tried, in one phrase; None where it can."""
+    if not isinstance(p.grid, tuple | list | np.ndarray):
+        return f"grid is {p.grid!r}; a tuple of values is expected"
     numbers = (p.null, p.scale, p.lower, p.upper, p.least, *p.grid)
     if not all(isinstance(x, Real) and not math.isnan(x) for x in numbers):
         return "null, scale, lower, upper, least and the values of grid are numbers"
@@ -109,9 +130,9 @@ def _malformed_parameter(p: Parameter) -> str | None:
         return f"scale is {p.scale:g}; a typical size other than 0 is expected"
     if not p.lower < p.upper:
         return f"lower is {p.lower:g} and upper {p.upper:g}; a range is expected"
-    if p.kind == "size" and not p.lower <= p.null <= p.upper:
-        return f"null is {p.null:g}, outside its range {p.lower:g} to {p.upper:g}"
-    if p.kind != "size" and not p.grid and p.name != "at_trip":  # whose values are the log's trips
+    if p.kind == "size" and not (math.isfinite(p.null) and p.lower <= p.null <= p.upper):
+        return f"null is {p.null:g}, no number of its range {p.lower:g} to {p.upper:g}"
+    if p.kind != "size" and not len(p.grid) and p.name != "at_trip":  # whose values are the log's trips
         return f"a {p.kind} without a grid is never tried; give it values to try"
     return None
 
@@ -135,7 +156,7 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
             plan = plan_of(car, [c], facts, problem.target, searched=True)
             for column in computed(plan.recipes, rows.segments, problem.target):
                 bad |= ~np.isfinite(column[: rows.rows])
-            null = plain if c.id in plan.left_out else problem.predict(car.plus(at_null(c, gears=facts.gears)))
+            null = plain if c.id in plan.left_out else problem.predict(car.plus(_idle(c, facts.gears)))
         except Exception as e:
             hint = "; every channel that it reads belongs in its needs" if isinstance(e, KeyError) else ""
             raise InputError(f"{where}: fails on this log: {type(e).__name__}: {e}{hint}") from e
@@ -146,11 +167,19 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
                 f"{where}: it or its slope is no finite number in {bad.sum()} of {rows.rows} rows, the first in trip "
                 f"{trip} at {at:g} s; a number is expected in every row, also of a branch that is not taken"
             )
-        if not np.allclose(null, plain, rtol=1e-5, atol=1e-9 * float(np.max(np.abs(plain)))):
+        if not np.allclose(null, plain, rtol=0.0, atol=ROUNDING * np.finfo(plain.dtype).eps * np.max(np.abs(plain))):
             raise InputError(
                 f"{where}: changes the prediction by up to {np.max(np.abs(null - plain)):.3g} {problem.unit} while its "
                 "sizes are null; what it adds is expected to be 0 there"
             )
+
+
+def _idle(effect: type[Effect], gears: int) -> Effect:
+    """With its sizes null and each shape at a value that is tried."""
+    null = at_null(effect, gears=gears)
+    values = {p.name: getattr(null, p.name) for p in effect.parameters}
+    tried = {p.name: np.asarray(float(p.grid[0])) for p in effect.parameters if p.kind in FIXED and len(p.grid)}
+    return effect(**(values | tried))
 
 
 def chosen_effects(

@@ -13,7 +13,7 @@ from experiments import pinn
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn import Config, chosen, tasks, together
 from experiments.pinn_closed import kernel, known, said, trainable
-from experiments.pinn_data import Data, load
+from experiments.pinn_data import Data, load, weighed
 from experiments.pinn_diagnosed import united
 from experiments.pinn_scores import pooled, scores
 from hdev_jax.errors import InputError
@@ -185,7 +185,7 @@ def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them(
     data = planted(data, 3.0, MassScale(0.03), RegenLimit(1.5e5), TimeSkew(0.3, 0.0), noise_share=0.01)
     a, b = data.vehicles
     closed, (one, other) = kernel(a, effects), known(data, json.dumps(effects))
-    car, weighed = closed.vehicle, closed.weighed(a)
+    car, own = closed.vehicle, closed.weighed(a)
     limit = float(car.effect("regen_limit").power_w)
     assert limit == pytest.approx(1.5e5, rel=0.01)
     assert float(car.effect("time_skew").skew_s) == pytest.approx(0.3, abs=0.03)
@@ -193,7 +193,7 @@ def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them(
 
     assert float(one.vehicle.effect("regen_limit").power_w) == pytest.approx(limit)
     assert {"headwind", "mass_scale", "time_skew"}.isdisjoint(e.id for e in one.vehicle.effects)
-    assert one.across_wh == pytest.approx(said(car, a, weighed) - said(car.minus("time_skew"), a, weighed))
+    assert one.across_wh == pytest.approx(said(car, a, own) - said(car.minus("time_skew"), a, own))
     trips = [np.sum(one.across_wh[a.routes == t]) for t in np.unique(a.routes)]
     assert np.sum(np.abs(one.across_wh)) > 10 * np.sum(np.abs(trips)) > 0, "a delay moves energy from row to row"
 
@@ -205,6 +205,44 @@ def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them(
     again = known(Data((spoilt, b), 1), json.dumps(effects))
     assert np.array_equal(again[0].across_wh, one.across_wh), "energies of rows that are not trained on say nothing"
     assert float(again[0].vehicle.effect("regen_limit").power_w) == limit
+
+
+def test_each_trips_mass_is_found_and_that_of_others_is_open():
+    """Trips' masses planted, with the fleet's noise of the energy: found where trips are trained on, within an interval
+    where they are not; too few trips tell no variance, and then the usual one holds."""
+    effects = {"mass_scale": {}, "headwind": {}}
+    data = load("fleet", 3, 40, ("B",), 1.0, None, 0, ("A", "B"))
+    a, b = data.vehicles
+    off = np.random.default_rng(4).normal(0.0, 0.04, int(a.routes.max()) + 1)[a.routes]
+    true = said(a.vehicle.plus(MassScale(0.02)), a, weighed(a.segments, off))
+    z = np.random.default_rng(0).standard_normal(len(true))
+    a = dataclasses.replace(a, energy_wh=true + z * (3.0 + 0.01 * np.abs(true)))
+    closed = kernel(a, effects)
+    at = a.use == 0
+    scale = float(closed.vehicle.effect("mass_scale").scale)
+    found, planted_ = (1 + closed.payload[at]) * (1 + scale), (1 + off[at]) * 1.02
+    assert np.sqrt(np.mean((found / planted_ - 1) ** 2)) < 0.006
+    assert closed.payload_sd == pytest.approx(np.std([off[a.routes == t][0] for t in np.unique(a.routes[at])]), rel=0.2)
+    assert not closed.payload[~at].any()
+
+    one, other = known(Data((a, b), 1), json.dumps(effects))
+    assert not one.loose_wh[at].any()
+    assert not other.payload.any()
+    plain = said(closed.vehicle, a)
+    unseen = np.unique(a.routes[~at])
+    sums = [(np.sum((true - plain)[a.routes == t]), np.sum(one.loose_wh[a.routes == t])) for t in unseen]
+    z = np.array([x / s for x, s in sums])
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6, (
+        "a trip's energy is off by what its mass is worth, signs of rows included"
+    )
+    assert np.min(one.loose_wh[~at]) < 0 < np.max(one.loose_wh[~at])
+
+    few = dataclasses.replace(a, use=np.where(a.routes < np.unique(a.routes[at])[3], a.use, 4))
+    (short, unknown) = known(Data((few, b), 1), json.dumps(effects))
+    assert np.isnan(kernel(few, effects).payload_sd)
+    assert short.loose_wh[few.use == 0].any()
+    assert unknown.loose_wh.any()
+    assert not known(Data((few, b), 1), json.dumps({"mass_scale": {"scale": 0.0}}))[0].loose_wh.any()
 
 
 def test_a_networks_physics_has_the_thresholds_and_what_acts_across_rows():

@@ -110,10 +110,11 @@ def test_the_interval_of_a_pooled_error_is_of_trips():
     blocks = {k: [{"mse": e**2, "n": 10**6}] * 3 for k, e in errors.items()}
     low, high = pooled_interval(blocks)
     mse = np.array([e**2 for e in errors.values()])
-    assert (low + high) / 2 == pytest.approx(pooled_rmse([m for b in blocks.values() for m in b]))
-    # of a mean of squares by hand, and by the root's slope
-    expected = 2.353 * np.std(mse, ddof=1) / 2 / (2 * np.sqrt(mse.mean()))
-    assert (high - low) / 2 == pytest.approx(expected, rel=0.1)
+    assert np.sqrt(low * high) == pytest.approx(pooled_rmse([m for b in blocks.values() for m in b]))
+    # of a mean of squares by hand, and by the slope of its logarithm's half
+    expected = 2.353 * np.std(mse, ddof=1) / 2 / (2 * mse.mean())
+    assert np.log(high / low) / 2 == pytest.approx(expected, rel=0.1)
+    assert pooled_interval({"A": [{"mse": 4.0, "n": 9}], "B": [{"mse": 0.01, "n": 9}]})[0] > 0
     with pytest.raises(ValueError, match="at least two"):
         pooled_interval({"A": blocks["A"]})
 

@@ -103,7 +103,12 @@ def fake(verdict="effects_found", trips=6, rows=120, names=None, synthetic=True,
             for k in range(20)
         ]
         + [
-            {"id": "wet_road", "score": None, "q_value": 1.0, "why_not": "needs a channel that the log lacks: wet_road"}
+            {
+                "id": "wet_road",
+                "score": None,
+                "q_value": 1.0,
+                "why_not": "not tried: needs a channel that the log lacks: wet_road",
+            }
         ],
         "unexplained": {
             "significant": unexplained,
@@ -241,14 +246,15 @@ def test_page_leads_with_the_answer(verdict, tmp_path):
         ({"kind": "block", "count": 1}, True, "Not decidable on this log: with 1 stretch of driving for training"),
         ({"kind": "block", "count": 2}, True, "Not decidable on this log: with 2 stretches of driving for training"),
         ({"kind": "block", "count": 3}, True, "Nothing is missing: none of the 20 effects"),
-        ({"kind": "block", "count": 3}, False, "Nothing was tried: the log shows none of the effects"),
+        ({"kind": "block", "count": 3}, False, "Nothing was tried: what was asked for is declared in the sheet"),
     ],
 )
 def test_nothing_is_missing_only_where_it_could_have_been_found(clusters, scored, said):
     data = fake("nothing_missing")
     data.summary["clusters"] = clusters
     if not scored:
-        data.summary["candidates"] = [{**c, "score": None} for c in data.summary["candidates"]]
+        why = "not tried: needs a channel that the log lacks: gear"
+        data.summary["candidates"] = [{**c, "score": None, "why_not": why} for c in data.summary["candidates"]]
     assert said in answer(data)
 
 

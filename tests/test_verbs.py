@@ -507,6 +507,23 @@ def test_effects_that_do_not_exist(options, words, given, out, capsys):
         (USER_EFFECT.replace("0.0, 100.0)", '0.0, 100.0, kind="limit")'), ["'w_per_s'", "grid"]),
         (USER_EFFECT.replace("0.0, 100.0", "float('nan'), 100.0"), ["'w_per_s'", "numbers"]),
         (USER_EFFECT.replace("self.w_per_s *", "(50.0 + self.w_per_s) *"), ["SlowDrift", "sizes are null"]),
+        (USER_EFFECT.replace("0.0, 100.0)", "0.0, 100.0, grid=5.0)"), ["'w_per_s'", "grid", "5.0"]),
+        (USER_EFFECT.replace("0.0, 100.0)", "0.0, 100.0, grid=None)"), ["'w_per_s'", "grid", "None"]),
+        (USER_EFFECT.replace('"w_per_s", "W/s"', '7, "W/s"'), ["name", "7"]),
+        (USER_EFFECT.replace("def power", "def pover"), ["SlowDrift", "no hook"]),
+        (
+            USER_EFFECT.replace("    equation", '    entries: ClassVar = ("raod",)\n    equation'),
+            ["entries", "raod", "road"],
+        ),
+        (
+            USER_EFFECT.replace("    equation", '    variants: ClassVar = (("w",),)\n    equation'),
+            ["variants", "w_per_s"],
+        ),
+        (
+            USER_EFFECT.replace("0.0, 100.0),)", '0.0, 100.0), Parameter("w_per_s", "W", 0.0, 1.0))'),
+            ["two parameters", "w_per_s"],
+        ),
+        (USER_EFFECT.replace("0.0, 100.0)", '0.0, 100.0, of="b")'), ["'w_per_s'", "of", "'b'"]),
         (USER_EFFECT.replace("slow_drift", "headwind"), ["headwind", "in the library already"]),
         (USER_EFFECT.replace("slow_drift", "slow.drift"), ["SlowDrift", "'slow.drift'", "letters"]),
         (USER_EFFECT.replace('"battery"', '"gearbox"'), ["SlowDrift", "'gearbox'", "driveline"]),
@@ -526,6 +543,34 @@ def test_a_file_of_effects_that_is_none(text, words, given, tmp_path, out, capsy
     line = refused(capsys, "diagnose", *given, "--effects", effect, "--out", out)
     assert all(w in line for w in ("mine.py", *words)), line
     assert not out.exists()
+
+
+@pytest.mark.parametrize("x64", [True, False])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("0.0, 100.0)", "0.0, 100.0, grid=tuple(np.linspace(1.0, 2.0, 3)))"),
+        (
+            "0.0, 100.0),)",
+            '0.0, 100.0), Parameter("tau_s", "s", 0.0, 60.0, 0.0, 1e4, kind="shape", grid=(60.0, 600.0)),)',
+        ),
+    ],
+    ids=["a grid made by NumPy", "a shape that is no number at its null"],
+)  # fmt: skip
+def test_effects_that_are_none_too_odd(x64, old, new, given, tmp_path):
+    """What is legal stays so: NumPy's numbers in a grid, a shape that is only ever one of its grid, single precision."""
+    import jax
+
+    text = USER_EFFECT.replace(old, new)
+    assert text != USER_EFFECT
+    if "tau_s" in new:
+        text = text.replace("    w_per_s: Any\n", "    w_per_s: Any\n    tau_s: Any\n")
+        text = text.replace("* row.time_s", "* row.time_s / self.tau_s")
+    effect = tmp_path / "mine.py"
+    effect.write_text("import numpy as np\n" + text)
+    with jax.enable_x64(x64):
+        start = opened("diagnose", [given[0]], given[2], None, None, None, None, effect, 0)
+    assert "slow_drift" in start.sheet.library
 
 
 def test_an_effect_whose_channel_is_not_logged_is_left_out(given, tmp_path):
@@ -576,15 +621,18 @@ def test_a_misspelt_column(verb, right, wrong, given, files, tmp_path, capsys):
 
 @pytest.mark.parametrize("unknown", [65535, 4294967295])
 @pytest.mark.parametrize("channel", ["gear", "road_surface"])
-def test_an_id_that_no_gear_has(channel, unknown, given, files, tmp_path, capsys):
+def test_an_id_that_no_gear_has_is_missing(channel, unknown, given, files, tmp_path):
     """An instrument's word for "unknown": a coefficient for each id up to it would be made."""
     log = pd.read_csv(files["log"])
     log[channel] = 1
-    log.loc[3, channel] = unknown
+    log.loc[[3, 4], channel] = unknown
     log.to_csv(tmp_path / "log.csv", index=False)
-    line = refused(capsys, "diagnose", tmp_path / "log.csv", *given[1:], "--out", tmp_path / "result")
-    assert all(w in line for w in (channel, "beyond 64 in 1 rows", "trip T01")), line
-    assert [p.name for p in tmp_path.iterdir()] == ["log.csv"]
+    status, said = hdev("check", tmp_path / "log.csv", "--vehicle", given[2])
+    assert status == 0
+    assert f"noted 2 rows of {channel}: beyond 64, such as {unknown:g}: no such id, taken as missing" in said
+    assert f"filled 2 rows of {channel}" in said
+    start = opened("diagnose", [tmp_path / "log.csv"], given[2], None, None, None, None, None, 0)
+    assert set(np.asarray(start.problem.segments.channels[channel]).tolist()) == {1}
 
 
 def test_a_log_that_is_not_there(given, tmp_path, capsys):

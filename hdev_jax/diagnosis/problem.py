@@ -9,7 +9,6 @@ import numpy as np
 
 from hdev_jax.diagnosis.facts import GROUPS
 from hdev_jax.diagnosis.metrics import sum_weight
-from hdev_jax.errors import InputError
 from hdev_jax.inference import Fit, ParameterTable, padded, predict
 from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
 from hdev_jax.logs import Log
@@ -27,7 +26,6 @@ _FOLLOWS = {
     "motor_torque_nm": ("motor_torque_nm", "current_a"),
     "traction_force_n": ("traction_force_n", "motor_torque_nm", "current_a"),
 }
-MOST_GROUPS = 64  # ids of a gear or of a kind of surface; beyond, an id is an instrument's word for "unknown"
 UNITS = {"energy_wh": "Wh", "battery_power_kw": "kW", "motor_torque_nm": "Nm", "traction_force_n": "N"}
 
 
@@ -67,19 +65,6 @@ class Problem:
         return np.asarray(predict(vehicle, rows.segments, self.target))[: rows.rows]
 
 
-def _check_groups(log: Log) -> None:
-    """Raise `InputError` for the first id that no gear or kind of surface has: a coefficient each would be made."""
-    for group in (g for g in GROUPS if log.segments.has(g)):
-        ids = np.asarray(log.segments.channels[group], dtype=float)
-        if (odd := np.flatnonzero(ids > MOST_GROUPS)).size:
-            first = int(odd[0])
-            trip, at = log.trip_names[log.trip[first]], float(np.asarray(log.segments.time_s)[first])
-            raise InputError(
-                f"the log's {group} is {ids[first]:g} in trip {trip} at {at:g} s, and beyond {MOST_GROUPS} in "
-                f"{len(odd)} rows; leave the cell empty where the instrument does not know it"
-            )
-
-
 def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured: bool = True) -> Problem:
     """The vehicle of a sheet for this log and target, with the chain entered where the log measures it.
 
@@ -92,7 +77,6 @@ def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured:
     else:
         measured = log.target(name) if need_measured else np.zeros(len(log))
     segments = log.segments.without(*_FOLLOWS[name])
-    _check_groups(log)
     built = sheet.build(segments, choose_entry(segments, name), name, vehicle_names=log.vehicle_names)
     notes = list(built.notes)
     if derived:

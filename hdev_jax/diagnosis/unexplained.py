@@ -15,7 +15,9 @@ from hdev_jax.segments import trip_slices
 
 __all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 
-LEVEL = 1e-3  # for each of the four looks below, as far as their p hold; docs/planted.md counts false alarms by noise
+# For the flexible learner and for cycles, a tenth of it for change points and levels, as far as their p hold:
+# docs/planted.md counts false alarms by noise
+LEVEL = 1e-3
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400

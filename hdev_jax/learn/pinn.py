@@ -263,7 +263,7 @@ class Objective:
     def _likelihood(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:
         w, count = rows.weight, jnp.sum(rows.weight)
         floor, share = jnp.exp(model.noise[2]) * model.scale_wh, jnp.exp(model.noise[3])
-        loose = jnp.sqrt(floor**2 + (share * p.physics_wh) ** 2)
+        loose = jnp.sqrt(floor**2 + (share * p.physics_wh) ** 2 + jnp.asarray(rows.loose_wh) ** 2)
         error, off = rows.energy_wh - p.energy_wh, rows.energy_wh - p.physics_wh
         data = jnp.sum(w * _normal(error, p.sd_wh)) / count
         physics = jnp.sum(w * _normal(off, loose)) / count

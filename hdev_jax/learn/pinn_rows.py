@@ -58,7 +58,8 @@ class Rows(eqx.Module):
 
     `vehicle` counts the vehicles that a model was trained on; one that it was not has the number after the last.
     `weight` is 0 for a row that only fills an array; `across_wh` is energy that effects across rows add to it;
-    `loose_wh` the standard deviation of what its whole trip shares and nothing in the log tells (a mass that is off).
+    `loose_wh` what one standard deviation of something that its whole trip shares and the log does not tell (a mass
+    that is off) adds to it, with its sign.
     """
 
     features: Float[Array, "*row feature"] | Float[np.ndarray, "*row feature"]
@@ -129,7 +130,7 @@ def rows_of(
     `features`, names of `FEATURES`; `effects`, those whose channels are to be worked out by trip; `calibrated`, the
     vehicle at whose force the efficiency is read and whose energy is a feature, in the place of the declared one;
     `across_wh` [row], what effects across rows add to each row's energy, which its own channels cannot tell (none: 0);
-    `loose_wh` [row], the standard deviation of what a trip's rows share and the log does not tell (none: 0).
+    `loose_wh` [row], what one standard deviation of what a trip's rows share and the log does not tell adds (none: 0).
 
     **Raises:** `InputError` for a vehicle that is not entered at the road or lacks rolling or aero, for an effect that
     acts across rows, for an unknown feature and for a channel that a feature needs and the log lacks.

@@ -7,6 +7,8 @@ from hdev_jax.logs.ledger import Ledger
 __all__ = ["fill_forward", "fill_linear", "fill_nearest", "repair"]
 
 CIRCULAR = ("heading_rad", "wind_from_rad")  # a mean of 1° and 359° is 180°: no interpolation
+COUNTED = ("gear", "road_surface")  # ids, each of which may have a coefficient of its own
+MOST_IDS = 64  # beyond, an id is an instrument's word for "unknown" (65535), not a gear
 # A trip without any value takes the log's median only while such trips are few; beyond this share of the rows the
 # channel is left out, because then the median, not the measurement, would be what the analysis sees.
 MEDIAN_SHARE = 0.1
@@ -57,12 +59,17 @@ def repair(
 ) -> tuple[dict[str, np.ndarray], Ledger]:
     """Channels without NaN, each repair counted; a channel that is empty, or mostly a median, is left out.
 
-    Between neighbours of a trip: linear for what varies, the value before for counts and flags (whole numbers), the
-    nearest for angles on a circle. A whole trip without values takes the median of the log.
+    Ids that no gear and no kind of surface has count as missing. Between neighbours of a trip: linear for what varies,
+    the value before for counts and flags (whole numbers), the nearest for angles on a circle. A whole trip without
+    values takes the median of the log.
     """
     out: dict[str, np.ndarray] = {}
     for name, x in channels.items():
         missing = ~np.isfinite(x)
+        if name in COUNTED and (beyond := ~missing & (x > MOST_IDS)).any():
+            reason = f"beyond {MOST_IDS}, such as {x[beyond][0]:g}: no such id, taken as missing"
+            ledger = ledger.add("noted", reason, count=int(beyond.sum()), column=name)
+            missing |= beyond
         count = int(missing.sum())
         if count == 0:
             out[name] = x

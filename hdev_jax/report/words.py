@@ -236,12 +236,16 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
                 f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left."
             )
     else:
-        tried = sum(c.get("score") is not None for c in s.get("candidates", []))
+        untried = ("not tried", "declared in the sheet")
+        tried = sum(not str(c.get("why_not") or "").startswith(untried) for c in s.get("candidates", []))
         test = s["after"]["test"]
         if suspects := _suspects(data) or _too_few(s):
             text = f"\x02Not decidable on this log\x03: {suspects}; "
         elif not tried:
-            text = "\x02Nothing was tried\x03: the log shows none of the effects that were asked for; "
+            text = (
+                "\x02Nothing was tried\x03: what was asked for is declared in the sheet already, or not to be seen in "
+                "this log; "
+            )
         else:
             text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
         text += (
