@@ -558,7 +558,7 @@ def test_a_file_of_effects_that_is_none(text, words, given, tmp_path, out, capsy
     ids=["a grid made by NumPy", "a shape that is no number at its null"],
 )  # fmt: skip
 def test_effects_that_are_none_too_odd(x64, old, new, given, tmp_path):
-    """What is legal stays so: NumPy's numbers in a grid, a shape that is only ever one of its grid, single precision."""
+    """What is legal stays so: NumPy's numbers in a grid, a shape that is one of its grid alone, single precision."""
     import jax
 
     text = USER_EFFECT.replace(old, new)
