@@ -254,10 +254,9 @@ def _absorption(
     by: dict[str, str] = {}
     if not names:
         return absorbs, by
-    totals = evidence.totals()
     plainest = [c for c in candidates if c.kind == "size" and c.id in best and c.freedoms == len(c.columns) == 1]
     for c in [*(s.candidate for s in best.values() if s.left <= ABSORBED), *plainest]:
-        left, weights = min((evidence.span(totals, k) for k in c.columns), key=lambda x: x[0])
+        left, weights = min((evidence.span(k) for k in c.columns), key=lambda x: x[0])
         if left > ABSORBED or any(c.id in ids for ids in absorbs.values()):
             continue
         name = names[int(np.argmax(np.abs(weights)))]

@@ -138,29 +138,25 @@ class NormalEquations:
                 yield part, self.base + np.array([ways[i] for i in part], dtype=int)
 
     @cached_property
-    def _lefts(self) -> Float[np.ndarray, " column"]:
-        """Share of each candidate column that is left after projecting the base columns off."""
+    def _spans(self) -> tuple[Float[np.ndarray, " column"], Float[np.ndarray, "base column"]]:
+        """`span` of every candidate column."""
         gram = self.totals()[0]
         square, cross = np.diag(gram)[self.base : -1], gram[: self.base, self.base : -1]
         d = np.sqrt(np.maximum(np.diag(gram)[: self.base], 1e-300))
         there = np.isfinite(square) & np.all(np.isfinite(cross), axis=0)
         c = np.where(there, cross, 0.0) / d[:, None]
         x = np.linalg.lstsq(gram[: self.base, : self.base] / np.outer(d, d), c, rcond=1e-10)[0]
-        return 1.0 - np.sum(c * x, axis=0) / np.maximum(np.where(there, square, 1.0), 1e-300)
+        return 1.0 - np.sum(c * x, axis=0) / np.maximum(np.where(there, square, 1.0), 1e-300), x
+
+    def span(self, at: int) -> tuple[float, Float[np.ndarray, " base"]]:
+        """Share of a candidate column that is left after projecting the base columns off, and the weights of those,
+        each of which counts with its length one."""
+        share, weights = self._spans
+        return float(share[at]), weights[:, at]
 
     def left(self, at: Sequence[int]) -> float:
         """Smallest share of the candidate columns that is left after projecting the base columns off."""
-        return float(np.min(self._lefts[list(at)])) if self.base else 1.0
-
-    def span(self, gram: np.ndarray, at: int) -> tuple[float, Float[np.ndarray, " base"]]:
-        """Share of a column that is left after projecting the base columns off, and the weights of those, each of
-        which counts with its length one."""
-        gram, j = gram[0], self.base + at
-        a = gram[: self.base, : self.base]
-        d = np.sqrt(np.maximum(np.diag(a), 1e-300))
-        c = gram[: self.base, j] / d
-        x = np.linalg.lstsq(a / np.outer(d, d), c, rcond=1e-10)[0]
-        return 1.0 - float(c @ x) / max(gram[j, j], 1e-300), x
+        return float(np.min(self._spans[0][list(at)])) if self.base else 1.0
 
     def projected(self, at: Int[np.ndarray, " k"]) -> Float[np.ndarray, "left left"]:
         """Gram matrix of columns with the base columns taken off, as far as their prior lets those move.

@@ -96,7 +96,7 @@ def remainder(
     white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
     period = _period(train, noise)
     change = _change_point(white, train.trip)
-    level = _levels(train)
+    offset = _levels(train, train.residual)  # about 0: what all trips share counts too, and is told apart below
     parts, depends, sizes = [], [], [0.0]
     if p_learner < LEVEL and share_train > LEAST_SHARE:
         sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
@@ -116,7 +116,11 @@ def remainder(
         depends.append("time_s")
         minutes = float(np.sum(train.duration_s[before]) / 60.0)
         parts.append(f"a change inside trip {trip_names[where]} after {minutes:.0f} min")
-    if level is not None:
+    mean = float(np.mean(train.residual))
+    if offset is not None and (level := _levels(train, train.residual - mean)) is None:
+        sizes.append(abs(mean))
+        parts.append(f"an offset of about {mean:+.2g} {unit} that all trips share")
+    elif offset is not None:
         where, size, sd = level
         sizes.append(sd)
         depends.append("trip_id")
@@ -276,24 +280,23 @@ def _shift(residual: np.ndarray, before: np.ndarray, after: np.ndarray) -> float
     return abs(step) * float(np.sqrt(n * m / (n + m) / len(residual)))
 
 
-def _levels(rows: Rows) -> tuple[int, float, float] | None:
+def _levels(rows: Rows, residual: np.ndarray) -> tuple[int, float, float] | None:
     """Trips of a level of their own, if coloured noise could not have made it: (worst, its level, sd of levels).
 
-    Levels are about what all rows have in common, which is no difference between trips. The likelihood ratio of the
-    noise with random levels against the noise without, each with an order of its own; half a χ², since a variance at
-    its bound is no two-sided question (Self and Liang 1987).
+    Levels are about 0: of a residual that has a mean, it is among them. The likelihood ratio of the noise with random
+    levels against the noise without, each with an order of its own; half a χ², since a variance at its bound is no
+    two-sided question (Self and Liang 1987).
     """
     long = {t: s for t, s in trip_slices(rows.trip) if s.stop - s.start >= 8}  # fewer rows have no level
     if len(long) < 4:
         return None
-    about = rows.residual - np.mean(rows.residual)
-    plain, noise = (estimate_noise(about, rows.trip, rows.duration_s, levels=x) for x in (False, True))
+    plain, noise = (estimate_noise(residual, rows.trip, rows.duration_s, levels=x) for x in (False, True))
     gain = noise.log_likelihood - plain.log_likelihood
     if 0.5 * stats.chi2.sf(2.0 * max(gain, 0.0), 1) > LEVEL / 10:
         return None
     # the share is one of a grid that holds the least itself: rounding must not decide
-    if noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(about**2):
+    if noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(residual**2):
         return None
-    means = {t: float(np.mean(about[s])) for t, s in long.items()}
+    means = {t: float(np.mean(residual[s])) for t, s in long.items()}
     worst = max(means, key=lambda t: abs(means[t]))
     return worst, means[worst], noise.level_sd

@@ -76,14 +76,22 @@ def test_noise_has_no_cycle(rho, trips):
 def test_slow_noise_has_no_levels_of_trips(rho, trips):
     rng = np.random.default_rng(5)
     logs = [residual(rng, trips, 250, rho=rho) for _ in range(20)]
-    assert all(_levels(rows) is None for rows in logs)
+    assert all(_levels(rows, rows.residual) is None for rows in logs)
 
 
-@pytest.mark.parametrize("trips", [9, 24])
-def test_an_offset_of_all_trips_is_no_level_of_each(trips):
+@pytest.mark.parametrize("levels", [0.0, 2.0])
+def test_an_offset_of_all_trips_is_no_level_of_each(levels):
+    """Both are left unexplained, and each is called what it is."""
     rng = np.random.default_rng(6)
-    plain = [residual(rng, trips, 250, rho=0.9) for _ in range(10)]
-    assert all(_levels(rows_of(rows.residual + 5.0, rows.clusters)) is None for rows in plain)
+    trips = [f"T{k}" for k in range(24)]
+    rows = residual(rng, 24, 250, rho=0.9)
+    other = np.repeat(rng.normal(0.0, levels, 24), 250)
+    left = remainder(rows_of(rows.residual + 5.0 + other, rows.clusters), rows, ["x"], "Wh", trips, seed=0)
+    assert left.significant
+    assert ("an offset of about +" in left.signature) == (levels == 0.0)
+    assert ("levels that differ by trip" in left.signature) == (levels > 0.0)
+    assert ("trip_id" in left.depends_on) == (levels > 0.0)
+    assert left.rms == pytest.approx(5.0 if levels == 0.0 else np.std(other), rel=0.3)
 
 
 def test_a_change_in_a_trip_has_a_size():
@@ -104,7 +112,7 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     level = np.repeat(rng.normal(0, 2.0, 8), 200)
     trip, values = np.r_[rows.trip, 8, 8, 8], np.r_[rows.residual + level, 0.1, 0.0, -0.1]
     short = rows_of(values, Clusters(trip, 9, "trip"))
-    found = _levels(short)
+    found = _levels(short, short.residual)
     assert found is not None
     assert found[2] == pytest.approx(np.std(level), rel=0.3)
 
