@@ -9,6 +9,7 @@ made from all runs that are kept in DIR; with --kept nothing is run. HDEV_DATA n
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -21,6 +22,9 @@ import numpy as np
 import real_page
 from real_withheld import WITHHELD, compare_logs, write_adapter
 
+import hdev_jax
+from experiments.store import sources_of
+from hdev_jax.opening import digest
 from hdev_jax.prediction import told_together
 
 __all__ = ["Job", "jobs", "kept", "main"]
@@ -31,6 +35,7 @@ TRIPS = ("1", "2", "3", "4")
 FOLDS = (1, 2, 3)
 # Which channel is withheld in which fold. The warmth of the passengers is small: the fold decides whether it is found.
 HELD = (("temperature", 1), ("passengers", 1), ("passengers", 3), ("steering", 1))
+CODE = tuple(Path(hdev_jax.__file__).parent / p for p in ("diagnosis/diagnose.py", "diagnosis/stages.py", "opening.py"))
 ZTBUS = Path("configs/adapters/ztbus.toml")
 
 
@@ -54,6 +59,12 @@ class Job:
             *(["--target", self.target] if self.target else []),
             *(word for option, trips in split if trips for word in (option, ",".join(trips))),
         ]  # fmt: skip
+
+    @property
+    def made_of(self) -> str:
+        """Fingerprint of the code that a diagnosis is computed by, of the sheet and of the adapter."""
+        files = (Path(self.vehicle), self.adapter)
+        return "-".join([sources_of(*CODE), *(digest(p)[:16] for p in files)])
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -86,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     if absent := [j.name for part in PARTS for j in everything[part] if j.name not in results]:
         print(f"not on the page, for it was not run: {', '.join(absent)}", file=sys.stderr)
     warm = _temperatures(everything["ztbus"][0], options.work)
-    rest = _json(options.work / "same_rest.json")
+    rest = _json(options.work / "same_rest.json").get("rest", {})
     page, figures = real_page.page(results, warm=warm, rest=rest)
     print(page)
     if options.write:
@@ -121,10 +132,11 @@ def _adapter(what: str, work: Path) -> Path:
 
 
 def kept(job: Job, work: Path) -> dict[str, Any] | None:
-    """A finished run, its cost and configuration with it; None where there is none. Another run's folder ends it."""
+    """A finished run, its cost and configuration with it; None where there is none, or one by another code, sheet or
+    adapter. A folder of a run that was asked for otherwise ends it."""
     out = work / job.name
-    result = _json(out / "diagnosis.json")
-    if not result:
+    result, cost = _json(out / "diagnosis.json"), _json(work / f"{job.name}.cost.json")
+    if not result or cost.get("made_of") != job.made_of:
         return None
     ran = tomllib.loads((out / "config.toml").read_text(encoding="utf-8"))
     asked: dict[str, Any] = {"vehicle": job.vehicle, "adapter": job.adapter.name}
@@ -139,13 +151,17 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     if covariance is None:
         raise SystemExit(f"{out} lacks predictive.json: remove the folder, and the run is made again")
     together = told_together(covariance["names"], np.array(covariance["matrix"]))
-    return {**result, "cost": _json(work / f"{job.name}.cost.json"), "ran": ran, "together": together}
+    return {**result, "cost": cost, "ran": ran, "together": together}
 
 
 def _run(job: Job, work: Path, place: str) -> None:
     """One diagnosis; its wall-clock seconds and peak memory are kept beside it."""
-    out = work / job.name
-    out.parent.mkdir(parents=True, exist_ok=True)
+    out, begun = work / job.name, work / f"{job.name}.begun"
+    if not begun.exists() or begun.read_text(encoding="utf-8") != job.made_of:  # what there is, is of something else
+        for old in (out, out.with_name(f"{job.name}.partial")):
+            shutil.rmtree(old, ignore_errors=True)
+    begun.parent.mkdir(parents=True, exist_ok=True)
+    begun.write_text(job.made_of, encoding="utf-8")
     print(f"{time.strftime('%H:%M:%S')}  {place}: {job.name} …", file=sys.stderr, flush=True)
     started = time.monotonic()
     command = [sys.executable, "-m", "hdev_jax.cli", "diagnose", *job.arguments, "--out", str(out)]
@@ -154,7 +170,7 @@ def _run(job: Job, work: Path, place: str) -> None:
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{job.name}: hdev diagnose ended with status {process.returncode}")
-    cost = {"seconds": time.monotonic() - started, "peak_gib": usage.ru_maxrss / 2**20}
+    cost = {"made_of": job.made_of, "seconds": time.monotonic() - started, "peak_gib": usage.ru_maxrss / 2**20}
     (work / f"{job.name}.cost.json").write_text(json.dumps(cost), encoding="utf-8")
     seconds, gib = cost["seconds"], cost["peak_gib"]
     print(f"{time.strftime('%H:%M:%S')}  {job.name}: {seconds:.0f} s, {gib:.1f} GiB", file=sys.stderr, flush=True)
@@ -163,10 +179,11 @@ def _run(job: Job, work: Path, place: str) -> None:
 def _same_rest(withheld: list[Job], work: Path) -> None:
     """Read the log with and without each channel, and keep what differs. Once: it takes about a minute."""
     path = work / "same_rest.json"
-    if not path.exists():
+    made_of = sorted({j.made_of for j in withheld})
+    if _json(path).get("made_of") != made_of:
         print(f"{time.strftime('%H:%M:%S')}  comparing the logs with and without …", file=sys.stderr, flush=True)
         rest = {what: compare_logs(withheld[0].logs, ZTBUS, _adapter(what, work)) for what in WITHHELD}
-        path.write_text(json.dumps(rest, indent=1), encoding="utf-8")
+        path.write_text(json.dumps({"made_of": made_of, "rest": rest}, indent=1), encoding="utf-8")
 
 
 def _temperatures(job: Job, work: Path) -> dict[str, float]:

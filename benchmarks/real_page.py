@@ -104,9 +104,12 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             if len(by_trip) > 1:
                 low, high = pooled_interval(by_trip)
                 within = f" (90 %: {low:.2f} to {high:.2f}, from how {len(by_trip)} test trips differ)"
+            found = (
+                f"Every one of them finds {named(always)}." if always else "There is no effect that all of them find."
+            )
             out.append(
-                f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. Every one of "
-                f"them finds {named(always)}. In {open_} of {len(runs)} the loop says that something more is missing."
+                f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. {found} "
+                f"In {open_} of {len(runs)} the loop says that something more is missing."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)
@@ -182,7 +185,7 @@ def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
     lines += _picture("niro_errors.png", "Kia Niro: test error before and after, by trip")
     lines += ["### Stability over training trips", "", *_reading(runs), "", *found_table(runs, "trip"), ""]
     lines += [*size_table(runs, "trip"), ""]
-    lines += _agreement(runs, "The four training sets share no row.")
+    lines += _agreement(runs, f"No two of the {len(runs)} training sets share a row.")
     lines += _picture("niro_sizes.png", "Kia Niro: sizes by training trip with 90 % bars")
     lines += ["### What stays unexplained", "", *left_table(runs, "trained on trip", "kW"), *_left_notes(runs)]
     blocks = {
@@ -227,7 +230,7 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     before = {n: m for r in runs.values() for n, m in r["before"]["test_by_trip"].items()}
     lines = ["## ZTBus: electric power from traction force and speed", ""]
     lines += [
-        "A trolleybus in Zurich; the sheet declares two efficiencies. Every third mission is held out, three times.",
+        "A trolleybus in Zurich; the sheet declares two efficiencies. Each fold holds every third mission out.",
         "",
     ]
     rows = [

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from hdev_jax.diagnosis.summary import SUSPICIOUS
 from hdev_jax.report import names, words
 
 __all__ = [
@@ -28,7 +29,6 @@ __all__ = [
 ]
 
 Runs = Mapping[str, Mapping[str, Any]]  # diagnosis.json by the name of its training set
-NEAR = 8.0  # gain in log-likelihood worth a word: odds of 3,000 to 1 before any correction
 IMPOSSIBLE = ("its best size has the wrong sign", "absorbed", "does nothing")
 
 
@@ -165,7 +165,7 @@ def nearest(result: Mapping[str, Any]) -> str:
     found = set(found_ids(result))
     able = [
         c for c in result["candidates"]
-        if c["id"] not in found and (c["score"] or 0.0) > NEAR and not c["why_not"].startswith(IMPOSSIBLE)
+        if c["id"] not in found and (c["score"] or 0.0) > SUSPICIOUS and not c["why_not"].startswith(IMPOSSIBLE)
     ]  # fmt: skip
     best = max(able, key=lambda c: c["score"], default=None)
     return "–" if best is None else f"`{best['id']}` (score {words.number(best['score'])}): {best['why_not']}"

@@ -65,7 +65,8 @@ def _same(without: Result, full: Result, rest: Mapping[str, Any]) -> str:
     ran, held = full.get("ran") or {}, without.get("ran") or {}
     kept = {"vehicle_sha256": "sheet", "split": "split", "seed": "seed", "fdr": "level of false discoveries"}
     a, b = ({**r, "split": d["split"]} for r, d in ((ran, full), (held, without)))
-    differs = [words_ for key, words_ in kept.items() if a.get(key) != b.get(key)]
+    kept = {key: words_ for key, words_ in kept.items() if key in a and key in b}
+    differs = [words_ for key, words_ in kept.items() if a[key] != b[key]]
     text = f"**Not the same in both: {', '.join(differs)}.**" if differs else f"The same: {', '.join(kept.values())}."
     if rest:
         gone = ", ".join(f"`{c}`" for c in rest["gone"])

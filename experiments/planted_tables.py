@@ -188,8 +188,9 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         (least, hits, count)
         for least, hits, count in ((case.wanted, as_asked, n), (case.wanted_alone, sum(alone_apart), len(apart)),
                                    (case.wanted_unexplained, unexplained, n))
-        if least is not None and count
+        if least is not None
     ]  # fmt: skip
+    decided = case.wanted is not None
     pairs = [s for _, r in group for s in r["sizes"]] if case.asked == "named" else []
     z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
     after = np.array([r["test_rmse"]["after"] for _, r in group])
@@ -204,8 +205,8 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "interval_95": list(wilson(as_asked, n)),
         "wanted": case.wanted,
         "asked": case.asked.replace("_", " ") if case.asked != "named" else None,
-        "met": all(k / m >= least for least, k, m in wanted) if case.wanted is not None else None,
-        "met_by_interval": all(wilson(k, m)[0] >= least for least, k, m in wanted) if case.wanted is not None else None,
+        "met": all(m and k / m >= least for least, k, m in wanted) if decided else None,
+        "met_by_interval": all(m and wilson(k, m)[0] >= least for least, k, m in wanted) if decided else None,
         "named_exactly": len(hits) / n if named else None,
         "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,

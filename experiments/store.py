@@ -14,7 +14,7 @@ import hdev_jax
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import atomic_file
 
-__all__ = ["experiment", "experiments_here", "keep", "place", "read", "sources"]
+__all__ = ["experiment", "experiments_here", "keep", "place", "read", "sources", "sources_of"]
 
 HERE = Path(__file__).parent
 PARTS = ("SOURCES", "Config", "tasks", "run", "collect")  # what an experiment is made of
@@ -80,6 +80,11 @@ def sources(module: ModuleType, *, collect: bool = False) -> str:
     """
     itself = Path(str(module.__file__))
     return _digest((itself, *(itself.parent / name for name in module.SOURCES)), collect)
+
+
+def sources_of(*files: Path) -> str:
+    """Fingerprint of files and of every file of the package that these import, without comments and docstrings."""
+    return _digest(files, False)
 
 
 @cache

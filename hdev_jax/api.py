@@ -49,8 +49,11 @@ def diagnose(
     `diagnosis.json`, `report.html`, `augmented_vehicle.toml`, figures. Raises `InputError` for what the user can mend.
     """
     started = time.time()
-    candidates = chosen_effects(effects, only, exclude)
-    start = opened("diagnose", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed)
+    known = known_effects(effects)
+    candidates = chosen_effects(known, only, exclude)
+    start = opened(
+        "diagnose", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known, *candidates
+    )
     problem, split = start.problem, start.split
     config = {
         **start.config,
@@ -65,6 +68,8 @@ def diagnose(
         result = run_loop(problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
         add_stages(result, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
         progress.step("writing the report")
+        why = {k: "--exclude" if k in (exclude or ()) else "not in --only" for k in known if k not in candidates}
+        result.summary["excluded"] += [{"id": k, "why": w} for k, w in why.items() if not problem.vehicle.has(k)]
         sheet = run.path("augmented_vehicle.toml")
         sheet.write_text(_augmented(result, start.sheet))
         result.summary["notes"] += write_predictive(run, sheet, problem, split, result.fit, "normal")

@@ -11,6 +11,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -29,7 +30,7 @@ from hdev_jax.physics.effect import KINDS, STAGES
 from hdev_jax.physics.library import DECLARED
 from hdev_jax.rundir import Run
 
-__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "known_effects", "opened", "tried"]
+__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "digest", "known_effects", "opened", "tried"]
 
 Paths = Sequence[str | Path]
 HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
@@ -102,12 +103,16 @@ def _malformed_parameters(effect: type[Effect], parameters: Sequence[Parameter])
             return f"parameter {p.name!r}: of is {p.of!r}; one of {', '.join(names)} is expected"
     if all(p.kind in FIXED for p in parameters):
         return "parameters holds no size and no limit, so nothing of it could be found"
+    if not (isinstance(effect.variants, tuple | list) and all(map(_texts, effect.variants))):
+        return f"variants is {effect.variants!r}; a tuple of tuples of names is expected"
     if odd := [n for variant in effect.variants for n in variant if n not in names]:
         return f"variants has {odd[0]!r}; sets of {', '.join(names)} are expected"
     try:
-        at_null(effect)
+        made = at_null(effect)
     except Exception as e:
         return f"cannot be made with its parameters ({', '.join(names)}): {type(e).__name__}: {e}"
+    if odd := [x for x in jax.tree.leaves(made) if not eqx.is_array_like(x)]:
+        return f"has a field that holds {odd[0]!r}, no number; make it a ClassVar or equinox.field(static=True)"
     return None
 
 
@@ -137,13 +142,14 @@ def _malformed_parameter(p: Parameter) -> str | None:
     return None
 
 
-def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None) -> None:
-    """Work out the columns of a user's own effects on every row of the log, before anything is fitted.
+def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None, *candidates: str) -> None:
+    """Work out the columns of a user's own effects on every row of the log, before anything is fitted: of those that
+    are `candidates` or that the vehicle has.
 
     Raises `InputError` that names the class, for one that fails there, does not give a number in every row, or changes
     the prediction while all of its sizes are null.
     """
-    own = [c for k, c in known.items() if k not in LIBRARY]
+    own = [c for k, c in known.items() if k not in LIBRARY and (k in candidates or problem.vehicle.has(k))]
     if not own:
         return
     car = problem.vehicle.minus(*(c.id for c in own if problem.vehicle.has(c.id)))
@@ -183,9 +189,9 @@ def _idle(effect: type[Effect], gears: int) -> Effect:
 
 
 def chosen_effects(
-    file: str | Path | None, only: Sequence[str] | None, exclude: Sequence[str] | None
+    known: Mapping[str, type[Effect]], only: Sequence[str] | None, exclude: Sequence[str] | None
 ) -> dict[str, type[Effect]]:
-    known = known_effects(file)
+    """Those of the known effects that are tried. Raises `InputError` for a name that none has, or if none is left."""
     for name in (*(only or ()), *(exclude or ())):
         if name not in known:
             near = difflib.get_close_matches(name, list(known), 1)
@@ -226,15 +232,19 @@ def opened(
     test_trips: Sequence[str] | None,
     effects: str | Path | None,
     seed: int,
+    known: Mapping[str, type[Effect]],
+    *candidates: str,
 ) -> Opening:
-    """Read the logs and the sheet, bring them together and split the trips. Raises `InputError`."""
-    known = known_effects(effects)
+    """Read the logs and the sheet, bring them together and split the trips. Raises `InputError`.
+
+    **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried.
+    """
     sheet = read_sheet(vehicle, library=known)
     with progress.busy("reading the logs"):
         log = read_log(list(logs), adapter)
         split = split_trips(log, train_trips, test_trips)
         problem = prepare(split.log, sheet, target)
-    tried(problem, known, effects)
+    tried(problem, known, effects, *candidates)
     config = {
         "verb": verb,
         "logs": [str(p) for p in logs],

@@ -17,7 +17,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import cluster_rows, padded
 from hdev_jax.inference.methods import METHODS, Outcome, calibrated
 from hdev_jax.inference.sheet_text import augmented_sheet
-from hdev_jax.opening import Paths, command_line, opened
+from hdev_jax.opening import Paths, command_line, known_effects, opened
 from hdev_jax.prediction import write_predictive
 from hdev_jax.report.build import report_data
 from hdev_jax.report.page import write_calibration_report
@@ -53,7 +53,9 @@ def calibrate(
     if noise not in ("normal", "student_t"):
         raise InputError(f"--noise {noise!r}: accepted are normal, student_t")
     started = time.time()
-    start = opened("calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed)
+    start = opened(
+        "calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known_effects(effects)
+    )
     problem, split = start.problem, start.split
     if not problem.table.free:
         raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")

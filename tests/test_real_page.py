@@ -52,6 +52,7 @@ def result(effects: list[dict], rmse: float = 9.0, turned_down=(), left: str | N
         "verdict": "effects_found" if left is None else "effects_found_and_unexplained_structure",
         "subsets": {"standing still": {"before": block(5.0)["test"], "after": block(4.0)["test"]}},
         "cost": {"seconds": 60.0, "peak_gib": 1.0}, "together": [],
+        "ran": {"vehicle_sha256": "ab", "seed": 0, "fdr": 0.05},
     }  # fmt: skip
 
 
@@ -196,6 +197,24 @@ def test_a_channel_that_nothing_reads_is_a_control(results):
     assert "place of" not in text
 
 
+def test_what_two_runs_do_not_have_in_common_is_said(results):
+    import real_page
+
+    results["ztbus_1_no_steering"]["ran"]["seed"] = 7
+    text, _ = real_page.page(results, warm={}, rest={})
+    assert text.count("**Not the same in both: seed.**") == 1
+    del results["ztbus_1_no_temperature"]["ran"]["fdr"]  # what a run does not say, it does not share
+    assert "The same: sheet, split, seed.\n" in real_page.page(results, warm={}, rest={})[0]
+
+
+def test_runs_that_find_nothing_in_common(results):
+    import real_page
+
+    results["niro_2"]["effects"] = []
+    text, _ = real_page.page(results, warm={}, rest={})
+    assert "There is no effect that all of them find." in text
+
+
 ADAPTER = {
     "format": "csv",
     "others": "drop",
@@ -265,6 +284,7 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
 
     monkeypatch.setattr(real_logs, "DATA", tmp_path / "none")
     work, docs = tmp_path / "work", tmp_path / "docs"
+    jobs = real_logs.jobs(work)["niro"]
     for name in ("niro_1", "niro_2"):
         (work / name).mkdir(parents=True)
         (work / name / "diagnosis.json").write_text(json.dumps(results[name]))
@@ -274,12 +294,17 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
         }  # fmt: skip
         (work / name / "config.toml").write_text(tomli_w.dumps(config))
         covariance = {"names": ["iron", "offset"], "matrix": [[1.0, -0.99], [-0.99, 1.0]]}
+        cost = {"made_of": next(j for j in jobs if j.name == name).made_of, "seconds": 1.0, "peak_gib": 1.0}
+        (work / f"{name}.cost.json").write_text(json.dumps(cost))
         (work / name / "predictive.json").write_text(json.dumps({"covariance": covariance}))
     assert real_logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
     page = (docs / "real_logs.md").read_text()
     assert "trained on trip" in page
     assert "- 2: iron and offset are known together far better than one by one (correlation -0.99)" in page
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
-    (work / "niro_2").rename(work / "niro_3")
+    for end in ("", ".cost.json"):
+        (work / f"niro_2{end}").rename(work / f"niro_3{end}")
     with pytest.raises(SystemExit, match="holds another run"):
         real_logs.main(["--work", str(work), "--kept"])
+    monkeypatch.setattr(real_logs, "sources_of", lambda *_: "mended")  # runs of other code are none
+    assert all(real_logs.kept(job, work) is None for job in jobs)

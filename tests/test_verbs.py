@@ -16,7 +16,8 @@ import pytest
 
 from hdev_jax import cli
 from hdev_jax.fleet import SyntheticLog, synthetic_log
-from hdev_jax.opening import opened
+from hdev_jax.opening import known_effects, opened
+from hdev_jax.physics import LIBRARY
 from hdev_jax.prediction import told_together
 from hdev_jax.rundir import Run
 
@@ -343,6 +344,19 @@ def test_an_effect_of_ones_own(files, given, tmp_path, out):
     drift = found["slow_drift"]["parameters"]["w_per_s"]
     assert abs(drift["value"] - 60.0) < 4 * drift["sd"]
     assert drift["unit"] == "W/s"
+    excluded = {e["id"]: e["why"] for e in read(out)["excluded"]}
+    assert set(excluded) == set(LIBRARY) - {"headwind", "auxiliary_power"}
+    assert set(excluded.values()) == {"not in --only"}
+    assert "Effects that this run left out" in (out / "report.html").read_text()
+
+
+def test_an_effect_that_fails_can_be_left_out(given, tmp_path, out):
+    """It is only worked out where it is asked for."""
+    effect = tmp_path / "mine.py"
+    effect.write_text(USER_EFFECT.replace("row.time_s", "(1, 2)"))
+    argv = ["--effects", effect, "--only", "headwind,auxiliary_power", "--out", out]
+    assert hdev("diagnose", *given, *argv)[0] == 0
+    assert {"id": "slow_drift", "why": "not in --only"} in read(out)["excluded"]
 
 
 # --- calibrate -------------------------------------------------------------------------------------------------------
@@ -510,6 +524,11 @@ def test_effects_that_do_not_exist(options, words, given, out, capsys):
         (USER_EFFECT.replace("0.0, 100.0)", "0.0, 100.0, grid=5.0)"), ["'w_per_s'", "grid", "5.0"]),
         (USER_EFFECT.replace("0.0, 100.0)", "0.0, 100.0, grid=None)"), ["'w_per_s'", "grid", "None"]),
         (USER_EFFECT.replace('"w_per_s", "W/s"', '7, "W/s"'), ["name", "7"]),
+        (USER_EFFECT.replace("    equation", "    variants: ClassVar = 3\n    equation"), ["variants", "3"]),
+        (
+            USER_EFFECT.replace("    w_per_s: Any\n", '    w_per_s: Any\n    mode: str = "v2"\n'),
+            ["'v2'", "static=True"],
+        ),
         (USER_EFFECT.replace("def power", "def pover"), ["SlowDrift", "no hook"]),
         (
             USER_EFFECT.replace("    equation", '    entries: ClassVar = ("raod",)\n    equation'),
@@ -569,7 +588,9 @@ def test_effects_that_are_none_too_odd(x64, old, new, given, tmp_path):
     effect = tmp_path / "mine.py"
     effect.write_text("import numpy as np\n" + text)
     with jax.enable_x64(x64):
-        start = opened("diagnose", [given[0]], given[2], None, None, None, None, effect, 0)
+        start = opened(
+            "diagnose", [given[0]], given[2], None, None, None, None, effect, 0, known_effects(effect), "slow_drift"
+        )
     assert "slow_drift" in start.sheet.library
 
 
@@ -578,7 +599,9 @@ def test_an_effect_whose_channel_is_not_logged_is_left_out(given, tmp_path):
     reads = USER_EFFECT.replace("row.time_s", 'row.channels["oil_temp_c"]')
     effect = tmp_path / "mine.py"
     effect.write_text(reads.replace("    equation", '    needs: ClassVar = ("oil_temp_c",)\n    equation'))
-    start = opened("diagnose", [given[0]], given[2], None, None, None, None, effect, 0)
+    start = opened(
+        "diagnose", [given[0]], given[2], None, None, None, None, effect, 0, known_effects(effect), "slow_drift"
+    )
     assert "slow_drift" in start.sheet.library
 
 
@@ -631,7 +654,7 @@ def test_an_id_that_no_gear_has_is_missing(channel, unknown, given, files, tmp_p
     assert status == 0
     assert f"noted 2 rows of {channel}: beyond 64, such as {unknown:g}: no such id, taken as missing" in said
     assert f"filled 2 rows of {channel}" in said
-    start = opened("diagnose", [tmp_path / "log.csv"], given[2], None, None, None, None, None, 0)
+    start = opened("diagnose", [tmp_path / "log.csv"], given[2], None, None, None, None, None, 0, known_effects(None))
     assert set(np.asarray(start.problem.segments.channels[channel]).tolist()) == {1}
 
 

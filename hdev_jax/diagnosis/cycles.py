@@ -103,7 +103,7 @@ def add_cycle(problem: Loop, state: Search) -> tuple[Search | None, Verdict | No
     if gain < COST * freedoms or share < LEAST_SHARE:
         return None, Verdict(ID, gain, q, f"a cycle of {wave.period_s:.0f} s that explains too little for its numbers")
     again = _profile(rows, wave)
-    left_out, stability = again.left_out_gain(), again.stability(COST * freedoms)
+    left_out, stability = again.left_out_gain(), again.stability(COST * freedoms, problem.rng.spawn(1)[0])
     if left_out <= LEFT_OUT:
         return None, Verdict(ID, gain, q, f"a cycle of {wave.period_s:.0f} s that trips left out do not bear out")
     if stability < STABLE:
@@ -255,9 +255,9 @@ class _Profile:
             total += float(special.logsumexp(each) + np.log(self.step))
         return total
 
-    def stability(self, cost: float) -> float:
+    def stability(self, cost: float, rng: np.random.Generator) -> float:
         """Share of resampled sets of trips in which a cycle is chosen again: of one size, and worth its numbers."""
-        rng, trips, hits = np.random.default_rng(0), self.cross.shape[1], 0
+        trips, hits = self.cross.shape[1], 0
         for _ in range(RESAMPLES):
             weight = np.bincount(rng.integers(0, trips, trips), minlength=trips).astype(float)
             k, gain, _ = self._chosen(weight)

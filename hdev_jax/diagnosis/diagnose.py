@@ -68,8 +68,10 @@ def diagnose(
         plain = checkpoint(f"step-{step}", lambda: to_plain(compute()))
         return from_plain(plain, problem.vehicle, library, gears)
 
-    if problem.target in ("traction_force_n", "motor_torque_nm"):  # a power sensor's fault is none of theirs
+    excluded = []
+    if problem.target in ("traction_force_n", "motor_torque_nm") and "power_gain" in library:
         library = {k: c for k, c in library.items() if k != "power_gain"}
+        excluded = [{"id": "power_gain", "why": "a power sensor's fault is none of a force's or a torque's"}]
     effects = list(library.values())
     state = search(
         problem.vehicle, problem.table, rows, problem.target, effects,
@@ -80,7 +82,7 @@ def diagnose(
     state, steps, predicted, left = told_apart(problem, split, state, loop, seed=seed, tell=tell, checkpoint=checkpoint)
     base = steps[0]
     leeway = {f.id: left_open(loop, state, f.score) for f in state.found}
-    summary = summarise(problem, split, state, steps, predicted, left, leeway)
+    summary = summarise(problem, split, state, steps, predicted, left, leeway) | {"excluded": excluded}
     rivals = [(f.id, library[t]) for f in state.found for t in f.twins if t in library]
     if rivals:
         tell("what to measure next: drives that would tell the rest apart")

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate, Source, plan_of
 from hdev_jax.diagnosis.chunks import CHUNK_ROWS, Shapes, chunks_of_fit
@@ -11,7 +12,7 @@ from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.facts import Facts, facts_of
 from hdev_jax.diagnosis.ranking import LEFT_OUT, best_of, plausible
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import adjusted, clusters_needed, clusters_to_tell, least_clusters, ruled_out
+from hdev_jax.diagnosis.significance import clusters_needed, clusters_to_tell, least_clusters, ruled_out
 from hdev_jax.diagnosis.sums import Ground, both_looks
 from hdev_jax.diagnosis.whiten import Noise, estimate_noise
 from hdev_jax.inference import Calibration, Clusters, Fit, ParameterTable
@@ -160,7 +161,7 @@ class View:
 
     def _correct(self) -> None:
         every = [1.0 if k in self.absorbed_by else min(1.0, s.p * self.ways[k]) for k, s in self.best.items()]
-        self.q = dict(zip(self.best, adjusted(every), strict=True))
+        self.q = dict(zip(self.best, map(float, stats.false_discovery_control(every)), strict=True))
 
     def counted(self, id_: str, ways: float) -> None:
         """Count so many times the ways in which an effect was tried, and correct every p anew."""
@@ -173,7 +174,7 @@ class View:
         for id_, s in sorted(self.best.items(), key=lambda kv: -kv[1].gain):
             if state.vehicle.has(id_):
                 continue
-            why = self.reasons.get(id_) or _why_not(s, self.q[id_], self.absorbed_by.get(id_), self.evidence.count)
+            why = self.reasons.get(id_) or _why_not(s, self.q[id_], fdr, self.absorbed_by.get(id_), self.evidence.count)
             by_rows = not s.plain and bool(s.p_model <= self.level(id_, fdr))
             needed, between = self._needed(s, fdr), self.between(s.candidate)
             out.append(Verdict(id_, float(s.gain), float(self.q[id_]), why, needed, between, by_rows))
@@ -206,7 +207,7 @@ class View:
         return needed if needed is not None and needed > count else None
 
 
-def _why_not(s: Score, q: float, absorbed_by: str | None, clusters: int) -> str:
+def _why_not(s: Score, q: float, fdr: float, absorbed_by: str | None, clusters: int) -> str:
     if absorbed_by:
         return f"absorbed: this log cannot tell it from {absorbed_by}"
     if clusters < (least := least_clusters(len(s.beta))):
@@ -215,9 +216,9 @@ def _why_not(s: Score, q: float, absorbed_by: str | None, clusters: int) -> str:
         return "its best size has the wrong sign or is out of range"
     if s.left_out_gain <= LEFT_OUT:
         return "does not lower the error on trips left out of the fit"
-    if s.p_cluster > s.p_model and q > 0.05:
+    if s.p_cluster > s.p_model and q > fdr:
         return f"too few trips or stretches of time bear it out (q = {q:.2g} with errors clustered)"
-    if q > 0.05:
+    if q > fdr:
         return f"not significant over the whole library (q = {q:.2g})"
     return "explains less than what was chosen, or too little for the numbers it fits"
 

@@ -79,7 +79,7 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     if new is None or before - float(np.mean((problem.measured - new.fit.predicted) ** 2)) < LEAST_SHARE * before:
         return None, Verdict(ID, gain, q, "in the joint refit it is out of range or not told from nothing")
     # told, not asked for: two trips of eight are both in a resampled set in four of ten
-    stability = _stability(every, *prior, level)
+    stability = _stability(every, *prior, level, problem.rng.spawn(1)[0])
     found = Found(ID, score, q, stability, (), gain)
     return replace(new, found=[*state.found, found]), None
 
@@ -190,9 +190,9 @@ def _left_out(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarr
     return gain, float(wald(fitted(np.ones(n))[1][-1:], np.array(sizes)))
 
 
-def _stability(every: Every, precision: np.ndarray, pull: np.ndarray, level: float) -> float:
+def _stability(every: Every, precision: np.ndarray, pull: np.ndarray, level: float, rng: np.random.Generator) -> float:
     """Share of resampled sets of trips that fall into two modes again, whichever trips they are then."""
-    rng, n = np.random.default_rng(0), every.shape[1]
+    n = every.shape[1]
     draws, hits = int(np.clip(MOST_SPLITS // n, 10, RESAMPLES)), 0
     for _ in range(draws):
         drawn = np.sort(rng.integers(0, n, n))

@@ -134,7 +134,7 @@ class NormalEquations:
         count = np.array([len(w) for w in ways], dtype=int)
         for k in np.unique(count):
             places, size = np.flatnonzero(count == k), cells * (self.base + int(k) + 1) ** 2
-            for part in np.array_split(places, -(-len(places) * size // AT_ONCE)):
+            for part in np.array_split(places, min(len(places), -(-len(places) * size // AT_ONCE))):
                 yield part, self.base + np.array([ways[i] for i in part], dtype=int)
 
     @cached_property

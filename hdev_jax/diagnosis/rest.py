@@ -28,6 +28,7 @@ __all__ = ["told_apart"]
 MOST_SHADOWS = 4
 SECONDS_PER_WH_OF_A_KW = 3.6
 CONSTANTS = {("auxiliary_power", "power_w"), ("power_gain", "offset_w")}  # loads that read nothing and choose nothing
+MEAN_OF_MORE = "the mean of something larger that is left unexplained, not a cause of its own"
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 
@@ -62,12 +63,15 @@ def told_apart(
             left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
             told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, fresh(), c, tell))
-        gone = told["superfluous"] if told else []
-        shadow = next(iter(gone), None) if told else _shadow(problem, state, predicted, train, left)
-        if shadow is None or round_ == MOST_SHADOWS:
+        if told:
+            gone = next(iter(told["superfluous"]), None)
+            why = f"not found again beside {'the formula' if 'formula' in told else 'the cycle'} for what is left"
+        else:
+            gone, why = _shadow(problem, state, predicted, train, left), MEAN_OF_MORE
+        if gone is None or round_ == MOST_SHADOWS:
             break
-        tell(f"taking {shadow} out: what is left is larger than what it explains")
-        state = _gone(loop, state, shadow)
+        tell(f"taking {gone} out: {why}")
+        state = _gone(loop, state, gone, why)
     if state.found and not left.rms:  # of training rows alone: what test rows say of the rest is no choice
         known = as_known(loop, state)
         steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
@@ -135,10 +139,9 @@ def _shadow(
     return None
 
 
-def _gone(loop: Loop, state: Search, effect_id: str) -> Search:
+def _gone(loop: Loop, state: Search, effect_id: str, why: str) -> Search:
     """The state without a stand-in, with the verdict on it."""
     gone = next(f for f in state.found if f.id == effect_id)
-    why = "the mean of something larger that is left unexplained, not a cause of its own"
     verdicts = [Verdict(effect_id, gone.score.gain, gone.q_value, why), *state.verdicts]
     return replace(without(loop, state, effect_id), verdicts=verdicts)
 

@@ -1,12 +1,10 @@
 """What chance could do: tests with few clusters, many candidates, and many ways to have each."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-__all__ = ["adjusted", "clusters_needed", "clusters_to_tell", "effective_number", "least_clusters", "ruled_out", "wald"]
+__all__ = ["clusters_needed", "clusters_to_tell", "effective_number", "least_clusters", "ruled_out", "wald"]
 
 
 def least_clusters(k: int) -> int:
@@ -58,19 +56,6 @@ def ruled_out(share: float, p: float, k: int, clusters: int, level: float = 0.05
         return False
     amounts = stats.chi2.ppf((np.arange(50) + 0.5) / 50, clusters - 1) * share / (1.0 - share)
     return float(np.mean(stats.ncf.cdf(stats.f.isf(p, k, free), k, free, amounts))) < level
-
-
-def adjusted(p: Sequence[float]) -> Float[np.ndarray, " k"]:
-    """q-values that bound the share of false discoveries (Benjamini and Hochberg 1995)."""
-    every = np.asarray(p, dtype=float)
-    if not len(every):
-        return every
-    order = np.argsort(every)
-    ranked = every[order] * len(every) / (np.arange(len(every)) + 1)
-    q = np.minimum.accumulate(ranked[::-1])[::-1]
-    out = np.empty_like(q)
-    out[order] = np.minimum(q, 1.0)
-    return out
 
 
 def effective_number(gram: Float[np.ndarray, "k k"]) -> float:

@@ -15,7 +15,7 @@ from hdev_jax.diagnosis.unexplained import Remainder
 from hdev_jax.inference import Calibration, Coefficient, cluster_rows
 from hdev_jax.physics import Parameter
 
-__all__ = ["FAR", "baseline_block", "parameters_of", "summarise"]
+__all__ = ["FAR", "SUSPICIOUS", "baseline_block", "parameters_of", "summarise"]
 
 ODD_SHARE = 0.2
 SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word

@@ -18,6 +18,7 @@ __all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 # For the flexible learner and for cycles, a tenth of it for change points and levels, as far as their p hold:
 # docs/planted.md counts false alarms by noise
 LEVEL = 1e-3
+OFFSET_LEVEL = 0.01  # of a mean over trips, once it is known that something is there
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
@@ -96,7 +97,7 @@ def remainder(
     white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
     period = _period(train, noise)
     change = _change_point(white, train.trip)
-    offset = _levels(train, train.residual)  # about 0: what all trips share counts too, and is told apart below
+    levels = _levels(train, train.residual)  # about 0: what all trips share counts too, and is told apart below
     parts, depends, sizes = [], [], [0.0]
     if p_learner < LEVEL and share_train > LEAST_SHARE:
         sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
@@ -116,12 +117,12 @@ def remainder(
         depends.append("time_s")
         minutes = float(np.sum(train.duration_s[before]) / 60.0)
         parts.append(f"a change inside trip {trip_names[where]} after {minutes:.0f} min")
-    mean = float(np.mean(train.residual))
-    if offset is not None and (level := _levels(train, train.residual - mean)) is None:
+    mean = _shared(train) if levels is not None else 0.0
+    if mean and (differing := _levels(train, train.residual - mean)) is None:
         sizes.append(abs(mean))
         parts.append(f"an offset of about {mean:+.2g} {unit} that all trips share")
-    elif offset is not None:
-        where, size, sd = level
+    elif levels is not None:
+        where, size, sd = differing if mean else levels
         sizes.append(sd)
         depends.append("trip_id")
         parts.append(
@@ -278,6 +279,14 @@ def _shift(residual: np.ndarray, before: np.ndarray, after: np.ndarray) -> float
         return 0.0
     step = float(np.mean(residual[after]) - np.mean(residual[before]))
     return abs(step) * float(np.sqrt(n * m / (n + m) / len(residual)))
+
+
+def _shared(rows: Rows) -> float:
+    """The mean of what is left, if trips' own means tell it from 0: of trips that differ about 0 it is none of its
+    own, however far chance moves it."""
+    means = [float(np.mean(rows.residual[s])) for _, s in trip_slices(rows.trip)]
+    told = len(means) > 1 and stats.ttest_1samp(means, 0.0).pvalue < OFFSET_LEVEL
+    return float(np.mean(rows.residual)) if told else 0.0
 
 
 def _levels(rows: Rows, residual: np.ndarray) -> tuple[int, float, float] | None:

@@ -24,6 +24,7 @@ __all__ = [
 
 WIDTH = 10.0
 NAMED_TRIPS = 16  # more trips than this are drawn by rank, without names
+MOST_TRIPS = 60  # that a box each has room for
 
 
 def short(name: str, most: int = 24) -> str:
@@ -223,7 +224,8 @@ def residual_by_trip(data: ReportData) -> Any:
     """Mean, middle half and 90 % range of each trip's residual."""
     good = test_rows(data)
     trip, residual = data.row("trip")[good], data.residual("after")[good]
-    ids = list(dict.fromkeys(trip.tolist()))[:60]
+    every = list(dict.fromkeys(trip.tolist()))
+    ids = every[:MOST_TRIPS]
     fig = figure(WIDTH, 3.0)
     ax = fig.add_subplot()
     q = np.array([np.quantile(residual[trip == i], [0.05, 0.25, 0.75, 0.95]) for i in ids])
@@ -239,7 +241,8 @@ def residual_by_trip(data: ReportData) -> Any:
         ax.set_xticks(x, [short(n, 18) for n in known], **slant)
     else:
         ax.set_xticks([])
-        ax.set_xlabel(f"{len(ids)} trips in the order of the log")
+        first = f"the first {len(ids)} of " if len(ids) < len(every) else ""
+        ax.set_xlabel(f"{first}{len(every)} trips in the order of the log")
     ax.set_xlim(-0.7, max(len(ids), 1) - 0.3)
     ax.set_ylabel(f"measured −\npredicted [{data.unit}]")
     ax.set_title(_title(data, "Error by trip (dot: mean, bar: middle half, line: 90 % of the rows)"))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax.diagnosis.summary import FAR
 from hdev_jax.report import names, words
 from hdev_jax.report.canvas import png, style
 from hdev_jax.report.data import ReportData, metrics, same_model, test_rows, total_name, trip_lines
@@ -20,13 +21,12 @@ from hdev_jax.report.figures import (
 )
 from hdev_jax.report.posterior import prior_likelihood_posterior
 from hdev_jax.report.residuals import panels, residual_by_channel, residual_in_time
-from hdev_jax.report.statistics import TRIPS_ENOUGH, row_seconds
+from hdev_jax.report.statistics import blocks, row_seconds
 
 __all__ = ["write_calibration_report", "write_page", "write_report"]
 
 _TEMPLATES = Path(__file__).parent / "templates"
 CANDIDATES_SHOWN = 8
-Z_FLAG = 2.0  # a coefficient further from its table than 19 of 20 would be by chance
 _NO_UNEXPLAINED = {
     "significant": False,
     "share_of_test_variance": None,
@@ -68,7 +68,7 @@ def write_report(data: ReportData, directory: Path) -> None:
         "dependence": [p for p in shown if p.name[0] != "\x00"],
         "channels_shown": len(shown),
         "channels": channels,
-        "clustered_by": "trip" if len(set(data.row("trip")[rows].tolist())) >= TRIPS_ENOUGH else "5-minute block",
+        "clustered_by": {"trip": "trip", "block": "block of 5 minutes or more"}[blocks(data, rows).kind],
         "row_seconds": row_seconds(data, rows),
         "n_test": int(rows.sum()),
         "stages": _blocks(summary.get("stages", {})),
@@ -193,7 +193,7 @@ def _tiles(data: ReportData) -> list[dict[str, str]]:
         {
             "label": "Noise floor",
             "value": words.number(u.get("noise_floor_rmse"), 2, data.unit),
-            "note": "estimated: what no model can predict from this log",
+            "note": "estimated: what a flexible learner does not predict either",
         },
         {
             "label": "Still predictable",
@@ -256,7 +256,7 @@ def _coefficient(path: str, p: dict[str, Any]) -> dict[str, Any]:
         "value": words.plus_minus(p.get("value"), p.get("sd"), unit),
         "prior": words.plus_minus(prior, p.get("prior_sd"), unit) if p.get("prior_sd") else "none",
         "z": "–" if z is None else f"{z:+.1f}".replace("-", "−"),
-        "flag": z is not None and abs(z) > Z_FLAG,
+        "flag": z is not None and abs(z) > FAR,
         "absorbs": [names.effect(a) for a in p.get("absorbs") or []],
     }
 

@@ -58,7 +58,7 @@ def panels(data: ReportData) -> tuple[list[Panel], int]:
     Time and distance since the start and the predicted value are always among them; constant channels never are.
     """
     rows = test_rows(data)
-    cluster = blocks(data, rows)
+    cluster = blocks(data, rows).ids
     residual = {w: data.residual(w)[rows] for w, _, _ in models(data)}
     found = []
     for name, (shown, column) in _columns(data).items():

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hdev_jax.inference.clusters import Clusters, clusters_of
 from hdev_jax.report.data import ReportData, test_rows
+from hdev_jax.segments import trip_slices
 
 __all__ = [
     "Binned",
@@ -21,8 +23,6 @@ __all__ = [
 ]
 
 BINS = 14
-BLOCK_S = 300.0  # design.md: with few trips, errors are clustered by blocks of at least 5 minutes
-TRIPS_ENOUGH = 8  # design.md: from so many trips on, a cluster is a trip
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,12 @@ class Binned:
 
 def runs(trip: np.ndarray) -> list[slice]:
     """Runs of equal trip ids."""
-    cut = np.flatnonzero(np.diff(trip)) + 1
-    return [slice(int(a), int(b)) for a, b in zip(np.r_[0, cut], np.r_[cut, len(trip)], strict=True) if b > a]
+    return [s for _, s in trip_slices(trip)]
 
 
-def blocks(data: ReportData, rows: np.ndarray) -> np.ndarray:
-    """Cluster id of each chosen row: its trip, or with fewer than 8 trips a block of 5 minutes of it."""
-    trip = data.row("trip")[rows]
-    if len(np.unique(trip)) >= TRIPS_ENOUGH:
-        return np.unique(trip, return_inverse=True)[1]
-    part = np.floor(np.nan_to_num(data.row("time_s")[rows]) / BLOCK_S).astype(np.int64)
-    return np.unique(trip * (part.max(initial=0) - part.min(initial=0) + 1) + part, return_inverse=True)[1]
+def blocks(data: ReportData, rows: np.ndarray) -> Clusters:
+    """Clusters of the chosen rows, as the diagnosis has them of training rows."""
+    return clusters_of(data.row("trip")[rows], np.nan_to_num(data.row("duration_s")[rows]))
 
 
 def edges_of(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:

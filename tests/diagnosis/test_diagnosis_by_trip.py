@@ -167,7 +167,7 @@ def test_trips_left_out_bear_a_mode_out():
     gain, p_cluster = _left_out(grams, *NOTHING, truth)
     assert 20.0 < gain < split[0]
     assert p_cluster < 1e-4
-    assert 0.8 < _stability(grams[None], *NOTHING, 0.05) <= 1.0
+    assert 0.8 < _stability(grams[None], *NOTHING, 0.05, np.random.default_rng(0)) <= 1.0
 
 
 def test_noise_has_a_split_that_gains_and_none_that_holds():
@@ -180,7 +180,7 @@ def test_noise_has_a_split_that_gains_and_none_that_holds():
         assert split is not None
         inside.append(split[0])
         outside.append(_left_out(grams, *NOTHING, split[1])[0])
-        again.append(_stability(grams[None], *NOTHING, 0.05 / 30))
+        again.append(_stability(grams[None], *NOTHING, 0.05 / 30, np.random.default_rng(0)))
     assert np.median(inside) > LEFT_OUT > max(outside)
     assert np.mean(again) < 0.1
 
@@ -188,4 +188,4 @@ def test_noise_has_a_split_that_gains_and_none_that_holds():
 def test_one_odd_trip_is_no_mode_of_resampled_trips():
     """Drawn twice it is still one trip: a mode has two of them at least."""
     grams = _grams(np.random.default_rng(3), np.r_[2.0, np.zeros(11)])
-    assert _stability(grams[None], *NOTHING, 0.05) < 0.1
+    assert _stability(grams[None], *NOTHING, 0.05, np.random.default_rng(0)) < 0.1

@@ -1,15 +1,14 @@
 """Scores from Gram matrices against the same numbers from the rows themselves."""
 
-import itertools
-
 import numpy as np
 import pytest
 from scipy import stats
 
+from hdev_jax.diagnosis import normal_equations
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import Evidence
 from hdev_jax.diagnosis.ranking import best_of
-from hdev_jax.diagnosis.significance import adjusted, effective_number, wald
+from hdev_jax.diagnosis.significance import effective_number, wald
 from hdev_jax.diagnosis.sums import LEVELS, Sums
 from hdev_jax.inference import Clusters
 from hdev_jax.physics import LIBRARY
@@ -90,6 +89,21 @@ def test_gain_is_that_of_generalised_least_squares(at, level):
     np.testing.assert_allclose(found, beta[BASE:], rtol=1e-6)
     before = evidence.base_likelihood(evidence.totals())
     assert evidence.gain(evidence.totals(), at, before)[0] == gain
+
+
+@pytest.mark.parametrize("room", [1, 700, 10**6])
+def test_ways_are_scored_in_as_many_parts_as_memory_asks_for(room, monkeypatch):
+    """Also where not even one of them has room: no part is empty."""
+    rows, ways = Rows(), [candidate(0), candidate(1), candidate(0, 2)]
+    alone = [rows.evidence().score(c) for c in ways]
+    monkeypatch.setattr(normal_equations, "AT_ONCE", room)
+    evidence = rows.evidence()
+    for own, together in zip(alone, evidence.scores(ways), strict=True):
+        np.testing.assert_allclose(together.beta, own.beta, rtol=1e-9)
+        assert together.gain == pytest.approx(own.gain, rel=1e-9)
+    np.testing.assert_allclose(
+        evidence.gains(evidence.totals(), [c.columns for c in ways]), [x.gain for x in alone], rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("level", [0.0, 0.8])
@@ -282,26 +296,3 @@ def test_wald_holds_its_level(k):
 
 def test_wald_of_few_clusters_says_nothing():
     assert wald(np.ones(2), np.ones((3, 2))) == 1.0
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_adjusted_is_benjamini_and_hochberg(seed):
-    rng = np.random.default_rng(seed)
-    p = np.r_[rng.uniform(size=30), rng.uniform(size=5) * 1e-4, 1.0, 0.0]
-    p = np.r_[p, p[:3]]  # ties
-    np.testing.assert_allclose(adjusted(p.tolist()), stats.false_discovery_control(p, method="bh"), rtol=1e-12)
-
-
-@pytest.mark.parametrize("p", [[], [0.03], [1.0, 1.0]])
-def test_adjusted_edges(p):
-    np.testing.assert_array_equal(adjusted(p), p)
-
-
-def test_adjusted_keeps_the_order():
-    p = np.random.default_rng(1).uniform(size=40)
-    q = adjusted(p.tolist())
-    assert np.all(q >= p * (1 - 1e-12))
-    assert np.all(q <= 1)
-    for (p1, q1), (p2, q2) in itertools.pairwise(sorted(zip(p, q, strict=True))):
-        assert p1 <= p2
-        assert q1 <= q2

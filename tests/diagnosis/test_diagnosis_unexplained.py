@@ -94,6 +94,20 @@ def test_an_offset_of_all_trips_is_no_level_of_each(levels):
     assert left.rms == pytest.approx(5.0 if levels == 0.0 else np.std(other), rel=0.3)
 
 
+@pytest.mark.parametrize("trips", [6, 16])
+def test_levels_that_differ_about_nothing_are_no_offset(trips):
+    """However far chance moves their mean, and however few there are to differ about it."""
+    rng = np.random.default_rng(8)
+    said = []
+    for _ in range(12):
+        rows = residual(rng, trips, 250, rho=0.0)
+        other = np.repeat(rng.normal(0.0, 0.3, trips), 250)
+        rows = rows_of(rows.residual + other, rows.clusters)
+        said.append(remainder(rows, rows, ["x"], "Wh", [f"T{k}" for k in range(trips)], seed=0).signature)
+    assert sum("levels that differ" in x for x in said) >= 5
+    assert sum("offset" in x for x in said) <= 1
+
+
 def test_a_change_in_a_trip_has_a_size():
     """One alone tells how much is left: what decides whether coefficients of whitened rows are told."""
     rng = np.random.default_rng(7)
