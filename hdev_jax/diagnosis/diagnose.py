@@ -82,7 +82,8 @@ def diagnose(
     state, steps, predicted, left = told_apart(problem, split, state, loop, seed=seed, tell=tell, checkpoint=checkpoint)
     base = steps[0]
     leeway = {f.id: left_open(loop, state, f.score) for f in state.found}
-    summary = summarise(problem, split, state, steps, predicted, left, leeway) | {"excluded": excluded}
+    summary = summarise(problem, split, state, steps, predicted, left, leeway)
+    summary["excluded"] = excluded
     rivals = [(f.id, library[t]) for f in state.found for t in f.twins if t in library]
     if rivals:
         tell("what to measure next: drives that would tell the rest apart")

@@ -284,9 +284,11 @@ def _shift(residual: np.ndarray, before: np.ndarray, after: np.ndarray) -> float
 def _shared(rows: Rows) -> float:
     """The mean of what is left, if trips' own means tell it from 0: of trips that differ about 0 it is none of its
     own, however far chance moves it."""
-    means = [float(np.mean(rows.residual[s])) for _, s in trip_slices(rows.trip)]
-    told = len(means) > 1 and stats.ttest_1samp(means, 0.0).pvalue < OFFSET_LEVEL
-    return float(np.mean(rows.residual)) if told else 0.0
+    means = np.array([float(np.mean(rows.residual[s])) for _, s in trip_slices(rows.trip)])
+    if len(means) < 2:
+        return 0.0
+    test: Any = stats.ttest_1samp(means, 0.0)
+    return float(np.mean(rows.residual)) if test.pvalue < OFFSET_LEVEL else 0.0
 
 
 def _levels(rows: Rows, residual: np.ndarray) -> tuple[int, float, float] | None:
