@@ -2,8 +2,9 @@
 
 Parts: niro (trained on each trip in turn), road (the Niro's force balance), ztbus (three folds of missions), withheld
 (a known channel of ZTBus taken out of the log). Each run is one `hdev diagnose`; a run that is there already is read,
-not repeated, and one that was cut off goes on where it was. With --write the page docs/real_logs.md and its figures are
-made from all runs that are kept in DIR; with --kept nothing is run. HDEV_DATA names the data (default ../shared/data).
+not repeated, one that was cut off goes on where it was, and one of other code, sheet or adapter is made again. With
+--write the page docs/real_logs.md and its figures are made from all runs that are kept in DIR; with --kept nothing is
+run. HDEV_DATA names the data (default ../shared/data).
 """
 
 import argparse
@@ -136,7 +137,7 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     adapter. A folder of a run that was asked for otherwise ends it."""
     out = work / job.name
     result, cost = _json(out / "diagnosis.json"), _json(work / f"{job.name}.cost.json")
-    if not result or cost.get("made_of") != job.made_of:
+    if not result or not _begun(job, work):
         return None
     ran = tomllib.loads((out / "config.toml").read_text(encoding="utf-8"))
     asked: dict[str, Any] = {"vehicle": job.vehicle, "adapter": job.adapter.name}
@@ -154,14 +155,20 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     return {**result, "cost": cost, "ran": ran, "together": together}
 
 
+def _begun(job: Job, work: Path) -> bool:
+    """Whether what there is of a run, finished or not, is of this code, sheet and adapter."""
+    begun = work / f"{job.name}.begun"
+    return begun.exists() and begun.read_text(encoding="utf-8") == job.made_of
+
+
 def _run(job: Job, work: Path, place: str) -> None:
     """One diagnosis; its wall-clock seconds and peak memory are kept beside it."""
-    out, begun = work / job.name, work / f"{job.name}.begun"
-    if not begun.exists() or begun.read_text(encoding="utf-8") != job.made_of:  # what there is, is of something else
+    out = work / job.name
+    if not _begun(job, work):  # what there is, is of something else
         for old in (out, out.with_name(f"{job.name}.partial")):
             shutil.rmtree(old, ignore_errors=True)
-    begun.parent.mkdir(parents=True, exist_ok=True)
-    begun.write_text(job.made_of, encoding="utf-8")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    (work / f"{job.name}.begun").write_text(job.made_of, encoding="utf-8")
     print(f"{time.strftime('%H:%M:%S')}  {place}: {job.name} …", file=sys.stderr, flush=True)
     started = time.monotonic()
     command = [sys.executable, "-m", "hdev_jax.cli", "diagnose", *job.arguments, "--out", str(out)]
@@ -170,7 +177,7 @@ def _run(job: Job, work: Path, place: str) -> None:
         process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise SystemExit(f"{job.name}: hdev diagnose ended with status {process.returncode}")
-    cost = {"made_of": job.made_of, "seconds": time.monotonic() - started, "peak_gib": usage.ru_maxrss / 2**20}
+    cost = {"seconds": time.monotonic() - started, "peak_gib": usage.ru_maxrss / 2**20}
     (work / f"{job.name}.cost.json").write_text(json.dumps(cost), encoding="utf-8")
     seconds, gib = cost["seconds"], cost["peak_gib"]
     print(f"{time.strftime('%H:%M:%S')}  {job.name}: {seconds:.0f} s, {gib:.1f} GiB", file=sys.stderr, flush=True)

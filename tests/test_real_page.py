@@ -294,15 +294,14 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
         }  # fmt: skip
         (work / name / "config.toml").write_text(tomli_w.dumps(config))
         covariance = {"names": ["iron", "offset"], "matrix": [[1.0, -0.99], [-0.99, 1.0]]}
-        cost = {"made_of": next(j for j in jobs if j.name == name).made_of, "seconds": 1.0, "peak_gib": 1.0}
-        (work / f"{name}.cost.json").write_text(json.dumps(cost))
+        (work / f"{name}.begun").write_text(next(j for j in jobs if j.name == name).made_of)
         (work / name / "predictive.json").write_text(json.dumps({"covariance": covariance}))
     assert real_logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
     page = (docs / "real_logs.md").read_text()
     assert "trained on trip" in page
     assert "- 2: iron and offset are known together far better than one by one (correlation -0.99)" in page
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
-    for end in ("", ".cost.json"):
+    for end in ("", ".begun"):
         (work / f"niro_2{end}").rename(work / f"niro_3{end}")
     with pytest.raises(SystemExit, match="holds another run"):
         real_logs.main(["--work", str(work), "--kept"])
