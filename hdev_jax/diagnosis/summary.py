@@ -208,13 +208,12 @@ def _not_decidable(verdicts: Sequence[Verdict], left: Remainder) -> list[dict[st
     """What more trips (or stretches of driving) would tell, the nearest of each kind first.
 
     Either rows speak for it and clusters not yet (one trip in the rain says little of rain), three at most; or trips
-    differ in level, and it is a cause that differs by trip: of any such a log knows no more than it has trips.
+    differ in level, or may, and it is a cause that differs by trip: of any such a log knows no more than it has trips.
     """
-    levels = left.significant and "trip_id" in left.depends_on
     able = sorted((v for v in verdicts if v.needed is not None), key=lambda v: v.needed or 0)
     open_to_doubt = [v for v in able if v.by_rows or v.q_value < DOUBTFUL]
     hinted = [v for v in open_to_doubt if (v.score or 0.0) > SUSPICIOUS][:MOST_HINTED]
-    told = [*hinted, *(v for v in able if levels and v.between and v not in hinted)]
+    told = [*hinted, *(v for v in able if left.trips_differ and v.between and v not in hinted)]
     return [{"id": v.id, "clusters_needed": v.needed, "why_not": v.why_not} for v in told]
 
 

@@ -20,6 +20,7 @@ __all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 LEVEL = 1e-3
 OFFSET_LEVEL = 0.01  # of a mean over trips, once it is known that something is there
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
+SUSPECTED = 0.05  # levels: enough to say what may hide among them, though not that they are there
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
 APART = 2.0  # in log-likelihood, that one amount explains trips' remainders better than the next
@@ -32,7 +33,8 @@ MOST_ROWS = 30_000  # that the flexible learner is trained on
 class Remainder:
     """The contract's `unexplained`, and a smooth correction: what a flexible learner would add, by its first channel.
 
-    `scales_with` is what a trip's remainder is in proportion to: `time`, `distance`, `energy`, or None.
+    `scales_with` is what a trip's remainder is in proportion to: `time`, `distance`, `energy`, or None. `trips_differ`
+    where trips have levels of their own, or are suspected to: what only trips tell may hide among them.
     """
 
     significant: bool
@@ -42,6 +44,7 @@ class Remainder:
     signature: str
     rms: float  # of the structure that training rows alone show, in the target's unit; 0 where they show none
     cycle_w: Float[np.ndarray, " train"]  # the cycle's swing about each training row, 0 where none is or it is no power
+    trips_differ: bool
     scales_with: str | None = None
     correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
     expression: str | None = None
@@ -76,6 +79,17 @@ class Rows:
     cycle_unit: str
     weight: np.ndarray
     amounts: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of trips: the trip that is furthest off, how far it is, the levels' sd, and whether they are told from
+    coloured noise or only not ruled out."""
+
+    worst: int
+    level: float
+    sd: float
+    told: bool
 
 
 def remainder(
@@ -117,17 +131,16 @@ def remainder(
         depends.append("time_s")
         minutes = float(np.sum(train.duration_s[before]) / 60.0)
         parts.append(f"a change inside trip {trip_names[where]} after {minutes:.0f} min")
-    mean = _shared(train) if levels is not None else 0.0
-    if mean and (differing := _levels(train, train.residual - mean)) is None:
+    mean = _shared(train) if levels is not None and levels.told else 0.0
+    differing = _levels(train, train.residual - mean) if mean else levels
+    if differing is not None and differing.told:
+        sizes.append(differing.sd)
+        depends.append("trip_id")
+        worst = f"{trip_names[differing.worst]} ({differing.level:+.2g} {unit})"
+        parts.append(f"levels that differ by trip by about {differing.sd:.2g} {unit}, most in {worst}")
+    elif mean:
         sizes.append(abs(mean))
         parts.append(f"an offset of about {mean:+.2g} {unit} that all trips share")
-    elif levels is not None:
-        where, size, sd = differing if mean else levels
-        sizes.append(sd)
-        depends.append("trip_id")
-        parts.append(
-            f"levels that differ by trip by about {sd:.2g} {unit}, most in {trip_names[where]} ({size:+.2g} {unit})"
-        )
     scales_with = _scale(train) if parts else None
     if scales_with is not None:
         parts.append(f"from trip to trip it grows with {scales_with}, as {GROWS_AS[scales_with]} does")
@@ -140,8 +153,9 @@ def remainder(
     depends_on = tuple(dict.fromkeys(depends))
     curve = _curve(correction, test, list(names), order[0], unit) if learned and order else None
     return Remainder(
-        bool(parts), share, floor, depends_on, signature + ".", rms, cycle_w, scales_with=scales_with, correction=curve
-    )
+        bool(parts), share, floor, depends_on, signature + ".", rms, cycle_w, differing is not None,
+        scales_with=scales_with, correction=curve,
+    )  # fmt: skip
 
 
 def _curve(correction: np.ndarray, rows: Rows, names: list[str], channel: str, unit: str) -> dict[str, Any]:
@@ -291,10 +305,10 @@ def _shared(rows: Rows) -> float:
     return float(np.mean(rows.residual)) if test.pvalue < OFFSET_LEVEL else 0.0
 
 
-def _levels(rows: Rows, residual: np.ndarray) -> tuple[int, float, float] | None:
-    """Trips of a level of their own, if coloured noise could not have made it: (worst, its level, sd of levels).
+def _levels(rows: Rows, residual: np.ndarray) -> Levels | None:
+    """Levels that trips have of their own, told or suspected; None where there is no sign of them.
 
-    Levels are about 0: of a residual that has a mean, it is among them. The likelihood ratio of the noise with random
+    They are about 0: of a residual that has a mean, it is among them. The likelihood ratio of the noise with random
     levels against the noise without, each with an order of its own; half a χ², since a variance at its bound is no
     two-sided question (Self and Liang 1987).
     """
@@ -303,11 +317,10 @@ def _levels(rows: Rows, residual: np.ndarray) -> tuple[int, float, float] | None
         return None
     plain, noise = (estimate_noise(residual, rows.trip, rows.duration_s, levels=x) for x in (False, True))
     gain = noise.log_likelihood - plain.log_likelihood
-    if 0.5 * stats.chi2.sf(2.0 * max(gain, 0.0), 1) > LEVEL / 10:
-        return None
+    p = 0.5 * float(stats.chi2.sf(2.0 * max(gain, 0.0), 1))
     # the share is one of a grid that holds the least itself: rounding must not decide
-    if noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(residual**2):
+    if p > SUSPECTED or noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(residual**2):
         return None
     means = {t: float(np.mean(residual[s])) for t, s in long.items()}
     worst = max(means, key=lambda t: abs(means[t]))
-    return worst, means[worst], noise.level_sd
+    return Levels(worst, means[worst], noise.level_sd, p <= LEVEL / 10)

@@ -258,7 +258,7 @@ def test_only_trips_tell_what_lives_between_them(tmp_path, kind):
 
 
 def test_between_trips_a_log_knows_no_more_than_it_has_trips():
-    left = Remainder(True, 0.1, 1.0, ("trip_id",), "", 1.0, np.zeros(3))
+    left = Remainder(False, 0.1, 1.0, (), "", 0.0, np.zeros(3), trips_differ=True)  # suspected is enough
     hinted = Verdict("hvac_power", 2.0, 1.0, "not significant", needed=40, between=True)
     inside = Verdict("headwind", 2.0, 1.0, "not significant", needed=30)
     strong = Verdict("wet_road", 20.0, 0.2, "too few trips", needed=50)
@@ -272,4 +272,4 @@ def test_between_trips_a_log_knows_no_more_than_it_has_trips():
         ("hvac_power", 40),
         *((f"effect_{k}", 45 + k) for k in range(4)),
     ]
-    assert [s["id"] for s in _not_decidable(every, replace(left, depends_on=()))] == ["wet_road", "regen_limit"]
+    assert [s["id"] for s in _not_decidable(every, replace(left, trips_differ=False))] == ["wet_road", "regen_limit"]
