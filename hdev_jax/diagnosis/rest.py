@@ -4,7 +4,7 @@ The mean of a cause that the library does not hold is left to whatever named cau
 taken out again and what is left is looked at anew.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.diagnosis.expression import Factor, find_expression
+from hdev_jax.diagnosis.expression import Described, Factor, find_expression
 from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.refit import as_known, refitted, without
@@ -28,6 +28,7 @@ __all__ = ["told_apart"]
 MOST_SHADOWS = 4
 SECONDS_PER_WH_OF_A_KW = 3.6
 CONSTANTS = {("auxiliary_power", "power_w"), ("power_gain", "offset_w")}  # loads that read nothing and choose nothing
+MEAN_OVER_SWING = 2.0  # of a load that is on for up to four fifths of its cycle, over its basic wave's amplitude
 MEAN_OF_MORE = "the mean of something larger that is left unexplained, not a cause of its own"
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
@@ -62,7 +63,10 @@ def told_apart(
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
-            told = checkpoint(f"cycle-{round_}", lambda s=state, c=left.cycle_w: _beside_cycle(s, fresh(), c, tell))
+            small = _small(problem, state, predicted, train, left.cycle_w)
+            told = checkpoint(
+                f"cycle-{round_}", lambda s=state, k=small, c=left.cycle_w: _beside_cycle(s, fresh(), c, k, tell)
+            )
         if told:
             gone = next(iter(told["superfluous"]), None)
             why = f"not found again beside {'the formula' if 'formula' in told else 'the cycle'} for what is left"
@@ -100,19 +104,39 @@ def _formula(
     channels = tuple(dict.fromkeys(f.name for f in found.factors))
     kept = {f.id for f in prune(found.loop, found.state, tell).found}
     again = [f.id for f in state.found if f.id not in kept]
-    again += [k for k in stand_ins(replace(found.loop, fdr=loop.fdr), found.state, channels, tell) if k in kept]
+    beside_it = replace(found.loop, fdr=loop.fdr)
+    again += [k for k in stand_ins(beside_it, found.state, channels, tell, kept - {Described.id}) if k not in again]
     return {
         "formula": found.formula, "factors": [asdict(f) for f in found.factors], "channels": list(channels),
         "rms": rms, "ways": found.ways, "predicted": found.predicted, "superfluous": again,
     }  # fmt: skip
 
 
-def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, tell: Tell) -> dict[str, Any]:
-    """Which effects are not found again beside a load as large in each trip as the cycle that is left there."""
-    if not state.found:
+def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collection[str], tell: Tell) -> dict[str, Any]:
+    """Which of the effects asked for are not found again beside a load as large in each trip as the cycle there."""
+    if not asked:
         return {}
     load = np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))]
-    return {"superfluous": list(stand_ins(*beside(loop, state, load), (), tell))}
+    return {"superfluous": list(stand_ins(*beside(loop, state, load), (), tell, asked))}
+
+
+def _small(
+    problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, cycle_w: np.ndarray
+) -> tuple[str, ...]:
+    """Effects that explain no more of the training rows than the mean of the cycle that is left could.
+
+    A heater's cycle is larger in the cold, and beside it what the cabin takes is hardly found again: but it takes more
+    than a swing of this size could, and so is no stand-in for it.
+    """
+    to_unit = np.asarray(problem.segments.duration_s)[train] / 3600.0 if problem.target == "energy_wh" else 1e-3
+    most = float(np.mean((MEAN_OVER_SWING * cycle_w * to_unit) ** 2))
+    return tuple(k for k, gain in _gains(problem, state, predicted, train).items() if gain < most)
+
+
+def _gains(problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray) -> dict[str, float]:
+    """What each found effect, in its turn, takes off the mean square of the training rows' residual."""
+    mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
+    return {f.id: max(mse[k] - mse[k + 1], 0.0) for k, f in enumerate(state.found)}
 
 
 def _described(
@@ -131,10 +155,9 @@ def _shadow(
     The mean of a cause that the library does not hold is one of the `CONSTANTS`. One that explains less than what is
     left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
     """
-    mse = [float(np.mean((problem.measured - p)[train] ** 2)) for p in predicted]
-    for k, f in reversed(list(enumerate(state.found))):
-        gain = max(mse[k] - mse[k + 1], 0.0)
-        if {(f.id, size) for size in f.score.candidate.sizes} <= CONSTANTS and gain < left.rms**2:
+    gains = _gains(problem, state, predicted, train)
+    for f in reversed(state.found):
+        if {(f.id, size) for size in f.score.candidate.sizes} <= CONSTANTS and gains[f.id] < left.rms**2:
             return f.id
     return None
 

@@ -5,7 +5,7 @@ formula, or as a cycle of so much in each trip) an effect that is real is found 
 stood in for it is not.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,16 +36,17 @@ def beside(problem: Loop, state: Search, load_w: Float[np.ndarray, " row"]) -> t
     return problem, replace(state, vehicle=fit.vehicle, table=table, fit=fit)
 
 
-def stand_ins(problem: Loop, state: Search, channels: Sequence[str], tell: Tell) -> tuple[str, ...]:
-    """Effects of `state`, whose vehicle describes the rest, that are not found again beside the description.
+def stand_ins(
+    problem: Loop, state: Search, channels: Sequence[str], tell: Tell, asked: Collection[str]
+) -> tuple[str, ...]:
+    """Effects of those `asked` that are not found again beside the description of the rest in `state`'s vehicle.
 
-    An effect that reads one of the description's `channels` is not asked: the two may be one cause, told in parts.
+    One that reads one of the description's `channels` is left: the two may be one cause, told in parts.
     """
-    asked = [
-        f for f in reversed(state.found) if f.id != Described.id and not {*f.score.candidate.effect.needs} & {*channels}
-    ]
     gone = []
-    for f in asked:
+    for f in reversed(state.found):
+        if f.id not in asked or {*f.score.candidate.effect.needs} & {*channels}:
+            continue
         tell(f"is {f.id} found again beside what is left")
         if not _again(problem, state, f, tell):
             gone.append(f.id)

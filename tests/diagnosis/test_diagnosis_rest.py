@@ -92,3 +92,25 @@ def test_a_constant_goes_where_more_than_it_explains_is_left(effect, sizes, rms,
     predicted = [np.zeros(15), np.where(train, 1.0, 0.0)]  # explains the training rows: a gain of 1
     left = replace(left_of(side(0, size=0.0), side(1, size=0.0)), rms=rms, significant=rms == 0.0)
     assert rest._shadow(problem, state, predicted, train, left) == (effect if gone else None)
+
+
+@pytest.mark.parametrize(("target", "unit"), [("battery_power_kw", 1.0), ("energy_wh", 10.0)])
+def test_what_takes_more_than_a_cycle_could_is_no_stand_in_for_it(target, unit):
+    """A cycle of 1 kW about its mean: a load that is on for most of it takes 2 kW on the average, no more."""
+    gains = {"hvac_power": 9.0, "auxiliary_power": 3.0, "inverter_loss": 0.1}  # of mean squares, in kW²
+    state = bare(Search, found=[SimpleNamespace(id=k) for k in gains])
+    train = np.arange(15) < 10
+    segments = SimpleNamespace(duration_s=np.full(15, 36.0))  # 1 kW is 10 Wh
+    problem = bare(Problem, measured=np.where(train, 0.0, 99.0), segments=segments, target=target)
+    squares = 20.0 - np.cumsum([0.0, *gains.values()])
+    predicted = [np.where(train, unit * np.sqrt(x), 0.0) for x in squares]
+    cycle = np.full(10, 1000.0)
+    assert rest._small(problem, state, predicted, train, cycle) == ("auxiliary_power", "inverter_loss")
+    assert rest._small(problem, state, predicted, train, 0.1 * cycle) == ()
+
+
+@pytest.mark.parametrize("duty", [0.05, 0.3, 0.5, 0.78])
+def test_the_mean_of_a_load_that_is_on_and_off_by_its_swing(duty):
+    on = np.arange(10_000) < duty * 10_000
+    swing = 2.0 * abs(np.fft.rfft(on)[1]) / 10_000
+    assert on.mean() < rest.MEAN_OVER_SWING * swing
