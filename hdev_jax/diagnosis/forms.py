@@ -2,7 +2,8 @@
 
 A resistance that grows with cold, a cut-off that fades: the library's form takes most of it, and the rest looks like
 something else, which more of the same log can only make surer. A further candidate has to say more than the found
-effects would in other forms.
+effects would in other forms, or as much as the best of these: a loss in proportion to torque is the root of one in
+proportion to its square, and is named all the same.
 """
 
 from collections.abc import Callable, Iterator
@@ -29,17 +30,18 @@ ALWAYS: tuple[Callable[[np.ndarray, Segments], np.ndarray], ...] = (
     lambda does, segments: does * np.asarray(segments.speed_mps),
     lambda does, segments: does * np.asarray(segments.time_s),
 )
+CLOSER = 1.0  # in log-likelihood, that one form has to explain more than the candidate
 SHAPES = 24  # of an effect's thresholds and time constants that are tried at most
 
 
 def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | None:
-    """Which found effects, in other forms, would say what the candidate does; None where it says more.
+    """Which found effects, in other forms, would say what the candidate does, and one of them more of it; or None.
 
     Other forms of an effect: its columns at other thresholds and time constants together, and what it does now, times
     speed, temperature, charge and time in the trip, squared, or as its root. The candidate is to stay significant
-    over the library beside all of them, by Bonferroni. What only trips tell is not asked: they are too few for so many
-    numbers. A second cause that is just such a form of the first (a constant load, and one in proportion to
-    temperature) is not named beside it, however long the log.
+    over the library beside all of them, by Bonferroni, or to explain as much as any one does. What only trips tell is
+    not asked: they are too few for so many numbers. A second cause that is closely such a form of the first (a constant
+    load, and one in proportion to temperature) may not be named beside it, however long the log.
     """
     if s.plain or not state.found:
         return None
@@ -68,8 +70,11 @@ def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | No
 
     evidence = evidence_of(view.ground, width + k, write)
     totals = evidence.totals()
-    gain = evidence.gain(totals, range(width + k))[0] - evidence.gain(totals, range(width))[0]
-    if stats.chi2.sf(2.0 * max(gain, 0.0), k) <= view.level(s.candidate.id, problem.fdr):
+    beside = evidence.gain(totals, range(width + k))[0] - evidence.gain(totals, range(width))[0]
+    if stats.chi2.sf(2.0 * max(beside, 0.0), k) <= view.level(s.candidate.id, problem.fdr):
+        return None
+    alone = evidence.gain(totals, range(width, width + k))[0]
+    if np.max(evidence.gains(totals, np.arange(width)[:, None])) <= alone + CLOSER:
         return None
     return f"no more than {' and '.join(f.id for f in state.found)} would say in another form"
 
