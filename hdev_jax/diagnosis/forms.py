@@ -74,7 +74,7 @@ def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | No
     if stats.chi2.sf(2.0 * max(beside, 0.0), k) <= view.level(s.candidate.id, problem.fdr):
         return None
     alone = evidence.gain(totals, range(width, width + k))[0]
-    if np.max(evidence.gains(totals, np.arange(width)[:, None])) <= alone + CLOSER:
+    if np.max(evidence.gains(totals, [[c] for c in range(width)])) <= alone + CLOSER:
         return None
     return f"no more than {' and '.join(f.id for f in state.found)} would say in another form"
 
