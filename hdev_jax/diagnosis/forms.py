@@ -39,9 +39,10 @@ def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | No
 
     Other forms of an effect: its columns at other thresholds and time constants together, and what it does now, times
     speed, temperature, charge and time in the trip, squared, or as its root. The candidate is to stay significant
-    over the library beside all of them, by Bonferroni, or to explain as much as any one does. What only trips tell is
-    not asked: they are too few for so many numbers. A second cause that is closely such a form of the first (a constant
-    load, and one in proportion to temperature) may not be named beside it, however long the log.
+    over the library beside all of them, by Bonferroni, or to explain as much as any one does, each of its further sizes
+    counted against it. What only trips tell is not asked: they are too few for so many numbers. A second cause that is
+    closely such a form of the first (a constant load, and one in proportion to temperature) may not be named beside it,
+    however long the log; a truth that has two other forms at once may leave something that is.
     """
     if s.plain or not state.found:
         return None
@@ -74,7 +75,7 @@ def another_form(problem: Loop, state: Search, s: Score, view: View) -> str | No
     if stats.chi2.sf(2.0 * max(beside, 0.0), k) <= view.level(s.candidate.id, problem.fdr):
         return None
     alone = evidence.gain(totals, range(width, width + k))[0]
-    if np.max(evidence.gains(totals, [[c] for c in range(width)])) <= alone + CLOSER:
+    if np.max(evidence.gains(totals, [[c] for c in range(width)])) <= alone - (k - 1) + CLOSER:
         return None
     return f"no more than {' and '.join(f.id for f in state.found)} would say in another form"
 

@@ -28,7 +28,7 @@ __all__ = ["told_apart"]
 MOST_SHADOWS = 4
 SECONDS_PER_WH_OF_A_KW = 3.6
 CONSTANTS = {("auxiliary_power", "power_w"), ("power_gain", "offset_w")}  # loads that read nothing and choose nothing
-MEAN_OVER_SWING = 2.0  # of a load that is on for up to four fifths of its cycle, over its basic wave's amplitude
+MEAN_OVER_SWING = 2.0  # of a load that is on for up to 78 % of its cycle, over its basic wave's amplitude
 MEAN_OF_MORE = "the mean of something larger that is left unexplained, not a cause of its own"
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
@@ -60,18 +60,18 @@ def told_apart(
             f"formula-{round_}",
             lambda s=state, p=predicted[-1], f=first, r=left: _formula(problem, train, s, fresh(), p, f, r, tell),
         )
+        asked = tuple(f.id for f in state.found) if told else ()
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
-            small = _small(problem, state, predicted, train, left.cycle_w)
+            asked = _small(problem, state, loop, predicted, train, left.cycle_w)
             told = checkpoint(
-                f"cycle-{round_}", lambda s=state, k=small, c=left.cycle_w: _beside_cycle(s, fresh(), c, k, tell)
+                f"cycle-{round_}", lambda s=state, k=asked, c=left.cycle_w: _beside_cycle(s, fresh(), c, k, tell)
             )
-        if told:
-            gone = next(iter(told["superfluous"]), None)
-            why = f"not found again beside {'the formula' if 'formula' in told else 'the cycle'} for what is left"
-        else:
-            gone, why = _shadow(problem, state, predicted, train, left), MEAN_OF_MORE
+        gone = next(iter(told.get("superfluous", ())), None)
+        why = f"not found again beside {'the formula' if 'formula' in told else 'the cycle'} for what is left"
+        if gone is None:  # of what was asked about, that word stands
+            gone, why = _shadow(problem, state, predicted, train, left, asked), MEAN_OF_MORE
         if gone is None or round_ == MOST_SHADOWS:
             break
         tell(f"taking {gone} out: {why}")
@@ -105,7 +105,7 @@ def _formula(
     kept = {f.id for f in prune(found.loop, found.state, tell).found}
     again = [f.id for f in state.found if f.id not in kept]
     beside_it = replace(found.loop, fdr=loop.fdr)
-    again += [k for k in stand_ins(beside_it, found.state, channels, tell, kept - {Described.id}) if k not in again]
+    again += stand_ins(beside_it, found.state, channels, tell, kept - {Described.id})
     return {
         "formula": found.formula, "factors": [asdict(f) for f in found.factors], "channels": list(channels),
         "rms": rms, "ways": found.ways, "predicted": found.predicted, "superfluous": again,
@@ -121,16 +121,24 @@ def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collect
 
 
 def _small(
-    problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, cycle_w: np.ndarray
+    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, cycle_w: np.ndarray
 ) -> tuple[str, ...]:
-    """Effects that explain no more of the training rows than the mean of the cycle that is left could.
+    """Effects that explain no more of the training rows than the mean of the cycle that is left could, when they were
+    found or now, beside all others.
 
     A heater's cycle is larger in the cold, and beside it what the cabin takes is hardly found again: but it takes more
     than a swing of this size could, and so is no stand-in for it.
     """
     to_unit = np.asarray(problem.segments.duration_s)[train] / 3600.0 if problem.target == "energy_wh" else 1e-3
     most = float(np.mean((MEAN_OVER_SWING * cycle_w * to_unit) ** 2))
-    return tuple(k for k, gain in _gains(problem, state, predicted, train).items() if gain < most)
+    mse = float(np.mean((problem.measured - predicted[-1])[train] ** 2))
+
+    def now(effect_id: str) -> float:
+        bare = problem.predict(without(loop, state, effect_id).fit.vehicle)
+        return float(np.mean((problem.measured - bare)[train] ** 2)) - mse
+
+    gains = _gains(problem, state, predicted, train)
+    return tuple(k for k, gain in gains.items() if gain < most or now(k) < most)
 
 
 def _gains(problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray) -> dict[str, float]:
@@ -148,15 +156,19 @@ def _described(
 
 
 def _shadow(
-    problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, left: Remainder
-) -> str | None:
-    """A found effect that may be no more than the mean of the structure that is left, the latest first.
+    problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray, left: Remainder,
+    asked: Collection[str],
+) -> str | None:  # fmt: skip
+    """A found effect that may be no more than the mean of the structure that is left, the latest first, of those that
+    were not `asked` about beside a description of it.
 
     The mean of a cause that the library does not hold is one of the `CONSTANTS`. One that explains less than what is
     left (`left.rms`) is no cause of its own. Both are of training rows: no choice sees the others.
     """
     gains = _gains(problem, state, predicted, train)
     for f in reversed(state.found):
+        if f.id in asked:
+            continue
         if {(f.id, size) for size in f.score.candidate.sizes} <= CONSTANTS and gains[f.id] < left.rms**2:
             return f.id
     return None

@@ -20,7 +20,7 @@ __all__ = ["LEAST_SHARE", "Remainder", "remainder"]
 LEVEL = 1e-3
 OFFSET_LEVEL = 0.01  # of a mean over trips, once it is known that something is there
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
-SUSPECTED = 0.05  # levels: enough to say what may hide among them, though not that they are there
+LEAST_ROWS = 8  # of a trip that is asked for its level
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
 ROUNDS = 400
 APART = 2.0  # in log-likelihood, that one amount explains trips' remainders better than the next
@@ -44,7 +44,7 @@ class Remainder:
     signature: str
     rms: float  # of the structure that training rows alone show, in the target's unit; 0 where they show none
     cycle_w: Float[np.ndarray, " train"]  # the cycle's swing about each training row, 0 where none is or it is no power
-    trips_differ: bool
+    trips_differ: bool = False
     scales_with: str | None = None
     correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
     expression: str | None = None
@@ -84,7 +84,7 @@ class Rows:
 @dataclass(frozen=True)
 class Levels:
     """Levels of trips: the trip that is furthest off, how far it is, the levels' sd, and whether they are told from
-    coloured noise or only not ruled out."""
+    coloured noise or only explain the residual better than it (`estimate_noise` asks for a gain of 2)."""
 
     worst: int
     level: float
@@ -131,14 +131,14 @@ def remainder(
         depends.append("time_s")
         minutes = float(np.sum(train.duration_s[before]) / 60.0)
         parts.append(f"a change inside trip {trip_names[where]} after {minutes:.0f} min")
-    mean = _shared(train) if levels is not None and levels.told else 0.0
+    mean = _shared(train) if levels is not None else 0.0
     differing = _levels(train, train.residual - mean) if mean else levels
     if differing is not None and differing.told:
         sizes.append(differing.sd)
         depends.append("trip_id")
         worst = f"{trip_names[differing.worst]} ({differing.level:+.2g} {unit})"
         parts.append(f"levels that differ by trip by about {differing.sd:.2g} {unit}, most in {worst}")
-    elif mean:
+    elif mean and levels is not None and levels.told:
         sizes.append(abs(mean))
         parts.append(f"an offset of about {mean:+.2g} {unit} that all trips share")
     scales_with = _scale(train) if parts else None
@@ -295,14 +295,20 @@ def _shift(residual: np.ndarray, before: np.ndarray, after: np.ndarray) -> float
     return abs(step) * float(np.sqrt(n * m / (n + m) / len(residual)))
 
 
+def _of_some_length(trip: np.ndarray) -> dict[int, slice]:
+    """Trips with rows enough to have a level, and where they are."""
+    return {t: s for t, s in trip_slices(trip) if s.stop - s.start >= LEAST_ROWS}
+
+
 def _shared(rows: Rows) -> float:
-    """The mean of what is left, if trips' own means tell it from 0: of trips that differ about 0 it is none of its
-    own, however far chance moves it."""
-    means = np.array([float(np.mean(rows.residual[s])) for _, s in trip_slices(rows.trip)])
+    """The mean of trips' own means, if they tell it from 0: of trips that differ about 0 it is none of its own, however
+    far chance moves it."""
+    means = np.array([float(np.mean(rows.residual[s])) for s in _of_some_length(rows.trip).values()])
     if len(means) < 2:
         return 0.0
-    test: Any = stats.ttest_1samp(means, 0.0)
-    return float(np.mean(rows.residual)) if test.pvalue < OFFSET_LEVEL else 0.0
+    mean, error = float(np.mean(means)), float(np.std(means, ddof=1) / np.sqrt(len(means)))
+    p = 2.0 * float(stats.t.sf(abs(mean) / (error + 1e-300), len(means) - 1))
+    return mean if p < OFFSET_LEVEL else 0.0
 
 
 def _levels(rows: Rows, residual: np.ndarray) -> Levels | None:
@@ -312,15 +318,15 @@ def _levels(rows: Rows, residual: np.ndarray) -> Levels | None:
     levels against the noise without, each with an order of its own; half a χ², since a variance at its bound is no
     two-sided question (Self and Liang 1987).
     """
-    long = {t: s for t, s in trip_slices(rows.trip) if s.stop - s.start >= 8}  # fewer rows have no level
+    long = _of_some_length(rows.trip)
     if len(long) < 4:
         return None
     plain, noise = (estimate_noise(residual, rows.trip, rows.duration_s, levels=x) for x in (False, True))
+    # the share is one of a grid that holds the least itself: rounding must not decide
+    if not noise.level_sd or noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(residual**2):
+        return None
     gain = noise.log_likelihood - plain.log_likelihood
     p = 0.5 * float(stats.chi2.sf(2.0 * max(gain, 0.0), 1))
-    # the share is one of a grid that holds the least itself: rounding must not decide
-    if p > SUSPECTED or noise.level_sd**2 < (LEAST_LEVEL - 1e-9) * np.mean(residual**2):
-        return None
     means = {t: float(np.mean(residual[s])) for t, s in long.items()}
     worst = max(means, key=lambda t: abs(means[t]))
     return Levels(worst, means[worst], noise.level_sd, p <= LEVEL / 10)

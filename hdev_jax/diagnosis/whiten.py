@@ -21,6 +21,7 @@ PIECE = 65_536  # rows that it takes at once
 BLOCK_S = 600.0
 BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
+LARGE_SHARE = 0.3  # of trips' means: from here on the grid is too coarse, and lags of the whole too inexact
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,30 @@ def _blocks(trip: np.ndarray, duration_s: np.ndarray) -> list[slice]:
     return out
 
 
+def _autocovariance(x: np.ndarray, slices: list[slice], order: int) -> np.ndarray:
+    """Autocovariance about zero up to lag `order`: each lag with the number of pairs it has, so that short trips are
+    not biased to white."""
+    longest = max(s.stop - s.start for s in slices)
+    acov, pairs = np.zeros(order + 1), np.zeros(order + 1)
+    size = 1 << int(np.ceil(np.log2(2 * longest)))
+    for s in slices:
+        n = s.stop - s.start
+        lags = min(order + 1, n)
+        acov[:lags] += np.fft.irfft(np.abs(np.fft.rfft(x[s], size)) ** 2, size)[:lags]
+        pairs[:lags] += n - np.arange(lags)
+    pairs = np.maximum(pairs, 1.0)
+    # divided by n, not by pairs, where there is plenty of either: that keeps the sequence positive definite
+    return acov / (pairs if longest < 50 * order else pairs[0])
+
+
+def _less_levels(residual: np.ndarray, slices: list[slice]) -> np.ndarray:
+    """The residual less each trip's own mean."""
+    out = residual.copy()
+    for s in slices:
+        out[s] -= np.mean(out[s])
+    return out
+
+
 def estimate_noise(
     residual: Float[np.ndarray, " row"],
     trip: Int[np.ndarray, " row"],
@@ -107,24 +132,17 @@ def estimate_noise(
         return Noise(np.zeros((2, 1)), np.ones(2), 0.0, np.ones(len(slices)), 0.0)
     longest = max(s.stop - s.start for s in slices)
     order = int(max(1, min(MAX_ORDER, longest // 4)))
-    # Autocovariance about zero: each lag with the number of pairs it has, so that short trips are not biased to white
-    acov = np.zeros(order + 1)
-    pairs = np.zeros(order + 1)
-    size = 1 << int(np.ceil(np.log2(2 * longest)))
-    for s in slices:
-        x = residual[s] / common
-        spectrum = np.abs(np.fft.rfft(x, size)) ** 2
-        lags = min(order + 1, len(x))
-        acov[:lags] += np.fft.irfft(spectrum, size)[:lags]
-        pairs[:lags] += len(x) - np.arange(lags)
-    pairs = np.maximum(pairs, 1.0)
-    # divided by n, not by pairs, where there is plenty of either: that keeps the sequence positive definite
-    acov = acov / (pairs if longest < 50 * order else pairs[0])
+    acov = _autocovariance(residual / common, slices, order)
+    levels = levels and len(slices) >= 4
+    tried = [(share, acov - share * acov[0]) for share in (LEVEL_SHARES if levels else (0.0,))]
+    inside = _less_levels(residual, slices) / common
+    if (between := 1.0 - float(np.mean(inside**2))) > LARGE_SHARE:
+        colour = _autocovariance(inside, slices, order)
+        tried += [(0.0, colour + between), *([(between, colour)] if levels else [])]
 
     best: tuple[float, Noise] | None = None
-    for share in LEVEL_SHARES if levels and len(slices) >= 4 else (0.0,):
-        rest = acov - share * acov[0]
-        if rest[0] <= 0:
+    for share, rest in tried:
+        if rest[0] <= 1e-12:
             continue
         phi, sd = _levinson(rest, order)
         aic = len(residual) * 2 * np.log(sd) + 2 * np.arange(order + 1)

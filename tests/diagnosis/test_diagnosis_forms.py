@@ -30,6 +30,14 @@ def test_a_second_cause_is_not_the_first_in_another_form():
 
 
 @pytest.mark.slow
+def test_a_loss_in_proportion_to_torque_is_named_beside_one_to_its_square():
+    """It is the root of the other, and explains as much as any one other form of it does."""
+    truth = {"copper_loss": {}, "inverter_loss": {"per_nm_w": 15.0}}
+    _, result = run(90401, effects=truth, **{**SHAFT, "ratio": 1.0})
+    assert sorted(names(result)) == ["copper_loss", "inverter_loss"]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["sampling_filter", "torque_offset"])
 def test_instruments_of_the_shaft(effect):
     """A filter of half a second is far from the longest, not at an edge; an offset is seen beside an absorbed gain."""

@@ -11,8 +11,9 @@ from hdev_jax.diagnosis import rest
 from hdev_jax.diagnosis.expression import Expression
 from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
-from hdev_jax.inference import Clusters
+from hdev_jax.inference import Calibration, Clusters
 from hdev_jax.physics import LIBRARY
 
 TRIPS, ROWS = 8, 150
@@ -91,22 +92,75 @@ def test_a_constant_goes_where_more_than_it_explains_is_left(effect, sizes, rms,
     problem, train = bare(Problem, measured=np.r_[np.ones(10), np.full(5, 9.0)]), np.arange(15) < 10
     predicted = [np.zeros(15), np.where(train, 1.0, 0.0)]  # explains the training rows: a gain of 1
     left = replace(left_of(side(0, size=0.0), side(1, size=0.0)), rms=rms, significant=rms == 0.0)
-    assert rest._shadow(problem, state, predicted, train, left) == (effect if gone else None)
+    assert rest._shadow(problem, state, predicted, train, left, ()) == (effect if gone else None)
+    assert rest._shadow(problem, state, predicted, train, left, (effect,)) is None
 
 
 @pytest.mark.parametrize(("target", "unit"), [("battery_power_kw", 1.0), ("energy_wh", 10.0)])
-def test_what_takes_more_than_a_cycle_could_is_no_stand_in_for_it(target, unit):
+def test_what_takes_more_than_a_cycle_could_is_no_stand_in_for_it(target, unit, monkeypatch):
     """A cycle of 1 kW about its mean: a load that is on for most of it takes 2 kW on the average, no more."""
-    gains = {"hvac_power": 9.0, "auxiliary_power": 3.0, "inverter_loss": 0.1}  # of mean squares, in kW²
-    state = bare(Search, found=[SimpleNamespace(id=k) for k in gains])
+    turn = {"hvac_power": 9.0, "cabin_warmup": 9.0, "auxiliary_power": 3.0, "inverter_loss": 0.1}  # mean squares, kW²
+    now = {**turn, "cabin_warmup": 1.0}  # found first, and the next took most of it over
+    state = bare(Search, found=[SimpleNamespace(id=k) for k in turn])
     train = np.arange(15) < 10
     segments = SimpleNamespace(duration_s=np.full(15, 36.0))  # 1 kW is 10 Wh
     problem = bare(Problem, measured=np.where(train, 0.0, 99.0), segments=segments, target=target)
-    squares = 20.0 - np.cumsum([0.0, *gains.values()])
+    squares = 30.0 - np.cumsum([0.0, *turn.values()])
     predicted = [np.where(train, unit * np.sqrt(x), 0.0) for x in squares]
+    fits = {k: SimpleNamespace(fit=SimpleNamespace(vehicle=unit * np.sqrt(squares[-1] + x))) for k, x in now.items()}
+    monkeypatch.setattr(rest, "without", lambda _, __, k: fits[k])
+    monkeypatch.setattr(Problem, "predict", lambda _, size: np.where(train, size, 0.0))
     cycle = np.full(10, 1000.0)
-    assert rest._small(problem, state, predicted, train, cycle) == ("auxiliary_power", "inverter_loss")
-    assert rest._small(problem, state, predicted, train, 0.1 * cycle) == ()
+    small = ("cabin_warmup", "auxiliary_power", "inverter_loss")
+    assert rest._small(problem, state, bare(Loop), predicted, train, cycle) == small
+    assert rest._small(problem, state, bare(Loop), predicted, train, 0.1 * cycle) == ()
+
+
+@pytest.mark.parametrize(
+    ("small", "again", "gone"),
+    [
+        ((), (), [("auxiliary_power", rest.MEAN_OF_MORE)]),
+        (("hvac_power",), ("hvac_power",), [("auxiliary_power", rest.MEAN_OF_MORE)]),
+        (("hvac_power",), (), [("hvac_power", "not found again beside the cycle for what is left")]),
+        (("hvac_power", "auxiliary_power"), ("hvac_power", "auxiliary_power"), []),
+    ],
+)
+def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_what_was_not(
+    small, again, gone, monkeypatch
+):
+    """A constant load goes where more than it explains is left, whatever else was found and asked about."""
+    train, asked, said = np.ones(10, bool), [], []
+
+    def found(id_: str) -> SimpleNamespace:
+        effect = LIBRARY[id_]
+        sizes = tuple(p.name for p in effect.parameters if p.name.endswith("_w") or "w_per" in p.name)[:1]
+        return SimpleNamespace(id=id_, score=SimpleNamespace(candidate=SimpleNamespace(effect=effect, sizes=sizes)))
+
+    def stand_ins(loop, state, channels, tell, of):
+        asked.append(tuple(of))
+        return tuple(k for k in of if k not in again)
+
+    def take_out(loop, state, id_, why):
+        said.append((id_, why))
+        return bare(Search, found=[f for f in state.found if f.id != id_])
+
+    left = replace(left_of(side(0, size=0.0), side(1, size=0.0)), rms=9.0, cycle_w=np.full(10, 500.0))
+    state = bare(Search, found=[found("hvac_power"), found("auxiliary_power")])
+    predicted = [np.full(10, np.sqrt(x)) for x in (50.0, 30.0, 20.0)]
+    for name, answer in {
+        "_path": lambda p, s, _: [bare(Calibration, vehicle=k) for k in range(len(s.found) + 1)],
+        "_remainder": lambda *_: left, "_formula": lambda *_: {}, "_small": lambda *_: small,
+        "beside": lambda loop, state, _: (loop, state), "stand_ins": stand_ins, "_gone": take_out, "MOST_SHADOWS": 1,
+        "replace": lambda loop, **_: loop,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(rest, name, answer)
+    monkeypatch.setattr(Problem, "rows", lambda *_: train)
+    monkeypatch.setattr(Problem, "predict", lambda _, k: predicted[k])
+    loop = bare(Loop, rows=SimpleNamespace(measured=np.zeros(10)))
+    problem, split = bare(Problem, measured=np.zeros(10)), bare(Split, train=(0,), test=(1,))
+    rest.told_apart(problem, split, state, loop, seed=0, tell=silent, checkpoint=lambda _, make: make())
+    assert said == gone
+    assert asked[:1] == ([small] if small else [])
 
 
 @pytest.mark.parametrize("duty", [0.05, 0.3, 0.5, 0.78])

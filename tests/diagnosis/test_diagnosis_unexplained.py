@@ -77,7 +77,7 @@ def test_slow_noise_has_no_levels_of_trips(rho, trips):
     rng = np.random.default_rng(5)
     logs = [residual(rng, trips, 250, rho=rho) for _ in range(20)]
     seen = [levels for rows in logs if (levels := _levels(rows, rows.residual))]
-    assert len(seen) <= 2  # of 20, at a level of 0.05
+    assert len(seen) <= 2  # of 20
     assert not any(levels.told for levels in seen)
 
 
@@ -133,6 +133,39 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     assert found.told
     assert found.worst == int(np.argmax(np.abs(level[::200])))
     assert found.sd == pytest.approx(np.std(level), rel=0.3)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+@pytest.mark.parametrize("alike", [True, False])
+def test_levels_stay_told_however_large(rho, alike):
+    """A constant in each trip is in every lag of the residual: no autoregression may pass for it."""
+    for size in (1.0, 2.0, 5.0, 30.0):
+        rng = np.random.default_rng(2)
+        rows = residual(rng, 12, 200, rho=rho)
+        level = size * (np.ones(12) if alike else rng.standard_normal(12))
+        found = _levels(rows, rows.residual + np.repeat(level, 200))
+        assert found is not None
+        assert found.told
+        assert found.sd == pytest.approx(np.sqrt(np.mean(level**2)), rel=0.25)
+
+
+def test_a_weak_offset_of_all_trips_is_not_suspected_to_differ():
+    rng, looks = np.random.default_rng(50), []
+    for _ in range(10):
+        rows = residual(rng, 8, 200, rho=0.9)
+        rows = rows_of(rows.residual + 0.6, rows.clusters)
+        looks.append(remainder(rows, rows, ["x"], "W", [f"T{k}" for k in range(8)], seed=0))
+    assert sum(left.trips_differ for left in looks) <= 1
+
+
+@pytest.mark.parametrize("seed", [7, 9])
+def test_pieces_of_a_few_rows_have_no_say_in_what_trips_share(seed):
+    rng = np.random.default_rng(seed)
+    trip = np.r_[np.repeat(np.arange(12), 200), np.repeat(np.arange(12, 16), 2)]
+    rows = rows_of(2.0 + 4.0 * rng.standard_normal(len(trip)), Clusters(trip, 16, "trip"))
+    left = remainder(rows, rows, ["x"], "W", [f"T{k}" for k in range(16)], seed=0)
+    assert "an offset of about +" in left.signature
+    assert "levels" not in left.signature
 
 
 def test_levels_of_a_few_trips_are_suspected_before_they_are_told():
