@@ -132,7 +132,9 @@ def remainder(
         minutes = float(np.sum(train.duration_s[before]) / 60.0)
         parts.append(f"a change inside trip {trip_names[where]} after {minutes:.0f} min")
     mean = _shared(train) if levels is not None else 0.0
-    differing = _levels(train, train.residual - mean) if mean else levels
+    apart = train.residual - mean
+    apart[np.abs(apart) < 1e-9 * abs(mean)] = 0.0  # the rounding of a difference is nothing that differs
+    differing = _levels(train, apart) if mean else levels
     if differing is not None and differing.told:
         sizes.append(differing.sd)
         depends.append("trip_id")

@@ -158,6 +158,16 @@ def test_a_weak_offset_of_all_trips_is_not_suspected_to_differ():
     assert sum(left.trips_differ for left in looks) <= 1
 
 
+@pytest.mark.filterwarnings("ignore:overflow encountered")  # of LightGBM, where nothing varies
+@pytest.mark.parametrize("offset", [0.1, 1.0])
+def test_an_offset_that_leaves_nothing_else_is_no_levels_of_rounding(offset):
+    rows = residual(np.random.default_rng(0), 8, 50)
+    rows = rows_of(np.full(400, offset), rows.clusters)
+    left = remainder(rows, rows, ["x"], "W", [f"T{k}" for k in range(8)], seed=0)
+    assert f"an offset of about {offset:+.2g} W" in left.signature
+    assert left.rms == pytest.approx(offset)
+
+
 @pytest.mark.parametrize("seed", [7, 9])
 def test_pieces_of_a_few_rows_have_no_say_in_what_trips_share(seed):
     rng = np.random.default_rng(seed)
