@@ -62,10 +62,11 @@ def halves(segments: Segments) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fitted(
-    vehicle: Vehicle, table: ParameterTable, segments: Segments, measured: np.ndarray, target: Target, *, paper: bool
-) -> LinearFit:
-    """The closed form on these rows: the paper's (independent normal rows), or ours."""
-    rows = padded(segments, measured)
+    vehicle: Vehicle, table: ParameterTable, segments: Segments, measured: np.ndarray, target: Target, *, paper: bool,
+    size: int | None = None,
+) -> LinearFit:  # fmt: skip
+    """The closed form on these rows: the paper's (independent normal rows), or ours. `size`: as in `padded`."""
+    rows = padded(segments, measured, size)
     clusters = clusters_of(np.asarray(segments.trip), np.asarray(segments.duration_s))
     return linear_fit(
         vehicle, table, lambda: [Rows(rows, clusters.ids)], target, clusters=0 if paper else clusters.count

@@ -31,7 +31,7 @@ __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_togeth
 
 SOURCES = (
     "pinn.py", "pinn_closed.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_models.py", "pinn_networks.py",
-    "pinn_scores.py", "pinn_buses.py", "paper1_halves.py",
+    "pinn_pooled.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py",
 )  # fmt: skip
 
 
@@ -49,6 +49,8 @@ class Model(Strict, Choices):  # pyright: ignore[reportGeneralTypeIssues]
     stretch: int = Field(Choices.stretch, ge=1)
     # as physics: those of the config, or what the diagnosis of its `diagnosed` vehicles finds
     effects: bool | Literal["diagnosed"] = False
+    # where coefficients and sizes of effects begin: the tables and none, or what vehicles' rows say in closed form
+    start: Literal["tables", "closed form"] = "tables"
     weights: tuple[float, float, float] = Field(PAPER_WEIGHTS, strict=False)
     members: int = Field(1, ge=1)  # of an ensemble
     rate: float = Field(0.005, gt=0)

@@ -15,13 +15,23 @@ import numpy as np
 
 from experiments.paper1_halves import MASS_SD, coefficient, fitted
 from experiments.pinn_data import Data, Member, weighed
-from hdev_jax.inference import Fit, ParameterTable, Rows, effect_coefficients, jacobian, linear_fit, padded, predict
+from hdev_jax.inference import (
+    Fit,
+    LinearFit,
+    ParameterTable,
+    Rows,
+    effect_coefficients,
+    jacobian,
+    linear_fit,
+    padded,
+    predict,
+)
 from hdev_jax.learn.pinn import Sized
 from hdev_jax.learn.pinn_rows import row_wise
 from hdev_jax.physics import LIBRARY, Effect, Parameter, Vehicle, at_null, most_group
 from hdev_jax.segments import Segments
 
-__all__ = ["Closed", "Known", "kernel", "known", "said", "sized", "trainable"]
+__all__ = ["Closed", "Known", "closed", "kernel", "known", "said", "sized", "trainable"]
 
 _ROUNDS = 5  # of a search: the threshold's grid, then each time a quarter of the steps about the best
 _LEAST_TRIPS = 4  # whose masses have a variance
@@ -49,16 +59,22 @@ def sized(effects: Mapping[str, Mapping[str, float]]) -> tuple[Sized, ...]:
 
 def said(vehicle: Vehicle, m: Member, segments: Segments | None = None) -> np.ndarray:
     """Energy of every row of a vehicle by the kernel [Wh]; of `segments` in the place of its log."""
-    rows = padded(m.segments if segments is None else segments, m.energy_wh)
+    rows = padded(m.segments if segments is None else segments, m.energy_wh, _whole(len(m.use)))
     return np.asarray(predict(vehicle, rows.segments, "energy_wh"))[: rows.rows]
 
 
+def _whole(n: int) -> int:
+    """The next power of two: vehicles of about as many rows, or trips, share what is compiled, which takes longest."""
+    return 2 ** int(np.ceil(np.log2(max(n, 1))))
+
+
 class Closed(NamedTuple):
-    """A vehicle's kernel in closed form; by how much each row's mass is off (0 where the trip is not trained on) and
-    the standard deviation of that over trips, as shares of the logged mass (NaN: too few trips to tell; 0: the mass is
-    as it is given)."""
+    """A vehicle's kernel in closed form, and that form; by how much each row's mass is off (0 where the trip is not
+    trained on) and the standard deviation of that over trips, as shares of the logged mass (NaN: too few trips to tell;
+    0: the mass is as it is given)."""
 
     vehicle: Vehicle
+    fit: LinearFit
     payload: np.ndarray
     payload_sd: float
 
@@ -79,6 +95,8 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
     segments, energy = m.segments.take(train), m.energy_wh[train]
     row_s = float(np.median(np.asarray(segments.duration_s)))
     car, table, searches = m.vehicle, m.table, []
+    if "power_w" in _open(effects, "auxiliary_power"):  # the same column as the declared load
+        table = table.with_free(**{"battery.auxiliary_w": False})
     for id, given in effects.items():
         e = _as_given(id, given, m)
         car = car.plus(e)
@@ -91,23 +109,24 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
     opened = "scale" in _open(effects, "mass_scale") and segments.has("mass_kg")
     trips = _Trips.of(segments) if opened else None
 
-    def fit(car: Vehicle, s: Segments) -> Vehicle:
-        return table.insert(car, fitted(car, table, s, energy, "energy_wh", paper=True).values)
+    def fit(car: Vehicle, s: Segments) -> tuple[Vehicle, LinearFit]:
+        found = fitted(car, table, s, energy, "energy_wh", paper=True, size=_whole(len(s)))
+        return table.insert(car, found.values), found
 
-    car = fit(car, segments)
+    car, found = fit(car, segments)
     for _ in range(_ROUNDS if searches or trips else 0):
         now = segments if trips is None else trips.weighed(segments)
         if searches:
-            left = _Left(car, table.with_free(**limits), padded(now, energy))
+            left = _Left(car, table.with_free(**limits), padded(now, energy, _whole(len(now))))
             for search in searches:
                 car = search.best(car, left)
-        car = fit(car, now)
+        car, found = fit(car, now)
         trips = trips and trips.again(car, segments, energy)
     if trips is None:
-        return Closed(car, np.zeros(len(m.use)), np.nan if opened else 0.0)
+        return Closed(car, found, np.zeros(len(m.use)), np.nan if opened else 0.0)
     payload = np.zeros(len(m.use))
     payload[train] = trips.off[trips.of_row]
-    return Closed(fit(car, trips.weighed(segments)), payload, trips.sd)
+    return Closed(*fit(car, trips.weighed(segments)), payload, trips.sd)
 
 
 def _open(effects: Mapping[str, Mapping[str, float]], id: str) -> set[str]:
@@ -146,9 +165,9 @@ class _Trips(NamedTuple):
         mean = float(car.effect("mass_scale").scale)
         sd = self.sd * (1.0 + mean)
         own = ParameterTable((coefficient("effects.mass_scale.scale", "1", mean, sd, positive=False),))
-        rows = padded(segments, energy)
-        found = linear_fit(car, own, lambda: [Rows(rows, self.of_row, self.of_row)], "energy_wh", groups=len(self.off))
-        off, sd = (found.values[:, 0] - mean) / (1.0 + mean), found.sd[:, 0] / (1.0 + mean)
+        rows, trips = padded(segments, energy, _whole(len(segments))), len(self.off)
+        found = linear_fit(car, own, lambda: [Rows(rows, self.of_row, self.of_row)], "energy_wh", groups=_whole(trips))
+        off, sd = (found.values[:trips, 0] - mean) / (1.0 + mean), found.sd[:trips, 0] / (1.0 + mean)
         return _Trips(self.of_row, off, float(np.sqrt(np.mean(off**2 + sd**2))))
 
 
@@ -216,13 +235,21 @@ class Known(NamedTuple):
 
 
 @cache
+def closed(data: Data, effects: str) -> tuple[Closed | None, ...]:
+    """`kernel` of each vehicle, None of one without training rows. **Arguments:** `effects`, by id with what is given
+    of their parameters, as JSON, so that the answer can be kept. Raises `InputError` where no vehicle has any."""
+    data.trains()
+    listed: dict[str, dict[str, float]] = json.loads(effects)
+    return tuple(kernel(m, listed) if np.any(m.use == 0) else None for m in data.vehicles)
+
+
+@cache
 def known(data: Data, effects: str) -> tuple[Known, ...]:
     """Of each vehicle, what its training rows tell (`kernel`) of the effects that no network can train.
 
     A vehicle without such rows has the others' medians of thresholds, of a power for each kilogram of the declared
-    mass, and of how far trips' masses are apart; and nothing of what acts across rows. **Arguments:** `effects`, by
-    id with what is given of their parameters, as JSON, so that the answer can be kept. Raises `InputError` where no
-    vehicle has a training row.
+    mass, and of how far trips' masses are apart; and nothing of what acts across rows. Arguments and errors are those
+    of `closed`.
     """
     data.trains()
     listed: dict[str, dict[str, float]] = json.loads(effects)
@@ -230,7 +257,7 @@ def known(data: Data, effects: str) -> tuple[Known, ...]:
     within = [e for e in listed if e not in across and e not in trainable(listed)]
     names = [(e, p) for e in within for p in LIBRARY[e].parameters]
     free = bool(names or across or "scale" in _open(listed, "mass_scale"))
-    fits = [kernel(m, listed) if free and np.any(m.use == 0) else None for m in data.vehicles]
+    fits = closed(data, effects) if free else [None] * len(data.vehicles)
     found = np.array([
         [np.nan if f is None else float(getattr(f.vehicle.effect(e), p.name)) / _unit(m, p) for e, p in names]
         for f, m in zip(fits, data.vehicles, strict=True)

@@ -1,5 +1,6 @@
 """Networks of one recipe, trained side by side, and how the mean of an ensemble scores on other rows."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 from experiments.pinn_closed import sized, trainable
 from experiments.pinn_data import Data
 from experiments.pinn_models import names_of, networks
+from experiments.pinn_pooled import begun
 from experiments.pinn_scores import scores
 from hdev_jax import progress
 from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
@@ -29,7 +31,8 @@ def trained(
     effects = tasks[0]["effects"]
     opened = sized({e: effects[e] for e in trainable(effects)})
     try:
-        ensemble = networks(rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=opened)
+        start = begun(data, json.dumps(effects), opened) if spec.start == "closed form" else None
+        ensemble = networks(rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=opened, start=start)
     except DivergedError as e:
         progress.step(f"{tasks[0]['name']}: {e}")
         return [{"diverged": True} for _ in tasks]

@@ -12,17 +12,23 @@ import pytest
 from experiments import pinn
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn import Config, chosen, tasks, together
-from experiments.pinn_closed import kernel, known, said, trainable
+from experiments.pinn_closed import closed, kernel, known, said, sized, trainable
 from experiments.pinn_data import Data, load, weighed
 from experiments.pinn_diagnosed import united
-from experiments.pinn_scores import pooled, scores
+from experiments.pinn_pooled import begun, pooled
+from experiments.pinn_scores import pooled as added_up
+from experiments.pinn_scores import scores
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn import Pinn, Recipe, predict
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
-from hdev_jax.physics import Grouped
+from hdev_jax.learn.pinn_rows import FEATURES
+from hdev_jax.physics import LIBRARY, Grouped
 from hdev_jax.physics.battery import RegenLimit
+from hdev_jax.physics.loads import AuxiliaryPower
 from hdev_jax.physics.losses import GearEfficiency
+from hdev_jax.physics.road import Headwind
 from hdev_jax.physics.sensors import GradeLag, MassScale, SamplingFilter, TimeSkew
+from hdev_jax.physics.tyres import RoadSurface, RollingSpeed
 
 
 def config(name, *sets):
@@ -107,7 +113,7 @@ def test_scores_are_those_of_all_rows_and_add_up_over_vehicles():
         mine = told[first : first + len(m.use)]
         parts.append(scores(data, m.use, mine, only=k)["test"])
         first += len(m.use)
-    whole, added = pooled([scores(data, use, told)["test"]]), pooled(parts)
+    whole, added = added_up([scores(data, use, told)["test"]]), added_up(parts)
     at = use == 2
     assert whole == pytest.approx(added, rel=1e-12)
     assert whole["rmse_wh"] == pytest.approx(np.sqrt(np.mean((told - y)[at] ** 2)), rel=1e-12)
@@ -243,6 +249,51 @@ def test_each_trips_mass_is_found_and_that_of_others_is_open():
     assert short.loose_wh[few.use == 0].any()
     assert unknown.loose_wh.any()
     assert not known(Data((few, b), 1), json.dumps({"mass_scale": {"scale": 0.0}}))[0].loose_wh.any()
+
+
+def test_a_network_begins_at_what_vehicles_that_resemble_say_in_closed_form():
+    """Planted: a rolling resistance that grows with v² alike in all vehicles. By itself a bus tells it from drag badly,
+    with the others well; and what is handed over is the closed form's own energy."""
+    effects = {"rolling_speed": {}, "road_surface": {}, "auxiliary_power": {}, "headwind": {}}
+    data = load("fleet", 3, 60, (), 1.0, None, 0, ("A", "B", "C", "bus_10m"))
+    sizes = (RollingSpeed(1.8e-6), RoadSurface(Grouped(jnp.array([0.0, 0.1, 0.05, 0.45]), "road_surface")))
+    vehicles = []
+    for k, m in enumerate(data.vehicles):
+        car = eqx.tree_at(lambda c: c.effect("aero").cda_m2, m.vehicle, 1.2 * m.vehicle.effect("aero").cda_m2)
+        y = said(car.plus(*sizes, AuxiliaryPower(1500.0 + 500.0 * k), Headwind(0.9)), m)
+        noise = np.random.default_rng(k).standard_normal(len(y)) * (3.0 + 0.01 * np.abs(y))
+        vehicles.append(dataclasses.replace(m, energy_wh=y + noise))
+    data = Data(tuple(vehicles), data.trained)
+    text, opened = json.dumps(effects), sized(effects)
+    names, theta = pooled(data, text)
+    drag = names.index("road.cda_m2")
+    alone = [float(c.vehicle.effect("aero").cda_m2 / m.vehicle.effect("aero").cda_m2) / 1.2 - 1
+             for m, c in zip(data.vehicles, closed(data, text), strict=True)]  # fmt: skip
+    together = np.exp(theta[:, drag]) / 1.2 - 1
+    assert np.max(np.abs(alone)) > 0.05
+    assert np.max(np.abs(together)) < 0.6 * np.max(np.abs(alone))
+    assert np.max(np.abs(together)) < 0.04
+
+    start = begun(data, text, opened)
+    rows, use = data.rows(FEATURES["unitless"], tuple(effects), known(data, text))
+    one = Recipe(features=FEATURES["unitless"], units=(4,), coefficients="free", by_vehicle=True, loss="likelihood")
+    model, memory = eqx.nn.make_with_state(Pinn)(one, 4, scale_wh=1.0, effects=opened, key=jax.random.key(0))
+    p = predict(start.of(model), memory, rows)
+    first = 0
+    for m, c, t in zip(data.vehicles, closed(data, text), theta, strict=True):
+        values = dict(zip(names, t, strict=True))
+        base = (m.vehicle.effect("rolling").c_rr, m.vehicle.effect("aero").cda_m2)
+        changed = {"road.c_rr": float(base[0]) * np.exp(values.pop("road.c_rr")),
+                   "road.cda_m2": float(base[1]) * np.exp(values.pop("road.cda_m2"))}  # fmt: skip
+        for n, x in values.items():
+            _, id, name = n.partition("[")[0].split(".")
+            (of,) = [q for q in LIBRARY[id].parameters if q.name == name]
+            changed[n] = of.null + of.scale * x
+        table = c.fit.table
+        car = table.insert(c.vehicle, [changed[r.name] for r in table.free])
+        np.testing.assert_allclose(p.physics_wh[first : first + len(m.use)], said(car, m), rtol=2e-4, atol=0.05)
+        first += len(m.use)
+    assert np.std(np.asarray(p.energy_wh) - data.column("energy_wh")) < 5.0
 
 
 def test_a_networks_physics_has_the_thresholds_and_what_acts_across_rows():

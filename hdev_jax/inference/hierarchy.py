@@ -20,7 +20,7 @@ from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.linear import LEAST_ROWS
 from hdev_jax.inference.models import POOL_FREEDOM
 
-__all__ = ["Sums", "drawn", "fleet_draws", "marginal"]
+__all__ = ["Sums", "drawn", "fleet_draws", "marginal", "resembling"]
 
 PROPOSAL_FREEDOM = 6.0  # tails of the proposal: heavier than the posterior's, so that no draw sticks
 WIDER = 1.1  # and a little wider
@@ -98,15 +98,17 @@ def marginal(phi: Float[np.ndarray, "n dim"], data: Sums) -> Float[np.ndarray, "
 
 
 def _given(
-    phi: Float[np.ndarray, "n dim"], data: Sums, rng: np.random.Generator
+    phi: Float[np.ndarray, "n dim"], data: Sums, rng: np.random.Generator | None
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n vehicle k"]]:
-    """The fleet's mean and the vehicles' coefficients, exactly, given (log τ, log σ²)."""
+    """The fleet's mean and the vehicles' coefficients given (log τ, log σ²): exact draws, without `rng` what they are
+    expected to be."""
     (vehicles, k), n = data.moment.shape, len(phi)
+    noise: Any = np.zeros if rng is None else rng.standard_normal
     tight, _, low, half, root, right = _parts(phi, data)
     y = _forward(root, right)
-    mean = _backward(root, [y[i] + rng.standard_normal(n) for i in range(k)])
+    mean = _backward(root, [y[i] + noise(n) for i in range(k)])
     pull = _forward(low, [np.repeat((tight[:, i] * mean[i])[:, None], vehicles, axis=1) for i in range(k)])
-    theta = _backward(low, [half[i] + pull[i] + rng.standard_normal((n, vehicles)) for i in range(k)])
+    theta = _backward(low, [half[i] + pull[i] + noise((n, vehicles)) for i in range(k)])
     return np.stack(mean, axis=-1), np.stack(theta, axis=-1)
 
 
@@ -146,6 +148,22 @@ def _mode(data: Sums, start: np.ndarray, width: np.ndarray) -> tuple[np.ndarray,
     return here, root
 
 
+def _width(data: Sums) -> Float[np.ndarray, " dim"]:
+    """About the posterior sds of (log τ, log σ²) where rows tell all coefficients."""
+    vehicles, k = data.moment.shape
+    return np.r_[np.full(k, 1.0 / np.sqrt(2.0 * vehicles + 2.0)), np.sqrt(2.0 / (data.rows + LEAST_ROWS))]
+
+
+def resembling(
+    data: Sums, start: Float[np.ndarray, " dim"]
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "vehicle k"]]:
+    """The fleet's mean, the spread of its vehicles and each one's coefficients, as expected at the mode of
+    (log τ, log σ²): empirical Bayes, in the units of `data`. `start`: a guess of (log τ, log σ²)."""
+    mode, _ = _mode(data, start, _width(data))
+    (mean,), (theta,) = _given(mode[None], data, None)
+    return mean, np.exp(mode[:-1]), theta
+
+
 def _accepted(weight: np.ndarray, odds: np.ndarray) -> np.ndarray:
     """Which proposal each draw is, by chain: the proposal's own, or the one that was there."""
     chains, draws = weight.shape
@@ -163,9 +181,7 @@ def drawn(
     """Draws `[chain, draw, …]` of `mean`, `spread`, `theta`, `variance` in the units of `data`; `kept`, how often a
     proposal was taken. `start`: a guess of (log τ, log σ²).
     """
-    vehicles, k = data.moment.shape
-    width = np.r_[np.full(k, 1.0 / np.sqrt(2.0 * vehicles + 2.0)), np.sqrt(2.0 / (data.rows + LEAST_ROWS))]
-    mode, root = _mode(data, start, width)
+    mode, root = _mode(data, start, _width(data))
     dim, freedom, n = len(mode), PROPOSAL_FREEDOM, chains * draws
     stretch = np.sqrt(freedom / rng.chisquare(freedom, (n, 1)))
     z = WIDER * stretch * rng.standard_normal((n, dim))

@@ -41,7 +41,7 @@ class Choices:
     - `coefficient_inputs`: `all` features, or those that a coefficient can depend on (`physical`).
     - `coefficient_loss`: squares of the distance from the table, `relative` to it or `absolute`.
     - `by_vehicle`: coefficients and effects have what trained vehicles have in common, their mean, and a part of each
-      vehicle's own about it; a vehicle that was not trained on has the mean.
+      vehicle's own about it; a vehicle that was not trained on has the median of these.
     - `loss`: `squares` (equation 7), or the normal `likelihood` of measured and of physical energy, whose variances
       are learned, which is what weighs the terms against each other (Kendall, Gal and Cipolla, CVPR 2018).
     - `energy_head`: with the head, or without; `stretch`, rows of a stretch of a trip whose sum counts too (1: none):
@@ -204,9 +204,11 @@ def _centred(table: Array) -> Array:
 
 
 def _of(table: Array, vehicle: Ids) -> Array:
-    """The vehicle's own part; zero for one that was not trained on."""
-    zero = jnp.zeros((1, *table.shape[1:]), table.dtype)
-    return jnp.concatenate([_centred(table), zero])[jnp.minimum(vehicle, table.shape[0])]
+    """The vehicle's own part; for one that was not trained on the middle one of the trained vehicles', which a few
+    tables that are off otherwise than most do not move."""
+    own = _centred(table)
+    middle = jnp.median(own, axis=0, keepdims=True)
+    return jnp.concatenate([own, middle])[jnp.minimum(vehicle, table.shape[0])]
 
 
 @eqx.filter_jit

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Array, Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn import C_RR_LIMIT, Objective, Pinn, Prediction, Recipe, Sized, predict
@@ -15,7 +18,7 @@ from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
 
-__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "fit", "stretches"]
+__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "Start", "fit", "stretches"]
 
 PAPER_WEIGHTS = (1.0, 0.1, 0.01)  # λ₁, λ₂, λ₃ of section 3.3.2
 _AT_ONCE = 2**13  # rows of a prediction; of more, what the hidden layers say does not fit the caches
@@ -27,6 +30,27 @@ class Member:
 
     seed: int
     weights: tuple[float, float, float] = PAPER_WEIGHTS
+
+
+class Start(NamedTuple):
+    """Where the coefficients and sizes of a network begin, in the place of the tables and of no effect: `Pinn`'s own
+    numbers of these names."""
+
+    common: Float[np.ndarray, " 2"]
+    own: Float[np.ndarray, "vehicle 2"]
+    sizes: dict[str, np.ndarray]
+    own_sizes: dict[str, np.ndarray]
+
+    def of(self, model: Pinn) -> Pinn:
+        """The model with these numbers. Raises `ValueError` where it has others."""
+
+        def put(old: Array, new: Any) -> Array:
+            if np.shape(old) != np.shape(new):
+                raise ValueError(f"start: {np.shape(old)} numbers are expected, found {np.shape(new)}")
+            return jnp.asarray(new, old.dtype)
+
+        where = lambda m: (m.common, m.own, m.sizes, m.own_sizes)  # noqa: E731
+        return eqx.tree_at(where, model, jax.tree.map(put, where(model), tuple(self)))
 
 
 @dataclass(frozen=True)
@@ -108,11 +132,14 @@ def fit(
     plan: Plan,
     rate: float = 0.005,
     effects: tuple[Sized, ...] = (),
+    start: Start | None = None,
+    checkpoint: Path | None = None,
     tell: Callable[[int, float, float], None] | None = None,
 ) -> Ensemble:
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
-    **Arguments:** `vehicles`, how many there are in `rows`. All members train in one program.
+    **Arguments:** `vehicles`, how many there are in `rows`; `start` of coefficients and sizes (none: the tables);
+    `checkpoint`, a file to go on from, as in `train`. All members train in one program.
 
     **Raises:** `DivergedError` where no member is left; `InputError` where there are no rows, or where a table's c_rr
     is not within the bounds that the recipe keeps it in.
@@ -137,7 +164,8 @@ def fit(
         )
         for m in members
     ]
-    arrays = [eqx.partition(model, eqx.is_inexact_array) for model, _ in made]
+    begun = [model if start is None else start.of(model) for model, _ in made]
+    arrays = [eqx.partition(model, eqx.is_inexact_array) for model in begun]
     static = arrays[0][1]
     weights = jax.tree.map(lambda *x: jnp.stack(x), *(w for w, _ in arrays))
     memory = jax.tree.map(lambda *x: jnp.stack(x), *(s for _, s in made))
@@ -150,7 +178,7 @@ def fit(
     trained = train(
         Objective(static, len(rows)), weights, memory, jax.tree.map(jnp.asarray, data), optax.adam(rate), plan,
         key=keys, held=jax.tree.map(jnp.asarray, check), settings=settings, members="" if single else "in turn",
-        tell=tell,
+        checkpoint=checkpoint, tell=tell,
     )  # fmt: skip
     weights, memory = trained.weights, trained.memory
     if single:

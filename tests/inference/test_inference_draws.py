@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, PRIOR, PRIOR_SD, driving, tabular, truck
-from scipy import stats
+from scipy import optimize, stats
 
 import hdev_jax
 from experiments import ranks
@@ -16,7 +16,7 @@ from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Rows, linear_fit, padded
 from hdev_jax.inference.calibrate import tabular as tabular_of
 from hdev_jax.inference.draws import Draws
-from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal
+from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal, resembling
 from hdev_jax.inference.linear import Prior, Statistics, posterior
 from hdev_jax.inference.mass import loads, mass_posterior, with_sd
 from hdev_jax.inference.models import Model
@@ -38,6 +38,32 @@ def world(rng: np.random.Generator, vehicles: int, rows: int, k: int = 2) -> tup
     gram, moment = np.stack([x.T @ x for x, _ in data]), np.stack([x.T @ y for x, y in data])
     sums = Sums(gram, moment, float(sum(y @ y for _, y in data)), float(vehicles * rows))
     return sums, {"mean": mean, "spread": spread, "theta": theta, "variance": variance}, data
+
+
+def test_vehicles_that_resemble_are_the_dense_normals_mean_at_the_mode():
+    """The mode by SciPy, the coefficients there by one big solve; what rows do not tell, the other vehicles do."""
+    rng = np.random.default_rng(3)
+    sums, _, _ = world(rng, 6, 40, k=3)
+    gram, moment = sums.gram.copy(), sums.moment.copy()
+    gram[5] = moment[5] = 0.0  # a vehicle without a row
+    sums = Sums(gram, moment, sums.square, sums.rows)
+    mean, spread, theta = resembling(sums, np.zeros(4))
+    best = optimize.minimize(lambda p: -marginal(p[None], sums)[0], np.zeros(4), method="BFGS").x
+    np.testing.assert_allclose(np.log(spread), best[:3], atol=0.03)
+    tight, variance = np.diag(spread**-2.0), float(np.exp(best[3]))
+    whole, right = np.zeros((21, 21)), np.zeros(21)  # six vehicles, then the mean
+    whole[18:, 18:] = np.eye(3)
+    for v in range(6):
+        at = slice(3 * v, 3 * v + 3)
+        whole[at, at] += gram[v] / variance + tight
+        whole[18:, 18:] += tight
+        whole[at, 18:] -= tight
+        whole[18:, at] -= tight
+        right[at] = moment[v] / variance
+    dense = np.linalg.solve(whole, right)
+    np.testing.assert_allclose(theta, dense[:18].reshape(6, 3), rtol=0.01, atol=1e-3)
+    np.testing.assert_allclose(mean, dense[18:], rtol=0.01, atol=1e-3)
+    np.testing.assert_allclose(theta[5], mean, rtol=1e-9)
 
 
 def test_the_marginal_is_the_dense_normals():

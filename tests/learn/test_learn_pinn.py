@@ -19,7 +19,7 @@ from scipy.stats import multivariate_t, norm
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads
 from hdev_jax.learn.pinn import Objective, Pinn, Recipe, Sized, predict
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, fit, stretches
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, Start, fit, stretches
 from hdev_jax.learn.pinn_rows import concatenated
 from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
@@ -197,18 +197,20 @@ def test_the_likelihood_and_its_stretches_by_hand(rows):
 
 def test_a_vehicle_that_was_not_trained_on_has_what_the_fleet_has_in_common(rows):
     model, memory = made(
-        recipe(coefficients="free", coefficient_inputs="physical", by_vehicle=True), effects=(AUXILIARY,)
+        recipe(coefficients="free", coefficient_inputs="physical", by_vehicle=True), vehicles=5, effects=(AUXILIARY,)
     )
-    for number in (0, 1, 2):
+    for number in (0, 4, 5):
         some = eqx.tree_at(lambda r: r.vehicle, rows, np.full(len(rows), number, np.int32))
-        own = np.zeros(2) if number == 2 else np.asarray(model.own[number]) - np.mean(model.own, axis=0)
+        apart = np.asarray(model.own)
+        apart = apart - apart.mean(axis=0)
+        own = np.median(apart, axis=0) if number == 5 else apart[number]
         heads = Heads(jnp.zeros(len(rows), jnp.float32), jnp.zeros((len(rows), 2), jnp.float32))
         c_rr, cda = model.coefficients(heads, some)
         factor = np.exp(np.asarray(model.common) + own)
         np.testing.assert_allclose(c_rr, rows.c_rr * factor[0], rtol=1e-5)
         np.testing.assert_allclose(cda, rows.cda_m2 * factor[1], rtol=1e-5)
         size, own_size = (m["auxiliary_power.power_w"] for m in (model.sizes, model.own_sizes))
-        size = size if number == 2 else size + own_size[number] - np.mean(own_size)
+        size = size + (np.median(own_size) if number == 5 else own_size[number]) - np.mean(own_size)
         np.testing.assert_allclose(model.effects_of(some)[0].power_w, 1000.0 * float(size) * np.ones(80), rtol=1e-5)
     # and its coefficients do not depend on the power that is asked for
     steeper = np.array(rows.features)
@@ -297,6 +299,39 @@ def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
         np.testing.assert_allclose(few.energy_wh, all_of.energy_wh[some], rtol=1e-6)
         np.testing.assert_allclose(few.c_rr, all_of.c_rr[some], rtol=1e-6)
     np.testing.assert_allclose(made.mean(rows).energy_wh, (first.energy_wh + second.energy_wh) / 2, rtol=1e-5)
+
+
+def test_a_fit_begins_where_it_is_told_to_and_goes_on_from_its_checkpoint(rows, tmp_path):
+    one, effects = recipe(coefficients="free", by_vehicle=True, loss="likelihood", stretch=4), (AUXILIARY,)
+    sizes = {"auxiliary_power.power_w": np.float64(0.7)}
+    start = Start(np.array([0.1, -0.2]), np.array([[0.05, 0.1], [-0.05, -0.1]]), sizes, {
+        "auxiliary_power.power_w": np.array([0.2, -0.2])})  # fmt: skip
+    given = {"vehicles": 2, "members": [Member(0), Member(1)], "effects": effects, "start": start}
+    still = fit(one, rows, rows, **given, plan=Plan(epochs=1, batch=80), rate=0.0)
+    (p, _) = still.predict(rows)
+    own = np.asarray(start.own)[np.asarray(rows.vehicle)]
+    np.testing.assert_allclose(p.c_rr, rows.c_rr * np.exp(0.1 + own[:, 0]), rtol=1e-5)
+    np.testing.assert_allclose(p.cda_m2, rows.cda_m2 * np.exp(-0.2 + own[:, 1]), rtol=1e-5)
+    watts = 1000.0 * (0.7 + np.array([0.2, -0.2]))[np.asarray(rows.vehicle)]
+    law = by_hand(rows, p.c_rr, p.cda_m2) + watts * rows.segments.duration_s / 3600
+    np.testing.assert_allclose(p.energy_wh, law, rtol=1e-4, atol=1e-2)
+
+    whole = fit(one, rows, rows, **given, plan=Plan(epochs=7, batch=16))
+    kept = tmp_path / "half"
+
+    def cut(epoch: int, loss: float, score: float) -> None:
+        if epoch == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(one, rows, rows, **given, plan=Plan(epochs=7, batch=16), checkpoint=kept, tell=cut)
+    assert kept.exists()
+    again = fit(one, rows, rows, **given, plan=Plan(epochs=7, batch=16), checkpoint=kept)
+    for a, b in zip(whole.predict(rows), again.predict(rows), strict=True):
+        np.testing.assert_array_equal(a.energy_wh, b.energy_wh)
+
+    with pytest.raises(ValueError, match=r"\(2, 2\) numbers are expected, found \(3, 2\)"):
+        fit(one, rows, rows, **{**given, "start": start._replace(own=np.zeros((3, 2)))}, plan=Plan(epochs=1))
 
 
 @pytest.mark.parametrize("seeds", [(0,), (0, 1)])
