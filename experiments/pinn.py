@@ -49,8 +49,8 @@ class Model(Strict, Choices):  # pyright: ignore[reportGeneralTypeIssues]
     stretch: int = Field(Choices.stretch, ge=1)
     # as physics: those of the config, or what the diagnosis of its `diagnosed` vehicles finds
     effects: bool | Literal["diagnosed"] = False
-    # where coefficients and sizes of effects begin: the tables and none, or what vehicles' rows say in closed form
-    start: Literal["tables", "closed form"] = "tables"
+    # what vehicles and the fleet have of coefficients and effects: trained, or what rows say in closed form
+    sizes: Literal["trained", "closed form"] = "trained"
     weights: tuple[float, float, float] = Field(PAPER_WEIGHTS, strict=False)
     members: int = Field(1, ge=1)  # of an ensemble
     rate: float = Field(0.005, gt=0)

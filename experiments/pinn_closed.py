@@ -225,10 +225,12 @@ class _Search:
 
 class Known(NamedTuple):
     """What networks take over from the closed form: a `vehicle`, as declared but with its thresholds that act within a
-    row; by row what effects that act across rows add (`across_wh`), what the mass is off by (`payload`, a share) and
+    row; the vehicle with all effects that do (`fitted`; None where nothing was fitted), at whose force efficiencies are
+    read; by row what effects that act across rows add (`across_wh`), what the mass is off by (`payload`, a share) and
     what one standard deviation of a mass that nobody found out adds (`loose_wh`)."""
 
     vehicle: Vehicle
+    fitted: Vehicle | None
     across_wh: np.ndarray
     payload: np.ndarray
     loose_wh: np.ndarray
@@ -256,8 +258,7 @@ def known(data: Data, effects: str) -> tuple[Known, ...]:
     across = [e for e in listed if not row_wise(LIBRARY[e])]
     within = [e for e in listed if e not in across and e not in trainable(listed)]
     names = [(e, p) for e in within for p in LIBRARY[e].parameters]
-    free = bool(names or across or "scale" in _open(listed, "mass_scale"))
-    fits = closed(data, effects) if free else [None] * len(data.vehicles)
+    fits = closed(data, effects) if listed else (None,) * len(data.vehicles)
     found = np.array([
         [np.nan if f is None else float(getattr(f.vehicle.effect(e), p.name)) / _unit(m, p) for e, p in names]
         for f, m in zip(fits, data.vehicles, strict=True)
@@ -278,7 +279,7 @@ def known(data: Data, effects: str) -> tuple[Known, ...]:
             payload, loose = f.payload, np.where(m.use == 0, 0.0, _loose(f.vehicle, m, f.payload_sd))
         if f is not None and across:
             moved = said(f.vehicle, m, f.weighed(m)) - said(f.vehicle.minus(*across), m, f.weighed(m))
-        out.append(Known(car, moved, payload, loose))
+        out.append(Known(car, None if f is None else f.vehicle.minus(*across), moved, payload, loose))
     return tuple(out)
 
 

@@ -62,7 +62,8 @@ class Data:
     ) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
 
-        Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`).
+        Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`), with
+        its effects where those are known.
         **Arguments:** `effects`, those that are trained; `known`, what is taken over of each vehicle.
         """
         made = [at_null(LIBRARY[e]) for e in effects]
@@ -72,7 +73,7 @@ class Data:
             s = weighed(s, own.payload)
             one = rows_of(
                 own.vehicle, s, m.energy_wh, number=min(k, self.trained), features=features, effects=made,
-                calibrated=fit, across_wh=own.across_wh, loose_wh=own.loose_wh,
+                calibrated=own.fitted or fit, across_wh=own.across_wh, loose_wh=own.loose_wh,
             )  # fmt: skip
             parts.append(one)
         return concatenated(parts), self.column("use")

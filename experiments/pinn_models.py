@@ -7,7 +7,7 @@ import numpy as np
 from experiments.paper1_halves import fitted
 from experiments.pinn_data import Data, Member
 from hdev_jax.learn.pinn import Recipe, Sized
-from hdev_jax.learn.pinn_fit import Ensemble, Start, fit
+from hdev_jax.learn.pinn_fit import Ensemble, Sizes, fit
 from hdev_jax.learn.pinn_fit import Member as Seed
 from hdev_jax.learn.pinn_rows import FEATURES, Rows
 from hdev_jax.learn.train import Plan
@@ -52,7 +52,7 @@ def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
 
 def networks(
     rows: Rows, use: np.ndarray, recipe: Recipe, data: Data, members: Sequence[tuple[int, Sequence[float]]], *,
-    plan: Plan, rate: float, effects: tuple[Sized, ...], start: Start | None,
+    plan: Plan, rate: float, effects: tuple[Sized, ...], sizes: Sizes | None,
 ) -> Ensemble:  # fmt: skip
     """Members by seed and weights, trained side by side on the training rows, kept at their best on the validation."""
     from hdev_jax import progress
@@ -65,5 +65,5 @@ def networks(
 
     return fit(
         recipe, rows.take(use == 0), rows.take(use == 1), vehicles=data.trained, plan=plan, rate=rate,
-        members=seeds, effects=effects, start=start, tell=tell,
+        members=seeds, effects=effects, sizes=sizes, tell=tell,
     )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.pinn_closed import sized, trainable
 from experiments.pinn_data import Data
 from experiments.pinn_models import names_of, networks
-from experiments.pinn_pooled import begun
+from experiments.pinn_pooled import sizes_of
 from experiments.pinn_scores import scores
 from hdev_jax import progress
 from hdev_jax.learn.pinn import C_RR_LIMIT, Choices, Recipe
@@ -31,8 +31,8 @@ def trained(
     effects = tasks[0]["effects"]
     opened = sized({e: effects[e] for e in trainable(effects)})
     try:
-        start = begun(data, json.dumps(effects), opened) if spec.start == "closed form" else None
-        ensemble = networks(rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=opened, start=start)
+        sizes = sizes_of(data, json.dumps(effects), opened) if spec.sizes == "closed form" else None
+        ensemble = networks(rows, use, recipe, data, members, plan=plan, rate=spec.rate, effects=opened, sizes=sizes)
     except DivergedError as e:
         progress.step(f"{tasks[0]['name']}: {e}")
         return [{"diverged": True} for _ in tasks]

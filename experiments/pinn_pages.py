@@ -29,6 +29,11 @@ GIVEN = ("ours and the closed form are given the list of effects that the fleet 
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
+LEARNED = f"{OURS} without effects"
+NAMEABLE = {
+    WAYS["kernel"]: "effects of the given list, in closed form",
+    f"{OURS}, effects as diagnosed, its physics alone": "effects that diagnoses of training routes name",
+}
 
 
 def _gathered(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
@@ -124,8 +129,25 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             *_lost(results),
             *([GIVEN] if config.data == "fleet" else []),
             *(f"effects in {name}: {', '.join(effects) or 'none'}" for name, effects in used.items()),
+            *_nameable(gathered),
         ],
     }  # fmt: skip
+
+
+def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[str]:
+    """How much of what a network learns named effects explain: of the squared error that ours without effects takes off
+    the calibrated declared physics, the share that the physics with effects takes off by itself."""
+    square = {way: pooled(f)["rmse_wh"] ** 2 for (way, use), f in gathered.items() if use == "test"}
+    base, learned = square.get(WAYS["bayesian"]), square.get(LEARNED)
+    if base is None or learned is None or learned >= base:
+        return []
+    what = f"what {LEARNED} learns beyond the calibrated declared physics ({base**0.5:.4g} to {learned**0.5:.4g} Wh)"
+    return [
+        f"{what}: {whose} take off {100 * (base - square[way]) / (base - learned):.0f} % of that squared error by "
+        "themselves"
+        for way, whose in NAMEABLE.items()
+        if way in square
+    ]
 
 
 def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
@@ -251,7 +273,7 @@ def _against_black_boxes(config: Any, curves: Mapping[tuple[str, str], list[tupl
     if (OURS, "test") not in curves:
         return out
     for use in ("test", "unseen"):
-        for other in ("network without physics", "lightgbm"):
+        for other in ("network without physics", "network, no kernel", "lightgbm", "LightGBM, no kernel"):
             if (other, use) not in curves or (OURS, use) not in curves:
                 continue
             others, mine_at = dict(curves[other, use]), dict(curves[OURS, use])

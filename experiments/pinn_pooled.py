@@ -1,5 +1,5 @@
-"""Where the coefficients of networks begin: what the rows of each vehicle say in closed form, vehicles of one fleet being
-alike as far as their rows say so.
+"""Coefficients and sizes of networks that are not trained: what the rows of each vehicle say in closed form, vehicles
+of one fleet being alike as far as their rows say so.
 
 A vehicle alone hardly tells some things apart (drag and a rolling resistance that grows with v²). What is alike in all
 vehicles (the second, over its usual size) is told by all of their rows, and then the first is known too.
@@ -14,10 +14,10 @@ from experiments.pinn_data import Data, Member
 from hdev_jax.inference import Coefficient, LinearFit
 from hdev_jax.inference.hierarchy import Sums, resembling
 from hdev_jax.learn.pinn import Sized
-from hdev_jax.learn.pinn_fit import Start
+from hdev_jax.learn.pinn_fit import Sizes
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["begun", "pooled"]
+__all__ = ["pooled", "sizes_of"]
 
 _LEAST_SHARE = 0.05  # of its table that a coefficient is, so that it has a logarithm
 
@@ -85,8 +85,8 @@ def _in_units(m: Member, fit: LinearFit) -> tuple[np.ndarray, np.ndarray, float,
     return gram, moment + gram @ where, float(square), where
 
 
-def begun(data: Data, effects: str, opened: tuple[Sized, ...]) -> Start:
-    """Where a network with the effects `opened` begins. Arguments and errors are those of `closed`."""
+def sizes_of(data: Data, effects: str, opened: tuple[Sized, ...]) -> Sizes:
+    """Those of a network with the effects `opened`. Arguments and errors are those of `closed`."""
     names, theta = pooled(data, effects)
     place = {n: k for k, n in enumerate(names)}
     mean = theta.mean(axis=0)
@@ -103,4 +103,4 @@ def begun(data: Data, effects: str, opened: tuple[Sized, ...]) -> Start:
             both = picked(mean, of), picked(own, of)
             sizes[path], own_sizes[path] = both if groups else (both[0][0], both[1][:, 0])
     base = ["road.c_rr", "road.cda_m2"]
-    return Start(picked(mean, base), picked(own, base), sizes, own_sizes)
+    return Sizes(picked(mean, base), picked(own, base), sizes, own_sizes)

@@ -15,7 +15,7 @@ from experiments.pinn import Config, chosen, tasks, together
 from experiments.pinn_closed import closed, kernel, known, said, sized, trainable
 from experiments.pinn_data import Data, load, weighed
 from experiments.pinn_diagnosed import united
-from experiments.pinn_pooled import begun, pooled
+from experiments.pinn_pooled import pooled, sizes_of
 from experiments.pinn_scores import pooled as added_up
 from experiments.pinn_scores import scores
 from hdev_jax.errors import InputError
@@ -251,7 +251,7 @@ def test_each_trips_mass_is_found_and_that_of_others_is_open():
     assert not known(Data((few, b), 1), json.dumps({"mass_scale": {"scale": 0.0}}))[0].loose_wh.any()
 
 
-def test_a_network_begins_at_what_vehicles_that_resemble_say_in_closed_form():
+def test_a_network_has_what_vehicles_that_resemble_say_in_closed_form():
     """Planted: a rolling resistance that grows with v² alike in all vehicles. By itself a bus tells it from drag badly,
     with the others well; and what is handed over is the closed form's own energy."""
     effects = {"rolling_speed": {}, "road_surface": {}, "auxiliary_power": {}, "headwind": {}}
@@ -274,11 +274,11 @@ def test_a_network_begins_at_what_vehicles_that_resemble_say_in_closed_form():
     assert np.max(np.abs(together)) < 0.6 * np.max(np.abs(alone))
     assert np.max(np.abs(together)) < 0.04
 
-    start = begun(data, text, opened)
-    rows, use = data.rows(FEATURES["unitless"], tuple(effects), known(data, text))
+    known_sizes = sizes_of(data, text, opened)
+    rows, _ = data.rows(FEATURES["unitless"], tuple(effects), known(data, text))
     one = Recipe(features=FEATURES["unitless"], units=(4,), coefficients="free", by_vehicle=True, loss="likelihood")
     model, memory = eqx.nn.make_with_state(Pinn)(one, 4, scale_wh=1.0, effects=opened, key=jax.random.key(0))
-    p = predict(start.of(model), memory, rows)
+    p = predict(known_sizes.of(model), memory, rows)
     first = 0
     for m, c, t in zip(data.vehicles, closed(data, text), theta, strict=True):
         values = dict(zip(names, t, strict=True))
@@ -291,7 +291,9 @@ def test_a_network_begins_at_what_vehicles_that_resemble_say_in_closed_form():
             changed[n] = of.null + of.scale * x
         table = c.fit.table
         car = table.insert(c.vehicle, [changed[r.name] for r in table.free])
-        np.testing.assert_allclose(p.physics_wh[first : first + len(m.use)], said(car, m), rtol=2e-4, atol=0.05)
+        # but for efficiencies, which are read at the force that the vehicle alone says
+        off = np.asarray(p.physics_wh[first : first + len(m.use)]) - said(car, m)
+        assert np.sqrt(np.mean(off**2)) < 0.2
         first += len(m.use)
     assert np.std(np.asarray(p.energy_wh) - data.column("energy_wh")) < 5.0
 

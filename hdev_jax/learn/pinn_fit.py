@@ -18,7 +18,7 @@ from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train
 
-__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "Start", "fit", "stretches"]
+__all__ = ["PAPER_WEIGHTS", "Ensemble", "Member", "Sizes", "fit", "stretches"]
 
 PAPER_WEIGHTS = (1.0, 0.1, 0.01)  # λ₁, λ₂, λ₃ of section 3.3.2
 _AT_ONCE = 2**13  # rows of a prediction; of more, what the hidden layers say does not fit the caches
@@ -32,9 +32,8 @@ class Member:
     weights: tuple[float, float, float] = PAPER_WEIGHTS
 
 
-class Start(NamedTuple):
-    """Where the coefficients and sizes of a network begin, in the place of the tables and of no effect: `Pinn`'s own
-    numbers of these names."""
+class Sizes(NamedTuple):
+    """`Pinn`'s numbers of these names, known from elsewhere and not trained."""
 
     common: Float[np.ndarray, " 2"]
     own: Float[np.ndarray, "vehicle 2"]
@@ -46,11 +45,22 @@ class Start(NamedTuple):
 
         def put(old: Array, new: Any) -> Array:
             if np.shape(old) != np.shape(new):
-                raise ValueError(f"start: {np.shape(old)} numbers are expected, found {np.shape(new)}")
+                raise ValueError(f"sizes: {np.shape(old)} numbers are expected, found {np.shape(new)}")
             return jnp.asarray(new, old.dtype)
 
-        where = lambda m: (m.common, m.own, m.sizes, m.own_sizes)  # noqa: E731
-        return eqx.tree_at(where, model, jax.tree.map(put, where(model), tuple(self)))
+        return eqx.tree_at(_sizes, model, jax.tree.map(put, _sizes(model), tuple(self)))
+
+
+def _sizes(model: Pinn) -> tuple[Any, ...]:
+    return model.common, model.own, model.sizes, model.own_sizes
+
+
+def _trained(model: Pinn, sizes: Sizes | None) -> Any:
+    """Which leaves are trained."""
+    every = jax.tree.map(eqx.is_inexact_array, model)
+    if sizes is None:
+        return every
+    return eqx.tree_at(_sizes, every, jax.tree.map(lambda _: False, _sizes(model)))
 
 
 @dataclass(frozen=True)
@@ -132,13 +142,13 @@ def fit(
     plan: Plan,
     rate: float = 0.005,
     effects: tuple[Sized, ...] = (),
-    start: Start | None = None,
+    sizes: Sizes | None = None,
     checkpoint: Path | None = None,
     tell: Callable[[int, float, float], None] | None = None,
 ) -> Ensemble:
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
-    **Arguments:** `vehicles`, how many there are in `rows`; `start` of coefficients and sizes (none: the tables);
+    **Arguments:** `vehicles`, how many there are in `rows`; `sizes` of coefficients and effects that are known;
     `checkpoint`, a file to go on from, as in `train`. All members train in one program.
 
     **Raises:** `DivergedError` where no member is left; `InputError` where there are no rows, or where a table's c_rr
@@ -164,8 +174,8 @@ def fit(
         )
         for m in members
     ]
-    begun = [model if start is None else start.of(model) for model, _ in made]
-    arrays = [eqx.partition(model, eqx.is_inexact_array) for model in begun]
+    models = [model if sizes is None else sizes.of(model) for model, _ in made]
+    arrays = [eqx.partition(model, _trained(model, sizes)) for model in models]
     static = arrays[0][1]
     weights = jax.tree.map(lambda *x: jnp.stack(x), *(w for w, _ in arrays))
     memory = jax.tree.map(lambda *x: jnp.stack(x), *(s for _, s in made))
@@ -183,4 +193,5 @@ def fit(
     weights, memory = trained.weights, trained.memory
     if single:
         weights, memory = jax.tree.map(lambda x: x[None], (weights, memory))
-    return Ensemble(eqx.combine(weights, static), memory, scale, tuple(members), trained)
+    alike = jax.tree.map(lambda x: jnp.stack([x] * len(members)) if eqx.is_array(x) else x, static)
+    return Ensemble(eqx.combine(weights, alike), memory, scale, tuple(members), trained)

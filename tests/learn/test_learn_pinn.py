@@ -19,7 +19,7 @@ from scipy.stats import multivariate_t, norm
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads
 from hdev_jax.learn.pinn import Objective, Pinn, Recipe, Sized, predict
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, Start, fit, stretches
+from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, Sizes, fit, stretches
 from hdev_jax.learn.pinn_rows import concatenated
 from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
@@ -301,14 +301,18 @@ def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
     np.testing.assert_allclose(made.mean(rows).energy_wh, (first.energy_wh + second.energy_wh) / 2, rtol=1e-5)
 
 
-def test_a_fit_begins_where_it_is_told_to_and_goes_on_from_its_checkpoint(rows, tmp_path):
-    one, effects = recipe(coefficients="free", by_vehicle=True, loss="likelihood", stretch=4), (AUXILIARY,)
+def test_a_fit_keeps_the_sizes_that_it_is_given_and_goes_on_from_its_checkpoint(rows, tmp_path):
+    effects = (AUXILIARY,)
     sizes = {"auxiliary_power.power_w": np.float64(0.7)}
-    start = Start(np.array([0.1, -0.2]), np.array([[0.05, 0.1], [-0.05, -0.1]]), sizes, {
+    start = Sizes(np.array([0.1, -0.2]), np.array([[0.05, 0.1], [-0.05, -0.1]]), sizes, {
         "auxiliary_power.power_w": np.array([0.2, -0.2])})  # fmt: skip
-    given = {"vehicles": 2, "members": [Member(0), Member(1)], "effects": effects, "start": start}
-    still = fit(one, rows, rows, **given, plan=Plan(epochs=1, batch=80), rate=0.0)
-    (p, _) = still.predict(rows)
+    given = {"vehicles": 2, "members": [Member(0), Member(1)], "effects": effects, "sizes": start}
+    one = recipe(coefficients="free", coefficient_inputs="physical", by_vehicle=True, loss="likelihood", stretch=4)
+    still = fit(one, rows, rows, **given, plan=Plan(epochs=3, batch=80), rate=0.01)
+    assert np.ptp(still.predict(rows)[0].residual_wh) > 0.1, "all else is trained"
+    head = lambda m: (m.coefficient_network.head, m.network.head)  # noqa: E731
+    model = eqx.tree_at(head, still.model, jax.tree.map(jnp.zeros_like, head(still.model)))
+    (p, _) = dataclasses.replace(still, model=model).predict(rows)
     own = np.asarray(start.own)[np.asarray(rows.vehicle)]
     np.testing.assert_allclose(p.c_rr, rows.c_rr * np.exp(0.1 + own[:, 0]), rtol=1e-5)
     np.testing.assert_allclose(p.cda_m2, rows.cda_m2 * np.exp(-0.2 + own[:, 1]), rtol=1e-5)
@@ -331,7 +335,7 @@ def test_a_fit_begins_where_it_is_told_to_and_goes_on_from_its_checkpoint(rows, 
         np.testing.assert_array_equal(a.energy_wh, b.energy_wh)
 
     with pytest.raises(ValueError, match=r"\(2, 2\) numbers are expected, found \(3, 2\)"):
-        fit(one, rows, rows, **{**given, "start": start._replace(own=np.zeros((3, 2)))}, plan=Plan(epochs=1))
+        fit(one, rows, rows, **{**given, "sizes": start._replace(own=np.zeros((3, 2)))}, plan=Plan(epochs=1))
 
 
 @pytest.mark.parametrize("seeds", [(0,), (0, 1)])
