@@ -5,6 +5,7 @@ A vehicle alone hardly tells some things apart (drag and a rolling resistance th
 vehicles (the second, over its usual size) is told by all of their rows, and then the first is known too.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,13 @@ from hdev_jax.physics import LIBRARY
 
 __all__ = ["pooled", "sizes_of"]
 
+_LOGS = ("road.c_rr", "road.cda_m2")
 _LEAST_SHARE = 0.05  # of its table that a coefficient is, so that it has a logarithm
+_LOG_SD = 0.3  # usual: of a coefficient over its table, and of vehicles about each other
 
 
 class _Unit(NamedTuple):
-    """How a network tells a coefficient: as a logarithm over its table, or from its null value in usual sizes."""
+    """How the fleet's coefficients are told: as logarithms over their tables, or from null values, in usual sizes."""
 
     null: float
     size: float
@@ -31,9 +34,9 @@ class _Unit(NamedTuple):
 
     @classmethod
     def of(cls, m: Member, c: Coefficient) -> "_Unit":
-        if c.path in ("road.c_rr", "road.cda_m2"):
+        if c.path in _LOGS:
             e = m.vehicle.effect("rolling" if c.path == "road.c_rr" else "aero")
-            return cls(float(e.c_rr if c.path == "road.c_rr" else e.cda_m2), 1.0, True)
+            return cls(float(e.c_rr if c.path == "road.c_rr" else e.cda_m2), _LOG_SD, True)
         if not c.path.startswith("effects."):  # no network has it; it only takes what is its own
             return cls(c.value, c.scale, False)
         _, id, name = c.path.split(".")
@@ -41,15 +44,16 @@ class _Unit(NamedTuple):
         return cls(p.null, p.scale, False)
 
     def told(self, value: float) -> tuple[float, float]:
-        """A value as a network tells it, and how much of the coefficient's own unit one of the network's is there."""
+        """A value in these units, and how much of its own unit one of these is there."""
         if not self.log:
             return (value - self.null) / self.size, self.size
         value = max(value, _LEAST_SHARE * self.null)
-        return float(np.log(value / self.null)), value
+        return float(np.log(value / self.null)) / self.size, value * self.size
 
 
 def pooled(data: Data, effects: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Coefficients by name, and each trained vehicle's value of them as networks tell them [vehicle, coefficient].
+    """Coefficients by name, and each trained vehicle's value of them as networks tell them [vehicle, coefficient]:
+    c_rr and C_d·A as logarithms over their tables, effects' sizes from their null value in usual sizes.
 
     One that has no training rows, or none that tell a coefficient, has what the fleet has of it. Arguments and errors
     are those of `closed`.
@@ -68,11 +72,11 @@ def pooled(data: Data, effects: str) -> tuple[tuple[str, ...], np.ndarray]:
             square, rows = square + left, rows + float(f.statistics.rows)
     apart = np.clip(np.nan_to_num(np.nanstd(seen, axis=0), nan=1.0), 0.02, 2.0)
     _, _, theta = resembling(Sums(gram, moment, square, rows), np.r_[np.log(apart), 0.0])
-    return names, theta
+    return names, theta * np.where(np.isin(names, _LOGS), _LOG_SD, 1.0)
 
 
 def _in_units(m: Member, fit: LinearFit) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Σxxᵀ, Σxr and Σr² of a vehicle's rows about the networks' zero, in their units and in those of the noise of its
+    """Σxxᵀ, Σxr and Σr² of a vehicle's rows about zero, in units of `_Unit` and in those of the noise of its
     rows; and what it says by itself."""
     values, noise = np.asarray(fit.values), float(fit.posterior.sigma)
     told = [_Unit.of(m, c).told(float(x)) for c, x in zip(fit.table.free, values, strict=True)]
@@ -92,7 +96,7 @@ def sizes_of(data: Data, effects: str, opened: tuple[Sized, ...]) -> Sizes:
     mean = theta.mean(axis=0)
     own = theta - mean
 
-    def picked(values: np.ndarray, of: list[str]) -> np.ndarray:
+    def picked(values: np.ndarray, of: Sequence[str]) -> np.ndarray:
         return np.stack([values[..., place[n]] if n in place else np.zeros(values.shape[:-1]) for n in of], axis=-1)
 
     sizes, own_sizes = {}, {}
@@ -102,5 +106,4 @@ def sizes_of(data: Data, effects: str, opened: tuple[Sized, ...]) -> Sizes:
             of = [f"effects.{path}[{g}]" for g in range(groups)] if groups else [f"effects.{path}"]
             both = picked(mean, of), picked(own, of)
             sizes[path], own_sizes[path] = both if groups else (both[0][0], both[1][:, 0])
-    base = ["road.c_rr", "road.cda_m2"]
-    return Sizes(picked(mean, base), picked(own, base), sizes, own_sizes)
+    return Sizes(picked(mean, _LOGS), picked(own, _LOGS), sizes, own_sizes)
