@@ -12,6 +12,7 @@ import numpy as np
 
 from experiments.pinn_closed import closed
 from experiments.pinn_data import Data, Member
+from hdev_jax.errors import InputError
 from hdev_jax.inference import Coefficient, LinearFit
 from hdev_jax.inference.hierarchy import Sums, resembling
 from hdev_jax.learn.pinn import Sized
@@ -37,7 +38,7 @@ class _Unit(NamedTuple):
         if c.path in _LOGS:
             e = m.vehicle.effect("rolling" if c.path == "road.c_rr" else "aero")
             return cls(float(e.c_rr if c.path == "road.c_rr" else e.cda_m2), _LOG_SD, True)
-        if not c.path.startswith("effects."):  # no network has it; it only takes what is its own
+        if not c.path.startswith("effects."):
             return cls(c.value, c.scale, False)
         _, id, name = c.path.split(".")
         p = next(p for p in LIBRARY[id].parameters if p.name == name)
@@ -90,8 +91,11 @@ def _in_units(m: Member, fit: LinearFit) -> tuple[np.ndarray, np.ndarray, float,
 
 
 def sizes_of(data: Data, effects: str, opened: tuple[Sized, ...]) -> Sizes:
-    """Those of a network with the effects `opened`. Arguments and errors are those of `closed`."""
+    """Those of a network with the effects `opened`. Arguments and errors are those of `closed`; `InputError` where the
+    closed form estimates what no network has."""
     names, theta = pooled(data, effects)
+    if other := [n for n in names if n not in _LOGS and not n.startswith("effects.")]:
+        raise InputError(f"sizes in closed form: {other[0]} is estimated, and no network has it; list auxiliary_power")
     place = {n: k for k, n in enumerate(names)}
     mean = theta.mean(axis=0)
     own = theta - mean

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import pinn
+from experiments import pinn, pinn_pooled
 from experiments.config import CONFIGS, resolve, typed
 from experiments.pinn import Config, chosen, tasks, together
 from experiments.pinn_closed import closed, kernel, known, said, sized, trainable
@@ -296,6 +296,13 @@ def test_a_network_has_what_vehicles_that_resemble_say_in_closed_form():
         assert np.sqrt(np.mean(off**2)) < 0.2
         first += len(m.use)
     assert np.std(np.asarray(p.energy_wh) - data.column("energy_wh")) < 5.0
+
+
+def test_what_no_network_has_is_not_estimated_beside_its_sizes(monkeypatch):
+    names = ("road.c_rr", "road.cda_m2", "battery.auxiliary_w")
+    monkeypatch.setattr(pinn_pooled, "pooled", lambda *_: (names, np.zeros((1, 3))))
+    with pytest.raises(InputError, match=r"battery.auxiliary_w is estimated, and no network has it"):
+        sizes_of(None, "{}", ())
 
 
 def test_a_networks_physics_has_the_thresholds_and_what_acts_across_rows():
