@@ -128,7 +128,7 @@ def inference(rows: Rows, vehicles: int) -> dict[str, float]:
     """Microseconds of one row, seconds of 550,000."""
     learner = Learner(Recipe(features=FEATURES["channels"]), rows, vehicles)
     one = jax.tree.map(lambda x: x[:1], rows)
-    with_numbers = ready(learner.model, learner.memory)
+    with_numbers = ready(learner.model, learner.memory, one)
     ways = {"ready": lambda: with_numbers(one), "predict": lambda: predict(learner.model, learner.memory, one)}
     taken: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(2000):

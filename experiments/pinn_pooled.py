@@ -17,13 +17,13 @@ from hdev_jax.inference import Coefficient, LinearFit
 from hdev_jax.inference.hierarchy import Sums, resembling
 from hdev_jax.learn.pinn import Sized
 from hdev_jax.learn.pinn_fit import Sizes
+from hdev_jax.learn.pinn_loss import LOG_SD
 from hdev_jax.physics import LIBRARY
 
 __all__ = ["pooled", "sizes_of"]
 
 _LOGS = ("road.c_rr", "road.cda_m2")
 _LEAST_SHARE = 0.05  # of its table that a coefficient is, so that it has a logarithm
-_LOG_SD = 0.3  # usual: of a coefficient over its table, and of vehicles about each other
 
 
 class _Unit(NamedTuple):
@@ -37,7 +37,7 @@ class _Unit(NamedTuple):
     def of(cls, m: Member, c: Coefficient) -> "_Unit":
         if c.path in _LOGS:
             e = m.vehicle.effect("rolling" if c.path == "road.c_rr" else "aero")
-            return cls(float(e.c_rr if c.path == "road.c_rr" else e.cda_m2), _LOG_SD, True)
+            return cls(float(e.c_rr if c.path == "road.c_rr" else e.cda_m2), LOG_SD, True)
         if not c.path.startswith("effects."):
             return cls(c.value, c.scale, False)
         _, id, name = c.path.split(".")
@@ -73,7 +73,7 @@ def pooled(data: Data, effects: str) -> tuple[tuple[str, ...], np.ndarray]:
             square, rows = square + left, rows + float(f.statistics.rows)
     apart = np.clip(np.nan_to_num(np.nanstd(seen, axis=0), nan=1.0), 0.02, 2.0)
     _, _, theta = resembling(Sums(gram, moment, square, rows), np.r_[np.log(apart), 0.0])
-    return names, theta * np.where(np.isin(names, _LOGS), _LOG_SD, 1.0)
+    return names, theta * np.where(np.isin(names, _LOGS), LOG_SD, 1.0)
 
 
 def _in_units(m: Member, fit: LinearFit) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:

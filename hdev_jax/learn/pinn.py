@@ -12,19 +12,18 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads, Network
 from hdev_jax.learn.pinn_rows import PHYSICAL, Rows, energy, wheel_energy, with_coefficients
 from hdev_jax.physics import Effect, Grouped, coefficients_that_hold
-from hdev_jax.segments import Column, Ids
+from hdev_jax.segments import Ids
 
-__all__ = ["C_RR_LIMIT", "Choices", "Objective", "Pinn", "Prediction", "Recipe", "Sized", "predict", "ready"]
+__all__ = ["C_RR_LIMIT", "Choices", "Pinn", "Prediction", "Recipe", "Sized", "centred", "predict", "ready"]
 
 C_RR_LIMIT = 0.02  # (0, 0.02] of section 3.3.2
-_LOG_SD = 0.3  # of a vehicle's coefficient about its table, in logarithms: tables are off by some ten per cent
-_SPREAD_DOF = 0.1  # degrees of freedom of what is known beforehand of how far vehicles are apart
 _BY_ROW = 0.5  # how far the network's head moves a free coefficient, in logarithms, for an output of 1
 
 
@@ -197,7 +196,7 @@ class Pinn(eqx.Module):
         return Prediction(base + residual, physics, residual, c_rr, cda, sd), heads, memory
 
 
-def _centred(table: Array) -> Array:
+def centred(table: Array) -> Array:
     """What each vehicle has of its own, about the mean. Were it not, the own parts could take all that the vehicles
     share and leave the common part, which is all that is known of an unseen vehicle, at the tables."""
     return table - jnp.mean(table, axis=0, keepdims=True)
@@ -206,7 +205,7 @@ def _centred(table: Array) -> Array:
 def _of(table: Array, vehicle: Ids) -> Array:
     """The vehicle's own part; for one that was not trained on the middle one of the trained vehicles', which a few
     tables that are off otherwise than most do not move."""
-    own = _centred(table)
+    own = centred(table)
     middle = jnp.median(own, axis=0, keepdims=True)
     return jnp.concatenate([own, middle])[jnp.minimum(vehicle, table.shape[0])]
 
@@ -223,83 +222,26 @@ def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
     return eqx.tree_at(lambda p: (p.c_rr, p.cda_m2), p, both)
 
 
-def ready(model: Pinn, memory: eqx.nn.State) -> Callable[[Rows], Prediction]:
-    """`predict` with the model's numbers compiled in: for a row at a time, where handing these over takes longest."""
-    return jax.jit(lambda rows: predict(model, memory, rows))
+def ready(model: Pinn, memory: eqx.nn.State, like: Rows) -> Callable[[Rows], Prediction]:
+    """`predict` for rows of the shape of `like`, a row at a time, where handing over numbers takes longest: the model's
+    are compiled in, and the row's columns go in as two arrays, of real and of whole numbers."""
+    leaves, tree = jax.tree.flatten(like)
+    whole = [np.issubdtype(np.asarray(x).dtype, np.integer) for x in leaves]
+    shapes = [np.shape(x) for x in leaves]
+    sizes = [int(np.prod(s)) for s in shapes]
 
+    @jax.jit
+    def packed(*parts: Array) -> Prediction:
+        begin, out = [0, 0], []
+        for of, shape, n in zip(whole, shapes, sizes, strict=True):
+            out.append(parts[of][begin[of] : begin[of] + n].reshape(shape))
+            begin[of] += n
+        return predict(model, memory, jax.tree.unflatten(tree, out))
 
-@dataclass(frozen=True)
-class Objective:
-    """Equation 7, or the likelihood. Batches are `Rows` [stretch, row of it, …]; `settings` are λ₁, λ₂ and λ₃ (of the
-    likelihood: what the measured term, the physics term and the priors are weighed by); `rows` is how many there are.
-    """
+    def one(rows: Rows) -> Prediction:
+        parts: tuple[list[Any], list[Any]] = ([], [])
+        for of, x in zip(whole, jax.tree.leaves(rows), strict=True):
+            parts[of].append(x.ravel())
+        return packed(*map(np.concatenate, parts))
 
-    static: Any  # the model without its weights
-    rows: int
-
-    def loss(self, weights: Any, memory: Any, batch: Rows, key: PRNGKeyArray, settings: Any) -> tuple[Array, Any]:
-        """Of one batch."""
-        model: Pinn = eqx.combine(weights, self.static)
-        flat = _flat(batch)
-        p, heads, memory = model(flat, memory, key=key)
-        terms = self._squares if model.recipe.loss == "squares" else self._likelihood
-        return jnp.sum(settings * jnp.stack(terms(model, p, heads, flat, batch))), memory
-
-    def score(self, weights: Any, memory: Any, data: Rows, settings: Any) -> Array:
-        """The first term alone, of rows that were held out."""
-        model: Pinn = eqx.combine(weights, self.static)
-        flat = _flat(data)
-        p, heads, _ = model(flat, memory)
-        terms = self._squares if model.recipe.loss == "squares" else self._likelihood
-        return terms(model, p, heads, flat, data)[0]
-
-    def _squares(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:
-        def mean(x: Column) -> Array:
-            return jnp.sum(rows.weight * x) / jnp.sum(rows.weight)
-
-        unit = (rows.c_rr, rows.cda_m2) if model.recipe.coefficient_loss == "relative" else (1.0, 1.0)
-        pairs = zip((p.c_rr, p.cda_m2), (rows.c_rr, rows.cda_m2), unit, strict=True)
-        away = sum((mean(((x - table) / u) ** 2) for x, table, u in pairs), jnp.zeros(()))
-        return mean((rows.energy_wh - p.energy_wh) ** 2), mean((rows.energy_wh - p.physics_wh) ** 2), away
-
-    def _likelihood(self, model: Pinn, p: Prediction, heads: Heads, rows: Rows, batch: Rows) -> tuple[Array, ...]:
-        w, count = rows.weight, jnp.sum(rows.weight)
-        floor, share = jnp.exp(model.noise[2]) * model.scale_wh, jnp.exp(model.noise[3])
-        loose = jnp.sqrt(floor**2 + (share * p.physics_wh) ** 2 + jnp.asarray(rows.loose_wh) ** 2)
-        error, off = rows.energy_wh - p.energy_wh, rows.energy_wh - p.physics_wh
-        data = jnp.sum(w * _normal(error, p.sd_wh)) / count
-        physics = jnp.sum(w * _normal(off, loose)) / count
-        shape = batch.weight.shape
-        if model.recipe.stretch > 1:
-            whole = lambda x: jnp.sum((w * x).reshape(shape), axis=1)  # noqa: E731
-            shared = (jnp.exp(model.drift) * whole(p.physics_wh)) ** 2 + whole(rows.loose_wh) ** 2
-            sd = jnp.sqrt(whole(p.sd_wh**2 - rows.loose_wh**2) + shared + 1e-6)
-            data = data + jnp.sum(_normal(whole(error), sd) * (whole(w) > 0)) / count
-        prior = 0.5 * jnp.sum(model.common**2) / _LOG_SD**2 + _between_vehicles(model.own, _LOG_SD)
-        prior += sum(0.5 * jnp.sum(x**2) for x in model.sizes.values())
-        prior += sum(_between_vehicles(x, 1.0) for x in model.own_sizes.values())
-        by_row = jnp.sum(w[:, None] * heads.coefficients**2) / count
-        return data, physics, prior / self.rows + 0.01 * by_row
-
-
-def _between_vehicles(own: Array, usual: float) -> Array:
-    """Minus the logarithm of the density of what vehicles have of their own [vehicle, …], but for a constant.
-
-    Each column is normal about the mean, with a variance that has the scaled inverse χ² distribution about `usual`²,
-    of so few degrees of freedom that the data say what it is: integrated out, a multivariate Student t (Gelman et al.,
-    Bayesian Data Analysis, 3.2) of one dimension less than there are vehicles, the mean being taken out. So a
-    coefficient that is alike in all vehicles is told by all of their rows together.
-    """
-    squares = jnp.sum(_centred(own) ** 2, axis=0)
-    power = 0.5 * (_SPREAD_DOF + own.shape[0] - 1)
-    return power * jnp.sum(jnp.log1p(squares / (_SPREAD_DOF * usual**2)))
-
-
-def _normal(error: Column, sd: Column) -> Array:
-    """Minus the logarithm of the normal density, but for a constant."""
-    return 0.5 * jnp.square(error / sd) + jnp.log(sd)
-
-
-def _flat(batch: Rows) -> Rows:
-    """Stretches one after the other."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+    return one

@@ -13,7 +13,8 @@ import optax
 from jaxtyping import Array, Float
 
 from hdev_jax.errors import InputError
-from hdev_jax.learn.pinn import C_RR_LIMIT, Objective, Pinn, Prediction, Recipe, Sized, predict
+from hdev_jax.learn.pinn import C_RR_LIMIT, Pinn, Prediction, Recipe, Sized, predict
+from hdev_jax.learn.pinn_loss import Objective
 from hdev_jax.learn.pinn_rows import Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Plan, Trained, train

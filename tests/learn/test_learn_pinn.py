@@ -18,8 +18,9 @@ from scipy.stats import multivariate_t, norm
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.heads import Heads
-from hdev_jax.learn.pinn import Objective, Pinn, Recipe, Sized, predict
+from hdev_jax.learn.pinn import Pinn, Recipe, Sized, predict, ready
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, Sizes, fit, stretches
+from hdev_jax.learn.pinn_loss import Objective
 from hdev_jax.learn.pinn_rows import concatenated
 from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
@@ -85,6 +86,16 @@ def test_an_untrained_model_says_what_the_sheet_says(rows, coefficients):
     np.testing.assert_allclose(p.c_rr, rows.c_rr, rtol=1e-5)
     np.testing.assert_allclose(p.cda_m2, rows.cda_m2, rtol=1e-6)
     np.testing.assert_array_equal(p.residual_wh, 0)
+
+
+def test_a_model_that_is_ready_says_the_same_of_a_row(rows):
+    model, memory = made(recipe(coefficients="free", by_vehicle=True, loss="likelihood"), effects=(AUXILIARY,))
+    say = ready(model, memory, rows.take(np.array([0])))
+    expected = predict(model, memory, rows)
+    for k in (0, 7, 70):
+        one = say(rows.take(np.array([k])))
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a[0], b[k], rtol=1e-5, atol=1e-4)
 
 
 @settings(max_examples=100)
