@@ -1,7 +1,7 @@
 """Speed of the physics-informed network of paper 1: training and inference, against PyTorch and a plain JAX loop.
 
     python benchmarks/pinn.py [training] [inference] [members] [--rows 385000] [--epochs 5] [--routes 60]
-                              [--members 1 4 16] [--compiled] [--json FILE]
+                              [--members 1 4 16] [--compiled] [--json FILE] [--write]
 
 *Training*: the paper's recipe (256-128, batch normalisation, batches of 1,024, Adam, float32), with dropout of 0.1 and
 without; `whole` has the loss of equation 7 with the kernel in it, `network` is the energy head's squares alone. PyTorch
@@ -15,7 +15,8 @@ work moves little: on one core (`taskset -c 0`) it is the fairest of them. Compi
 accelerator, ours and the loop run on it, as every command does, and `over_cpu` is ours on the processor over that.
 *Inference*: one row, called from Python, and 550,000. *Members*: seeds in one program on 20,000 rows, against one.
 
-Rows are of the synthetic fleet, repeated up to the number wanted.
+Rows are of the synthetic fleet, repeated up to the number wanted. With --write the tables are kept in
+docs/pinn_speed.md.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from pinn_page import page
 from pinn_sides import BATCH, Learner, Torch, same_loss
 
 from experiments.pinn_closed import known
@@ -44,6 +46,7 @@ LIMITS = {
     "over_torch": 1.0, "over_loop": 3.0, "paper_minutes": 10.0, "ready_one_row_us": 100.0, "many_rows_s": 1.0,
     "grid_minutes": 30.0,
 }  # fmt: skip
+DOC = Path(__file__).parents[1] / "docs" / "pinn_speed.md"
 PAPER_ROWS, GRID = 550_000, 75 * 3
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -183,6 +186,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--members", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--compiled", action="store_true", help="torch.compile too, which wants a compiler")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--write", action="store_true", help="keep the tables in docs/pinn_speed.md")
     given = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     rows, vehicles = fleet_rows(given.rows, given.routes)
@@ -198,6 +202,9 @@ def main(argv: list[str] | None = None) -> int:
     print(_shown(out))
     if given.json:
         given.json.write_text(json.dumps(out, indent=1) + "\n")
+    if given.write:
+        command = " ".join(["python benchmarks/pinn.py", *(sys.argv[1:] if argv is None else argv)])
+        DOC.write_text(page(out, LIMITS, command), encoding="utf-8")
     missed = []
     for key, value in out.items():
         limit = next((v for k, v in LIMITS.items() if key.endswith(k)), None)

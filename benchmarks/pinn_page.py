@@ -1,0 +1,71 @@
+"""docs/pinn_speed.md of what `pinn.py` measured."""
+
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["page"]
+
+PARTS = {"whole": "the loss of equation 7, kernel included", "network": "the energy head's squares alone"}
+SIDES = {"ours": "ours", "cpu": "ours, on the processor", "loop": "plain JAX loop", "torch_1": "PyTorch, one thread",
+         "torch_2": "PyTorch, two threads"}  # fmt: skip
+
+
+def page(out: Mapping[str, Any], limits: Mapping[str, float], command: str) -> str:
+    """The page, with what was wanted beside what was measured."""
+    lines = [
+        "# Networks with physics: speed", "",
+        f"Made by `{command}` on {out['device']}, {out['cores']} cores, float32; load of the machine before it",
+        f"{out['load']:.1f}. Synthetic rows. Sides take an epoch each by turns; numbers are of the median epoch,",
+        "without compiling. PyTorch has the same network, batch and loss"
+        + (f" (relative difference of both losses {out['same_loss']:.0e})." if "same_loss" in out else "."), "",
+    ]  # fmt: skip
+    if any(k.startswith("whole") for k in out):
+        lines += [f"## Training: 256-128 units, batches of 1,024, Adam, {out['rows']:,} rows", "",
+                  "| loss | dropout | side | thousand rows a second | by seconds of the processor | ours over it |",
+                  "|---|---|---|---:|---:|---:|"]  # fmt: skip
+        for part, what in PARTS.items():
+            for dropout in ("0.1", "0"):
+                lines += [_line(out, part, what, dropout, side) for side in SIDES
+                          if f"{part}_dropout_{dropout}_{side}_per_s" in out]  # fmt: skip
+        lines += [
+            "", f"550,000 rows of which 70 % train, 100 epochs, with dropout: {out['paper_minutes']:.1f} minutes "
+            f"({limits['paper_minutes']:g} wanted).", "", _why(out, limits["over_loop"]), "",
+        ]  # fmt: skip
+    if "many_rows_s" in out:
+        lines += ["## Inference", "", "| what | measured | wanted |", "|---|---:|---:|"]
+        lines += [
+            f"| one row, called from Python, the model's numbers compiled in | {out['ready_one_row_us']:.0f} µs | "
+            f"{limits['ready_one_row_us']:g} µs |",
+            f"| one row, called from Python | {out['predict_one_row_us']:.0f} µs | – |",
+            f"| 550,000 rows | {out['many_rows_s']:.2f} s | {limits['many_rows_s']:g} s |",
+            "",
+        ]
+    if "grid_minutes" in out:
+        lines += ["## Members in one program, 20,000 rows", "", "| members | µs a member and row |", "|---|---:|"]
+        lines += [f"| {k.split('_')[1]} | {v:.2f} |" for k, v in out.items()
+                  if k.startswith("members_") and k.endswith("_us") and "cpu" not in k]  # fmt: skip
+        lines += ["", f"A grid of 75 weights and 3 seeds, 100 epochs each: {out['grid_minutes']:.1f} minutes "
+                      f"({limits['grid_minutes']:g} wanted)."]  # fmt: skip
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _line(out: Mapping[str, Any], part: str, what: str, dropout: str, side: str) -> str:
+    name = f"{part}_dropout_{dropout}"
+    mine, theirs = out[f"{name}_ours_per_s"], out[f"{name}_{side}_per_s"]
+    ratio = "" if side == "ours" else f"{mine / theirs:.2f}"
+    cpu = out[f"{name}_{side}_cpu_per_s"]
+    return f"| {what} | {dropout} | {SIDES[side]} | {theirs / 1e3:.0f} | {cpu / 1e3:.0f} | {ratio} |"
+
+
+def _why(out: Mapping[str, Any], wanted: float) -> str:
+    """Why a loop from Python is not slower than it is."""
+    step = {side: 1024e3 / out[f"whole_dropout_0.1_{side}_per_s"] for side in ("ours", "loop")}
+    over = step["loop"] / step["ours"]
+    if over >= wanted:
+        return f"A step called from Python takes {over:.1f} times ours ({wanted:g} wanted)."
+    return (
+        f"A step takes {step['ours']:.2f} ms in ours and {step['loop']:.2f} ms when Python draws the batch and calls "
+        f"it: {over:.2f} times, {wanted:g} wanted. Both do the same arithmetic, and with this network it is nearly all "
+        f"of a step: what the loop adds, {step['loop'] - step['ours']:.2f} ms, would have to be {wanted - 1:g} times "
+        "the arithmetic."
+    )
