@@ -63,9 +63,9 @@ def said(vehicle: Vehicle, m: Member, segments: Segments | None = None) -> np.nd
     return np.asarray(predict(vehicle, rows.segments, "energy_wh"))[: rows.rows]
 
 
-def _whole(n: int) -> int:
+def _whole(n: int, least: int = 1) -> int:
     """The next power of two: vehicles of about as many rows, or trips, share what is compiled, which takes longest."""
-    return 2 ** int(np.ceil(np.log2(max(n, 1))))
+    return 2 ** int(np.ceil(np.log2(max(n, least))))
 
 
 class Closed(NamedTuple):
@@ -83,15 +83,17 @@ class Closed(NamedTuple):
         return weighed(m.segments, self.payload)
 
 
-def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
+def kernel(m: Member, effects: Mapping[str, Mapping[str, float]], *, rows: int = 1, trips: int = 1) -> Closed:
     """The whole kernel, efficiency map included, with these effects; parameters that are not given are fitted to the
     training rows. A shape that is not given has its usual value.
 
     Sizes in closed form, thresholds by search between, and where the mass is among the effects what each trip's is off
     by about the mean: a random effect of the trips, whose variance the trips tell (EM; Laird and Ware 1982). Otherwise
-    a few trips that are heavier than logged would be told as drag and rolling resistance.
+    a few trips that are heavier than logged would be told as drag and rolling resistance. `rows` and `trips`: what
+    other vehicles have, so that they share what is compiled.
     """
     train = m.where(0)
+    size = _whole(len(train), rows)
     segments, energy = m.segments.take(train), m.energy_wh[train]
     row_s = float(np.median(np.asarray(segments.duration_s)))
     car, table, searches = m.vehicle, m.table, []
@@ -107,26 +109,26 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]]) -> Closed:
         searches += [_Search(id, p, row_s) for p in e.parameters if p.kind == "limit" and p.name not in given]
     limits = {f"effects.{s.id}.{s.p.name}": True for s in searches}
     opened = "scale" in _open(effects, "mass_scale") and segments.has("mass_kg")
-    trips = _Trips.of(segments) if opened else None
+    masses = _Trips.of(segments, trips) if opened else None
 
     def fit(car: Vehicle, s: Segments) -> tuple[Vehicle, LinearFit]:
-        found = fitted(car, table, s, energy, "energy_wh", paper=True, size=_whole(len(s)))
+        found = fitted(car, table, s, energy, "energy_wh", paper=True, size=size)
         return table.insert(car, found.values), found
 
     car, found = fit(car, segments)
-    for _ in range(_ROUNDS if searches or trips else 0):
-        now = segments if trips is None else trips.weighed(segments)
+    for _ in range(_ROUNDS if searches or masses else 0):
+        now = segments if masses is None else masses.weighed(segments)
         if searches:
-            left = _Left(car, table.with_free(**limits), padded(now, energy, _whole(len(now))))
+            left = _Left(car, table.with_free(**limits), padded(now, energy, size))
             for search in searches:
                 car = search.best(car, left)
         car, found = fit(car, now)
-        trips = trips and trips.again(car, segments, energy)
-    if trips is None:
+        masses = masses and masses.again(car, segments, energy, size)
+    if masses is None:
         return Closed(car, found, np.zeros(len(m.use)), np.nan if opened else 0.0)
     payload = np.zeros(len(m.use))
-    payload[train] = trips.off[trips.of_row]
-    return Closed(*fit(car, trips.weighed(segments)), payload, trips.sd)
+    payload[train] = masses.off[masses.of_row]
+    return Closed(*fit(car, masses.weighed(segments)), payload, masses.sd)
 
 
 def _open(effects: Mapping[str, Mapping[str, float]], id: str) -> set[str]:
@@ -149,26 +151,29 @@ class _Trips(NamedTuple):
     of_row: np.ndarray
     off: np.ndarray
     sd: float
+    groups: int  # trips, and more that have no row
 
     @classmethod
-    def of(cls, segments: Segments) -> "_Trips | None":
+    def of(cls, segments: Segments, least: int) -> "_Trips | None":
         """Before anything is known of them; None where trips are too few to have a variance."""
         names, of_row = np.unique(np.asarray(segments.trip), return_inverse=True)
-        return cls(of_row, np.zeros(len(names)), MASS_SD) if len(names) >= _LEAST_TRIPS else None
+        n = len(names)
+        return cls(of_row, np.zeros(n), MASS_SD, _whole(n, least)) if n >= _LEAST_TRIPS else None
 
     def weighed(self, segments: Segments) -> Segments:
         """The rows with these masses."""
         return weighed(segments, self.off[self.of_row])
 
-    def again(self, car: Vehicle, segments: Segments, energy: np.ndarray) -> "_Trips":
-        """One step of EM: each trip's mass with all else as it is, then the variance that they have."""
+    def again(self, car: Vehicle, segments: Segments, energy: np.ndarray, size: int) -> "_Trips":
+        """One step of EM: each trip's mass with all else as it is, then the variance that they have. `size`: as in
+        `padded`."""
         mean = float(car.effect("mass_scale").scale)
         sd = self.sd * (1.0 + mean)
         own = ParameterTable((coefficient("effects.mass_scale.scale", "1", mean, sd, positive=False),))
-        rows, trips = padded(segments, energy, _whole(len(segments))), len(self.off)
-        found = linear_fit(car, own, lambda: [Rows(rows, self.of_row, self.of_row)], "energy_wh", groups=_whole(trips))
-        off, sd = (found.values[:trips, 0] - mean) / (1.0 + mean), found.sd[:trips, 0] / (1.0 + mean)
-        return _Trips(self.of_row, off, float(np.sqrt(np.mean(off**2 + sd**2))))
+        rows, n = padded(segments, energy, size), len(self.off)
+        found = linear_fit(car, own, lambda: [Rows(rows, self.of_row, self.of_row)], "energy_wh", groups=self.groups)
+        off, sd = (found.values[:n, 0] - mean) / (1.0 + mean), found.sd[:n, 0] / (1.0 + mean)
+        return self._replace(off=off, sd=float(np.sqrt(np.mean(off**2 + sd**2))))
 
 
 class _Left:
@@ -242,7 +247,10 @@ def closed(data: Data, effects: str) -> tuple[Closed | None, ...]:
     of their parameters, as JSON, so that the answer can be kept. Raises `InputError` where no vehicle has any."""
     data.trains()
     listed: dict[str, dict[str, float]] = json.loads(effects)
-    return tuple(kernel(m, listed) if np.any(m.use == 0) else None for m in data.vehicles)
+    trained = [m for m in data.vehicles if np.any(m.use == 0)]
+    rows = max(len(m.where(0)) for m in trained)
+    trips = max(len(np.unique(m.routes[m.where(0)])) for m in trained)
+    return tuple(kernel(m, listed, rows=rows, trips=trips) if np.any(m.use == 0) else None for m in data.vehicles)
 
 
 @cache

@@ -1,15 +1,19 @@
 """What the whole diagnosis finds on training routes: of one vehicle, and as the effects of a network's physics."""
 
 import dataclasses
+import multiprocessing
 import tempfile
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from experiments.pinn_data import Data, Member
+from hdev_jax.compiling import compile_quickly
 from hdev_jax.logs import Log
 from hdev_jax.physics import LIBRARY, Vehicle
 
@@ -44,7 +48,18 @@ def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
 
 def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
     """The vehicle with the effects that the diagnosis finds on its first training routes, what these are, and what the
-    declared coefficients became. The whole loop, as `hdev diagnose` runs it."""
+    declared coefficients became. The whole loop, as `hdev diagnose` runs it on so short a log: in a process that
+    compiles quickly, which one where networks are trained does not."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _quickly) as pool:
+        return pool.submit(_diagnosed, m, routes, seed).result()
+
+
+def _quickly() -> None:
+    compile_quickly()
+    jax.config.update("jax_enable_x64", True)
+
+
+def _diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
     from hdev_jax import progress
     from hdev_jax.diagnosis.diagnose import diagnose
     from hdev_jax.diagnosis.problem import prepare
