@@ -34,8 +34,8 @@ import numpy as np
 from pinn_page import page
 from pinn_sides import BATCH, Learner, Torch, same_loss
 
-from experiments.pinn_closed import known
 from experiments.pinn_data import load
+from experiments.pinn_known import known
 from hdev_jax.learn.pinn import Recipe, predict, ready
 from hdev_jax.learn.pinn_fit import Ensemble, Member
 from hdev_jax.learn.pinn_rows import FEATURES, Rows

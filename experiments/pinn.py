@@ -15,9 +15,10 @@ from experiments import pinn_pages
 from experiments.config import Strict
 from experiments.data import MissingDataError, fingerprint
 from experiments.pinn_buses import bus_sources
-from experiments.pinn_closed import kernel, known, said, trainable
+from experiments.pinn_closed import kernel, said, trainable
 from experiments.pinn_data import Data, load
 from experiments.pinn_diagnosed import diagnosed, found_effects
+from experiments.pinn_known import known
 from experiments.pinn_models import bayesian, boosted, names_of
 from experiments.pinn_networks import trained
 from experiments.pinn_scores import scores
@@ -30,8 +31,8 @@ from hdev_jax.rundir import Run
 __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = (
-    "pinn.py", "pinn_closed.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_models.py", "pinn_networks.py",
-    "pinn_pooled.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py",
+    "pinn.py", "pinn_closed.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_known.py", "pinn_models.py",
+    "pinn_networks.py", "pinn_pooled.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py",
 )  # fmt: skip
 
 
@@ -135,6 +136,11 @@ def _checked(config: Config) -> None:
         known = [p.name for p in LIBRARY[id].parameters]
         if odd := set(shapes) - set(known):
             raise InputError(f"config, key effects.{id}: {sorted(odd)[0]!r} is none of {', '.join(known)}")
+    for name, m in chosen(config).items():
+        if m.kind == "network" and m.sizes == "closed form" and not (m.coefficients == "free" and m.by_vehicle):
+            raise InputError(
+                f"config, model {name!r}: sizes in closed form want coefficients that are free, by vehicle"
+            )
     named = [n for n, m in chosen(config).items() if m.effects == "diagnosed"]
     if named and not config.diagnosed:
         raise InputError(f"config: model {named[0]!r} has the effects of a diagnosis, key diagnosed names no vehicle")

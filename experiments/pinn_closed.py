@@ -7,7 +7,7 @@ is not: it is searched between closed forms of all else. A trip's mass is off by
 import json
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ from hdev_jax.learn.pinn_rows import row_wise
 from hdev_jax.physics import LIBRARY, Effect, Parameter, Vehicle, at_null, most_group
 from hdev_jax.segments import Segments
 
-__all__ = ["Closed", "Known", "closed", "kernel", "known", "said", "sized", "trainable"]
+__all__ = ["Closed", "closed", "kernel", "listed", "opened", "said", "sized", "trainable"]
 
 _ROUNDS = 5  # of a search: the threshold's grid, then each time a quarter of the steps about the best
 _LEAST_TRIPS = 4  # whose masses have a variance
@@ -77,10 +77,20 @@ class Closed(NamedTuple):
     fit: LinearFit
     payload: np.ndarray
     payload_sd: float
+    size: int  # as in `padded`, of the training rows
 
     def weighed(self, m: Member) -> Segments:
         """The vehicle's log with its trips' masses as they were found."""
         return weighed(m.segments, self.payload)
+
+    def again(self, m: Member, values: np.ndarray) -> LinearFit:
+        """The same training rows with the kernel linearised at other values of its coefficients."""
+        train = m.where(0)
+        rows = padded(self.weighed(m).take(train), m.energy_wh[train], self.size)
+        of, table = np.zeros(len(train), int), self.fit.table
+        return linear_fit(
+            self.vehicle, table, lambda: [Rows(rows, of)], "energy_wh", passes=1, prior=(values, self.fit.scale)
+        )
 
 
 def kernel(m: Member, effects: Mapping[str, Mapping[str, float]], *, rows: int = 1, trips: int = 1) -> Closed:
@@ -96,20 +106,16 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]], *, rows: int =
     size = _whole(len(train), rows)
     segments, energy = m.segments.take(train), m.energy_wh[train]
     row_s = float(np.median(np.asarray(segments.duration_s)))
-    car, table, searches = m.vehicle, m.table, []
-    if "power_w" in _open(effects, "auxiliary_power"):  # the same column as the declared load
-        table = table.with_free(**{"battery.auxiliary_w": False})
-    for id, given in effects.items():
-        e = _as_given(id, given, m)
-        car = car.plus(e)
-        sizes = [p.name for p in e.parameters if p.kind == "size" and p.name not in given]
-        by = tuple(p.by for p in e.parameters if p.by)
-        groups = tuple(str(g) for g in range(1, most_group(m.segments, by) + 1))
-        table = table.plus(*effect_coefficients(e, sizes, shapes=False, groups=groups))
-        searches += [_Search(id, p, row_s) for p in e.parameters if p.kind == "limit" and p.name not in given]
+    car, table = listed(m, effects)
+    searches = [
+        _Search(id, p, row_s)
+        for id, given in effects.items()
+        for p in LIBRARY[id].parameters
+        if p.kind == "limit" and p.name not in given
+    ]
     limits = {f"effects.{s.id}.{s.p.name}": True for s in searches}
-    opened = "scale" in _open(effects, "mass_scale") and segments.has("mass_kg")
-    masses = _Trips.of(segments, trips) if opened else None
+    loose = "scale" in opened(effects, "mass_scale") and segments.has("mass_kg")
+    masses = _Trips.of(segments, trips) if loose else None
 
     def fit(car: Vehicle, s: Segments) -> tuple[Vehicle, LinearFit]:
         found = fitted(car, table, s, energy, "energy_wh", paper=True, size=size)
@@ -125,13 +131,28 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]], *, rows: int =
         car, found = fit(car, now)
         masses = masses and masses.again(car, segments, energy, size)
     if masses is None:
-        return Closed(car, found, np.zeros(len(m.use)), np.nan if opened else 0.0)
+        return Closed(car, found, np.zeros(len(m.use)), np.nan if loose else 0.0, size)
     payload = np.zeros(len(m.use))
     payload[train] = masses.off[masses.of_row]
-    return Closed(*fit(car, masses.weighed(segments)), payload, masses.sd)
+    return Closed(*fit(car, masses.weighed(segments)), payload, masses.sd, size)
 
 
-def _open(effects: Mapping[str, Mapping[str, float]], id: str) -> set[str]:
+def listed(m: Member, effects: Mapping[str, Mapping[str, float]]) -> tuple[Vehicle, ParameterTable]:
+    """The vehicle with these effects at what is given of them, and the table with their sizes free."""
+    car, table = m.vehicle, m.table
+    if "power_w" in opened(effects, "auxiliary_power"):  # the same column as the declared load
+        table = table.with_free(**{"battery.auxiliary_w": False})
+    for id, given in effects.items():
+        e = _as_given(id, given, m)
+        car = car.plus(e)
+        sizes = [p.name for p in e.parameters if p.kind == "size" and p.name not in given]
+        by = tuple(p.by for p in e.parameters if p.by)
+        groups = tuple(str(g) for g in range(1, most_group(m.segments, by) + 1))
+        table = table.plus(*effect_coefficients(e, sizes, shapes=False, groups=groups))
+    return car, table
+
+
+def opened(effects: Mapping[str, Mapping[str, float]], id: str) -> set[str]:
     """Parameters of a listed effect that are not given."""
     return {p.name for p in LIBRARY[id].parameters} - {*effects[id]} if id in effects else set()
 
@@ -228,76 +249,13 @@ class _Search:
         return eqx.tree_at(lambda c: getattr(c.effect(self.id), self.p.name), car, jnp.asarray(value))
 
 
-class Known(NamedTuple):
-    """What networks take over from the closed form: a `vehicle`, as declared but with its thresholds that act within a
-    row; the vehicle with all effects that do (`fitted`; None where nothing was fitted), at whose force efficiencies are
-    read; by row what effects that act across rows add (`across_wh`), what the mass is off by (`payload`, a share) and
-    what one standard deviation of a mass that nobody found out adds (`loose_wh`)."""
-
-    vehicle: Vehicle
-    fitted: Vehicle | None
-    across_wh: np.ndarray
-    payload: np.ndarray
-    loose_wh: np.ndarray
-
-
 @cache
 def closed(data: Data, effects: str) -> tuple[Closed | None, ...]:
     """`kernel` of each vehicle, None of one without training rows. **Arguments:** `effects`, by id with what is given
     of their parameters, as JSON, so that the answer can be kept. Raises `InputError` where no vehicle has any."""
     data.trains()
-    listed: dict[str, dict[str, float]] = json.loads(effects)
+    given: dict[str, dict[str, float]] = json.loads(effects)
     trained = [m for m in data.vehicles if np.any(m.use == 0)]
     rows = max(len(m.where(0)) for m in trained)
     trips = max(len(np.unique(m.routes[m.where(0)])) for m in trained)
-    return tuple(kernel(m, listed, rows=rows, trips=trips) if np.any(m.use == 0) else None for m in data.vehicles)
-
-
-@cache
-def known(data: Data, effects: str) -> tuple[Known, ...]:
-    """Of each vehicle, what its training rows tell (`kernel`) of the effects that no network can train.
-
-    A vehicle without such rows has the others' medians of thresholds, of a power for each kilogram of the declared
-    mass, and of how far trips' masses are apart; and nothing of what acts across rows. Arguments and errors are those
-    of `closed`.
-    """
-    data.trains()
-    listed: dict[str, dict[str, float]] = json.loads(effects)
-    across = [e for e in listed if not row_wise(LIBRARY[e])]
-    within = [e for e in listed if e not in across and e not in trainable(listed)]
-    names = [(e, p) for e in within for p in LIBRARY[e].parameters]
-    fits = closed(data, effects) if listed else (None,) * len(data.vehicles)
-    found = np.array([
-        [np.nan if f is None else float(getattr(f.vehicle.effect(e), p.name)) / _unit(m, p) for e, p in names]
-        for f, m in zip(fits, data.vehicles, strict=True)
-    ])  # fmt: skip
-    found = np.where(np.isnan(found), np.nanmedian(found, axis=0, keepdims=True) if names else found, found)
-    told = [f.payload_sd for f in fits if f is not None and np.isfinite(f.payload_sd)]
-    usual = float(np.median(told)) if told else MASS_SD * ("scale" in _open(listed, "mass_scale"))
-    out = []
-    for m, f, own in zip(data.vehicles, fits, found, strict=True):
-        values: dict[str, dict[str, Any]] = {e: {} for e in within}
-        for (e, p), x in zip(names, own, strict=True):
-            values[e][p.name] = jnp.asarray(x * _unit(m, p))
-        car = m.vehicle.plus(*(LIBRARY[e](**v) for e, v in values.items()))
-        moved, payload = np.zeros(len(m.use)), np.zeros(len(m.use))
-        if f is None or np.isnan(f.payload_sd):  # of no trip
-            loose = _loose(car if f is None else f.vehicle, m, usual)
-        else:
-            payload, loose = f.payload, np.where(m.use == 0, 0.0, _loose(f.vehicle, m, f.payload_sd))
-        if f is not None and across:
-            moved = said(f.vehicle, m, f.weighed(m)) - said(f.vehicle.minus(*across), m, f.weighed(m))
-        out.append(Known(car, None if f is None else f.vehicle.minus(*across), moved, payload, loose))
-    return tuple(out)
-
-
-def _loose(car: Vehicle, m: Member, sd: float) -> np.ndarray:
-    """What a mass that is by a share of `sd` higher adds to each row's energy [Wh]."""
-    if sd == 0:
-        return np.zeros(len(m.use))
-    return said(car, m, weighed(m.segments, np.full(len(m.use), sd))) - said(car, m)
-
-
-def _unit(m: Member, p: Parameter) -> float:
-    """What a parameter is told in for vehicles to be alike."""
-    return float(m.vehicle.mass_kg) if p.unit == "W" else 1.0
+    return tuple(kernel(m, given, rows=rows, trips=trips) if np.any(m.use == 0) else None for m in data.vehicles)

@@ -21,7 +21,7 @@ from hdev_jax.physics import LIBRARY, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
 
 if TYPE_CHECKING:
-    from experiments.pinn_closed import Known
+    from experiments.pinn_known import Known
 
 __all__ = ["Data", "Member", "load", "weighed"]
 

@@ -2,28 +2,33 @@
 of one fleet being alike as far as their rows say so.
 
 A vehicle alone hardly tells some things apart (drag and a rolling resistance that grows with v²). What is alike in all
-vehicles (the second, over its usual size) is told by all of their rows, and then the first is known too.
+vehicles (the second, over its usual size) is told by all of their rows, and then the first is known too. Rows count as
+independent, and the sheets' own sds are not used: how far tables are off is learned from the fleet.
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
-from experiments.pinn_closed import closed
+from experiments.pinn_closed import Closed, closed, listed, trainable
 from experiments.pinn_data import Data, Member
+from hdev_jax import progress
 from hdev_jax.errors import InputError
-from hdev_jax.inference import Coefficient, LinearFit
+from hdev_jax.inference import Coefficient
 from hdev_jax.inference.hierarchy import Sums, resembling
 from hdev_jax.learn.pinn import Sized
 from hdev_jax.learn.pinn_fit import Sizes
 from hdev_jax.learn.pinn_loss import LOG_SD
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import LIBRARY, Vehicle
 
-__all__ = ["pooled", "sizes_of"]
+__all__ = ["Fleet", "fleet", "sizes_of"]
 
 _LOGS = ("road.c_rr", "road.cda_m2")
 _LEAST_SHARE = 0.05  # of its table that a coefficient is, so that it has a logarithm
+_PASSES = 5  # linearisations, the first at the tables; products (mass and rolling resistance) settle in a few
 
 
 class _Unit(NamedTuple):
@@ -38,8 +43,6 @@ class _Unit(NamedTuple):
         if c.path in _LOGS:
             e = m.vehicle.effect("rolling" if c.path == "road.c_rr" else "aero")
             return cls(float(e.c_rr if c.path == "road.c_rr" else e.cda_m2), LOG_SD, True)
-        if not c.path.startswith("effects."):
-            return cls(c.value, c.scale, False)
         _, id, name = c.path.split(".")
         p = next(p for p in LIBRARY[id].parameters if p.name == name)
         return cls(p.null, p.scale, False)
@@ -51,63 +54,111 @@ class _Unit(NamedTuple):
         value = max(value, _LEAST_SHARE * self.null)
         return float(np.log(value / self.null)) / self.size, value * self.size
 
+    def value(self, told: float) -> float:
+        """The value that `told` tells."""
+        return self.null * float(np.exp(self.size * told)) if self.log else self.null + self.size * told
 
-def pooled(data: Data, effects: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Coefficients by name, and each trained vehicle's value of them as networks tell them [vehicle, coefficient]:
-    c_rr and C_d·A as logarithms over their tables, effects' sizes from their null value in usual sizes.
 
-    One that has no training rows, or none that tell a coefficient, has what the fleet has of it. Arguments and errors
-    are those of `closed`.
-    """
+class Fleet(NamedTuple):
+    """Coefficients by name, and of each trained vehicle its value in units of `_Unit` [vehicle, coefficient]. One that
+    has no training rows, or none that tell a coefficient, has what the fleet has of it."""
+
+    names: tuple[str, ...]
+    theta: np.ndarray
+
+    def put(self, car: Vehicle, m: Member, number: int, effects: Mapping[str, Mapping[str, float]]) -> Vehicle:
+        """A vehicle with these effects, all as vehicle `number` has them; past the trained ones as their medians."""
+        own = self.theta[number] if number < len(self.theta) else np.median(self.theta, axis=0)
+        told = dict(zip(self.names, own, strict=True))
+        whole, table = listed(m, effects)
+        car = car.plus(*(whole.effect(id) for id in effects))
+        table = table.with_free(**{c.name: c.name in told for c in table.free})
+        return table.insert(car, np.array([_Unit.of(m, c).value(told[c.name]) for c in table.free]))
+
+
+@cache
+def fleet(data: Data, effects: str) -> Fleet:
+    """What vehicles that resemble say together of what networks have: c_rr, C_d·A and the effects that they could
+    train, all else being as each vehicle's closed form has it. Arguments and errors are those of `closed`."""
+    kept = (*_LOGS, *(f"effects.{id}." for id in trainable(json.loads(effects))))
     pairs = list(zip(data.vehicles[: data.trained], closed(data, effects), strict=False))
-    fits = [(m, c.fit if c is not None else None) for m, c in pairs]
-    names = tuple(dict.fromkeys(c.name for _, f in fits if f is not None for c in f.table.free))
-    k = len(names)
-    gram, moment = np.zeros((len(fits), k, k)), np.zeros((len(fits), k))
-    seen = np.full((len(fits), k), np.nan)
+    values = [np.zeros(0) if c is None else np.array(c.fit.values) for _, c in pairs]
+    places, names = [], {}
+    for m, c in pairs:
+        free = () if c is None else c.fit.table.free
+        mine = [(i, x) for i, x in enumerate(free) if x.path.startswith(kept)]
+        places.append([(i, names.setdefault(x.name, len(names)), _Unit.of(m, x)) for i, x in mine])
+    alone = np.full((len(pairs), len(names)), np.nan)
+    for v, at in enumerate(places):
+        for i, j, unit in at:
+            alone[v, j] = unit.told(values[v][i])[0]
+            values[v][i] = unit.value(0.0)  # what a few rows say alone may be anything; products of that more so
+    spread = np.log(np.clip(np.nan_to_num(np.nanstd(alone, axis=0), nan=1.0), 0.02, 2.0))
+    for _ in range(_PASSES):
+        found = resembling(_sums(pairs, values, places, len(names)), np.r_[spread, 0.0])
+        spread = np.log(found.spread)
+        for v, at in enumerate(places):
+            for i, j, unit in at:
+                values[v][i] = unit.value(found.theta[v, j])
+    if not found.converged:
+        progress.step("closed form of the fleet: how far vehicles are apart has not settled")
+    return Fleet(tuple(names), found.theta)
+
+
+def _sums(
+    pairs: Sequence[tuple[Member, Closed | None]],
+    values: Sequence[np.ndarray],
+    places: Sequence[Sequence[tuple[int, int, _Unit]]],
+    k: int,
+) -> Sums:
+    """Σxxᵀ, Σxr and Σr² of each vehicle's rows about zero, in units of `_Unit` and in those of the noise of its rows,
+    linearised at `values`. `places`: of each coefficient its place in the vehicle's and in the fleet's, and its unit.
+    """
+    gram, moment = np.zeros((len(pairs), k, k)), np.zeros((len(pairs), k))
     square = rows = 0.0
-    for v, (m, f) in enumerate(fits):
-        if f is not None:
-            at = [names.index(c.name) for c in f.table.free]
-            gram[np.ix_([v], at, at)], moment[v, at], left, seen[v, at] = _in_units(m, f)
-            square, rows = square + left, rows + float(f.statistics.rows)
-    apart = np.clip(np.nan_to_num(np.nanstd(seen, axis=0), nan=1.0), 0.02, 2.0)
-    _, _, theta = resembling(Sums(gram, moment, square, rows), np.r_[np.log(apart), 0.0])
-    return names, theta * np.where(np.isin(names, _LOGS), LOG_SD, 1.0)
-
-
-def _in_units(m: Member, fit: LinearFit) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Σxxᵀ, Σxr and Σr² of a vehicle's rows about zero, in units of `_Unit` and in those of the noise of its
-    rows; and what it says by itself."""
-    values, noise = np.asarray(fit.values), float(fit.posterior.sigma)
-    told = [_Unit.of(m, c).told(float(x)) for c, x in zip(fit.table.free, values, strict=True)]
-    where, size = np.array(told).T
-    step = size / np.asarray(fit.scale)
-    here = fit.statistics.about(fit.posterior.mean)  # at what it says, where logarithms are straight
-    gram = np.asarray(here.gram) * np.outer(step, step) / noise**2
-    moment = np.asarray(here.moment) * step / noise**2
-    square = float(here.square) / noise**2 + where @ (2.0 * moment + gram @ where)
-    return gram, moment + gram @ where, float(square), where
+    for v, (m, c) in enumerate(pairs):
+        if c is None:
+            continue
+        fit, noise = c.again(m, values[v]), float(c.fit.posterior.sigma)
+        mine, at = [i for i, _, _ in places[v]], [j for _, j, _ in places[v]]
+        where, size = np.array([unit.told(float(fit.at[i])) for i, _, unit in places[v]]).T
+        step = size / np.asarray(fit.scale)[mine]
+        here = np.asarray(fit.statistics.gram)[np.ix_(mine, mine)] * np.outer(step, step) / noise**2
+        slope = np.asarray(fit.statistics.moment)[mine] * step / noise**2
+        gram[np.ix_([v], at, at)], moment[v, at] = here, slope + here @ where
+        square += float(fit.statistics.square) / noise**2 + float(where @ (2.0 * slope + here @ where))
+        rows += float(fit.statistics.rows)
+    return Sums(gram, moment, square, rows)
 
 
 def sizes_of(data: Data, effects: str, opened: tuple[Sized, ...]) -> Sizes:
     """Those of a network with the effects `opened`. Arguments and errors are those of `closed`; `InputError` where the
     closed form estimates what no network has."""
-    names, theta = pooled(data, effects)
-    if other := [n for n in names if n not in _LOGS and not n.startswith("effects.")]:
-        raise InputError(f"sizes in closed form: {other[0]} is estimated, and no network has it; list auxiliary_power")
+    for c in closed(data, effects):
+        for x in () if c is None else c.fit.table.free:
+            if x.path not in _LOGS and not x.path.startswith("effects."):
+                raise InputError(
+                    f"sizes in closed form: {x.name} is estimated, and no network has it; list auxiliary_power"
+                )
+    names, theta = fleet(data, effects)
+    theta = theta * np.where(np.isin(names, _LOGS), LOG_SD, 1.0)  # networks tell plain logarithms
     place = {n: k for k, n in enumerate(names)}
     mean = theta.mean(axis=0)
     own = theta - mean
 
-    def picked(values: np.ndarray, of: Sequence[str]) -> np.ndarray:
-        return np.stack([values[..., place[n]] if n in place else np.zeros(values.shape[:-1]) for n in of], axis=-1)
+    def picked(values: np.ndarray, name: str) -> np.ndarray:
+        """0 for a group (a surface, a gear) that no row is of."""
+        return values[..., place[name]] if name in place or "[" not in name else np.zeros(values.shape[:-1])
+
+    def both(of: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        return np.stack([picked(mean, n) for n in of]), np.stack([picked(own, n) for n in of], axis=-1)
 
     sizes, own_sizes = {}, {}
     for e in opened:
         for name, groups in e.sizes:
             path = f"{e.kind.id}.{name}"
-            of = [f"effects.{path}[{g}]" for g in range(groups)] if groups else [f"effects.{path}"]
-            both = picked(mean, of), picked(own, of)
-            sizes[path], own_sizes[path] = both if groups else (both[0][0], both[1][:, 0])
-    return Sizes(picked(mean, _LOGS), picked(own, _LOGS), sizes, own_sizes)
+            if groups:
+                sizes[path], own_sizes[path] = both([f"effects.{path}[{g}]" for g in range(groups)])
+            else:
+                sizes[path], own_sizes[path] = picked(mean, f"effects.{path}"), picked(own, f"effects.{path}")
+    return Sizes(*both(_LOGS), sizes, own_sizes)

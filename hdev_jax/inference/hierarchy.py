@@ -20,7 +20,7 @@ from hdev_jax.inference.draws import Draws
 from hdev_jax.inference.linear import LEAST_ROWS
 from hdev_jax.inference.models import POOL_FREEDOM
 
-__all__ = ["Sums", "drawn", "fleet_draws", "marginal", "resembling"]
+__all__ = ["Resembling", "Sums", "drawn", "fleet_draws", "marginal", "resembling"]
 
 PROPOSAL_FREEDOM = 6.0  # tails of the proposal: heavier than the posterior's, so that no draw sticks
 WIDER = 1.1  # and a little wider
@@ -116,8 +116,9 @@ def _in_pieces(phi: np.ndarray, data: Sums) -> list[np.ndarray]:
     return np.array_split(phi, max(1, len(phi) * len(data.moment) // PIECE))
 
 
-def _mode(data: Sums, start: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The mode of `marginal` by damped Newton steps, and the root of the inverse curvature there.
+def _mode(data: Sums, start: np.ndarray, width: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """The mode of `marginal` by damped Newton steps, the root of the inverse curvature there, and whether they ended
+    before they were stopped.
 
     By differences, a fifth of `width` (about the posterior's sds) apart.
     """
@@ -144,8 +145,8 @@ def _mode(data: Sums, start: np.ndarray, width: np.ndarray) -> tuple[np.ndarray,
         moved = float(np.max(np.abs((tries[best] - here) / width)))
         here = tries[best]
         if moved < 0.05:
-            break
-    return here, root
+            return here, root, True
+    return here, root, False
 
 
 def _width(data: Sums) -> Float[np.ndarray, " dim"]:
@@ -154,14 +155,21 @@ def _width(data: Sums) -> Float[np.ndarray, " dim"]:
     return np.r_[np.full(k, 1.0 / np.sqrt(2.0 * vehicles + 2.0)), np.sqrt(2.0 / (data.rows + LEAST_ROWS))]
 
 
-def resembling(
-    data: Sums, start: Float[np.ndarray, " dim"]
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "vehicle k"]]:
-    """The fleet's mean, the spread of its vehicles and each one's coefficients, as expected at the mode of
-    (log τ, log σ²): empirical Bayes, in the units of `data`. `start`: a guess of (log τ, log σ²)."""
-    mode, _ = _mode(data, start, _width(data))
+class Resembling(NamedTuple):
+    """The fleet's mean, the spread of its vehicles and each one's coefficients, in the units of its `Sums`; whether the
+    search for the spread came to rest."""
+
+    mean: Float[np.ndarray, " k"]
+    spread: Float[np.ndarray, " k"]
+    theta: Float[np.ndarray, "vehicle k"]
+    converged: bool
+
+
+def resembling(data: Sums, start: Float[np.ndarray, " dim"]) -> Resembling:
+    """What is expected of a fleet at the mode of (log τ, log σ²): empirical Bayes. `start`: a guess of that mode."""
+    mode, _, converged = _mode(data, start, _width(data))
     (mean,), (theta,) = _given(mode[None], data, None)
-    return mean, np.exp(mode[:-1]), theta
+    return Resembling(mean, np.exp(mode[:-1]), theta, converged)
 
 
 def _accepted(weight: np.ndarray, odds: np.ndarray) -> np.ndarray:
@@ -181,7 +189,7 @@ def drawn(
     """Draws `[chain, draw, …]` of `mean`, `spread`, `theta`, `variance` in the units of `data`; `kept`, how often a
     proposal was taken. `start`: a guess of (log τ, log σ²).
     """
-    mode, root = _mode(data, start, _width(data))
+    mode, root, _ = _mode(data, start, _width(data))
     dim, freedom, n = len(mode), PROPOSAL_FREEDOM, chains * draws
     stretch = np.sqrt(freedom / rng.chisquare(freedom, (n, 1)))
     z = WIDER * stretch * rng.standard_normal((n, dim))

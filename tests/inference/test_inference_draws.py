@@ -47,7 +47,8 @@ def test_vehicles_that_resemble_are_the_dense_normals_mean_at_the_mode():
     gram, moment = sums.gram.copy(), sums.moment.copy()
     gram[5] = moment[5] = 0.0  # a vehicle without a row
     sums = Sums(gram, moment, sums.square, sums.rows)
-    mean, spread, theta = resembling(sums, np.zeros(4))
+    mean, spread, theta, converged = resembling(sums, np.zeros(4))
+    assert converged
     best = optimize.minimize(lambda p: -marginal(p[None], sums)[0], np.zeros(4), method="BFGS").x
     np.testing.assert_allclose(np.log(spread), best[:3], atol=0.03)
     tight, variance = np.diag(spread**-2.0), float(np.exp(best[3]))
