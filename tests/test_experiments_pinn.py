@@ -203,7 +203,8 @@ def test_thresholds_and_a_delay_are_the_vehicles_own_and_no_network_trains_them(
 
     assert float(one.vehicle.effect("regen_limit").power_w) == pytest.approx(limit)
     assert {"headwind", "mass_scale", "time_skew"}.isdisjoint(e.id for e in one.vehicle.effects)
-    assert one.across_wh == pytest.approx(said(car, a, own) - said(car.minus("time_skew"), a, own))
+    late = one.fitted.plus(car.effect("time_skew"))
+    assert one.across_wh == pytest.approx(said(late, a, own) - said(one.fitted, a, own))
     trips = [np.sum(one.across_wh[a.routes == t]) for t in np.unique(a.routes)]
     assert np.sum(np.abs(one.across_wh)) > 10 * np.sum(np.abs(trips)) > 0, "a delay moves energy from row to row"
 
