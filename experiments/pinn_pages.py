@@ -30,6 +30,7 @@ GIVEN = ("ours and the closed form are given the list of effects that the fleet 
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
 LEARNED = f"{OURS} without effects"
+LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
 NAMEABLE = {
     WAYS["kernel"]: "effects of the given list, in closed form",
     f"{OURS}, effects as diagnosed, its physics alone": "effects that diagnoses of training routes name",
@@ -139,15 +140,18 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     the calibrated declared physics, the share that the physics with effects takes off by itself."""
     square = {way: pooled(f)["rmse_wh"] ** 2 for (way, use), f in gathered.items() if use == "test"}
     base, learned = square.get(WAYS["bayesian"]), square.get(LEARNED)
-    if base is None or learned is None or learned >= base:
+    if base is None or learned is None or base - learned < LEAST_LEARNED * base:
         return []
     what = f"what {LEARNED} learns beyond the calibrated declared physics ({base**0.5:.4g} to {learned**0.5:.4g} Wh)"
-    return [
-        f"{what}: {whose} take off {100 * (base - square[way]) / (base - learned):.0f} % of that squared error by "
-        "themselves"
-        for way, whose in NAMEABLE.items()
-        if way in square
-    ]
+    out = []
+    for way, whose in NAMEABLE.items():
+        if way in square:
+            share = 100 * (base - square[way]) / (base - learned)
+            told = (
+                f"take off {share:.0f} % of that squared error" if share > 0 else "take nothing off that squared error"
+            )
+            out.append(f"{what}: {whose} {told} by themselves")
+    return out
 
 
 def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:

@@ -34,7 +34,8 @@ class Member:
 
 
 class Sizes(NamedTuple):
-    """`Pinn`'s numbers of these names, known from elsewhere and not trained."""
+    """`Pinn`'s numbers of these names, known from elsewhere and not trained. What the network's head says of a row's
+    coefficients still moves them, for all vehicles alike."""
 
     common: Float[np.ndarray, " 2"]
     own: Float[np.ndarray, "vehicle 2"]
@@ -150,7 +151,7 @@ def fit(
     """Adam at `rate` on batches of `plan.batch` rows; the best epoch by the rows `held`.
 
     **Arguments:** `vehicles`, how many there are in `rows`; `sizes` of coefficients and effects that are known;
-    `checkpoint`, a file to go on from, as in `train`. All members train in one program.
+    `checkpoint`, a file to go on from, as in `train`; it does not hold `sizes`. All members train in one program.
 
     **Raises:** `DivergedError` where no member is left; `InputError` where there are no rows, or where a table's c_rr
     is not within the bounds that the recipe keeps it in.
