@@ -18,7 +18,7 @@ from experiments.pinn_buses import bus_sources
 from experiments.pinn_closed import kernel, said, trainable
 from experiments.pinn_data import Data, load
 from experiments.pinn_diagnosed import diagnosed, found_effects
-from experiments.pinn_known import known
+from experiments.pinn_known import known, of_fleet
 from experiments.pinn_models import bayesian, boosted, names_of
 from experiments.pinn_networks import trained
 from experiments.pinn_scores import scores
@@ -189,7 +189,8 @@ def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> 
     task |= {**plan, "effects": config.effects if model.effects is True else {}}
     if model.effects == "diagnosed":
         task |= {"diagnosed": config.diagnosed, "diagnosed_routes": config.diagnosed_routes}
-    for seed in config.seeds:
+    # LightGBM draws nothing here: its seeds would be alike
+    for seed in config.seeds[: None if model.kind == "network" else 1]:
         for weights in _weights(config, model) if model.kind == "network" else [[]]:
             yield {**task, "seed": seed, "weights": list(weights)}
 
@@ -235,10 +236,16 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if task["model"]["kind"] == "vehicles":
         return [_by_vehicle(data, task)]
     names = names_of(task["model"]["features"], data)
-    rows, use = data.rows(names, trainable(effects), known(data, json.dumps(effects)))
+    own = known(data, json.dumps(effects))
+    rows, use = data.rows(names, trainable(effects), own)
     if task["model"]["kind"] == "lightgbm":
         return [{"lightgbm": scores(data, use, boosted(rows, use, t["seed"])), "counts": data.counts()} for t in tasks]
-    return trained(data, rows, use, tasks, Model(**task["model"]))
+    out = trained(data, rows, use, tasks, Model(**task["model"]))
+    if task["model"]["sizes"] == "closed form" and effects:
+        of = zip(own, data.vehicles, strict=True)
+        form = scores(data, use, np.concatenate([of_fleet(k, m) for k, m in of]))
+        out = [r if "diverged" in r else {**r, "form": form} for r in out]
+    return out
 
 
 def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:

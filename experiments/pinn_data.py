@@ -110,10 +110,11 @@ class Data:
         return np.concatenate([getattr(m, name) for m in self.vehicles])
 
     def counts(self) -> dict[str, int]:
-        """Rows of each use."""
+        """Rows of each use, and training routes."""
         use = self.column("use")
         names = ("training", "validation", "test", "unseen", "unused")
-        return {n: int(np.sum(use == k)) for k, n in enumerate(names)}
+        routes = len(np.unique(self.column("routes")[use == 0]))
+        return {n: int(np.sum(use == k)) for k, n in enumerate(names)} | {"routes": routes}
 
 
 def weighed(segments: Segments, off: np.ndarray) -> Segments:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.figures import save_figure, styled
-from experiments.pinn_scores import pooled
+from experiments.pinn_scores import TAUGHT, pooled
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, plain_log, tidy
@@ -76,27 +76,30 @@ def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]
 
 
 @styled
-def learning_curves(run: Run, curves: Mapping[tuple[str, str], list[tuple[float, list[float]]]]) -> None:
-    """Error by the share of training routes: median over seeds, and a band of all."""
-    uses = [u for u in ("test", "unseen") if any(k[1] == u for k in curves)]
+def learning_curves(
+    run: Run, curves: Mapping[tuple[str, str], list[tuple[float, list[float]]]], routes: Mapping[float, int]
+) -> None:
+    """Error by how many routes train (`routes` by share): median over seeds, and a band of all."""
+    uses = [u for u in ("test", TAUGHT, "unseen") if any(k[1] == u for k in curves)]
     fig = figure(4.6 * len(uses), 3.6)
     for i, use in enumerate(uses):
         ax = fig.add_subplot(1, len(uses), i + 1)
         for way in dict.fromkeys(k[0] for k in curves if k[1] == use and "alone" not in k[0]):
             points = curves[way, use]
-            x = [100 * s for s, _ in points]
+            x = [routes[s] for s, _ in points]
             drawn = ax.plot(x, [np.median(v) for _, v in points], "o-", markersize=3, label=way)
             ax.fill_between(x, [min(v) for _, v in points], [max(v) for _, v in points], alpha=0.2,
                             color=drawn[0].get_color(), linewidth=0)  # fmt: skip
         ax.set_xscale("log")
         ax.set_yscale("log")
-        ax.set_xlabel("training routes used [%]")
+        ax.set_xlabel("training routes")
         ax.set_ylabel("RMSE [Wh]")
-        ax.set_xticks(sorted({100 * s for k, points in curves.items() if k[1] == use for s, _ in points}))
+        ax.set_xticks(sorted({routes[s] for k, points in curves.items() if k[1] == use for s, _ in points}))
         for axis in (ax.xaxis, ax.yaxis):
             plain_log(axis)
         ax.set_yticks([y for y in (5, 10, 20, 50, 100, 200) if ax.get_ylim()[0] <= y <= ax.get_ylim()[1]])
-        ax.set_title({"test": "Test routes", "unseen": "Never trained on"}[use] + " (synthetic)")
+        title = {"test": "Test routes", TAUGHT: "Test routes, vehicles trained on", "unseen": "Never trained on"}
+        ax.set_title(title[use] + " (synthetic)")
         ax.legend(fontsize=7)
         tidy(ax)
     save_figure(run, fig, "shares")

@@ -14,7 +14,7 @@ from experiments.pinn_pooled import fleet
 from hdev_jax.learn.pinn_rows import row_wise
 from hdev_jax.physics import LIBRARY, Parameter, Vehicle
 
-__all__ = ["Known", "known"]
+__all__ = ["Known", "known", "of_fleet"]
 
 
 class Known(NamedTuple):
@@ -70,6 +70,11 @@ def known(data: Data, effects: str) -> tuple[Known, ...]:
             moved = said(late, m, f.weighed(m)) - said(whole, m, f.weighed(m))
         out.append(Known(car, fitted, moved, payload, loose))
     return tuple(out)
+
+
+def of_fleet(own: Known, m: Member) -> np.ndarray:
+    """Energy of every row of a vehicle by the fleet's closed form alone [Wh], no network having a say."""
+    return said(own.fitted or own.vehicle, m, weighed(m.segments, own.payload)) + own.across_wh
 
 
 def _loose(car: Vehicle, m: Member, sd: float) -> np.ndarray:

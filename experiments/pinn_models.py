@@ -18,13 +18,15 @@ __all__ = ["bayesian", "boosted", "names_of", "networks"]
 
 def names_of(features: str, data: Data) -> tuple[str, ...]:
     """A set of `FEATURES`, without those whose channels this data lacks."""
-    have = data.vehicles[0].segments
     needs = {
         "wind_along": ("wind_speed_mps",), "wind_across": ("wind_speed_mps",), "wet": ("wet_road",),
         "surface_1": ("road_surface",), "surface_2": ("road_surface",), "surface_3": ("road_surface",),
-        "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",), "ambient_temp_c": ("ambient_temp_c",),
+        "wind_sine": ("wind_from_rad", "heading_rad"), "wind_cosine": ("wind_from_rad", "heading_rad"),
+        "wind_speed_mps": ("wind_speed_mps",), "wet_road": ("wet_road",), "curvature_1pm": ("curvature_1pm",),
+        "gear": ("gear",), "cornering": ("curvature_1pm",), "temperature": ("ambient_temp_c",),
+        "ambient_temp_c": ("ambient_temp_c",),
     }  # fmt: skip
-    return tuple(n for n in FEATURES[features] if have.has(*needs.get(n, ())))
+    return tuple(n for n in FEATURES[features] if all(m.segments.has(*needs.get(n, ())) for m in data.vehicles))
 
 
 def bayesian(m: Member) -> tuple[Vehicle, list[float]]:
@@ -35,11 +37,13 @@ def bayesian(m: Member) -> tuple[Vehicle, list[float]]:
 
 
 def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
-    """LightGBM on the same features, stopped by the validation rows: energy of every row [Wh]."""
+    """LightGBM on the same features, stopped by the validation rows: energy of every row [Wh]. It learns the energy in
+    the row's unit, the squares being of Wh all the same."""
     import lightgbm as lgb
 
-    x, y = np.asarray(rows.features), np.asarray(rows.energy_wh, float)
-    train, held = lgb.Dataset(x[use == 0], y[use == 0]), lgb.Dataset(x[use == 1], y[use == 1])
+    x, unit = np.asarray(rows.features), np.asarray(rows.unit, float)
+    y, weight = np.asarray(rows.energy_wh, float) / unit, unit**2 / np.mean(unit[use == 0] ** 2)
+    train, held = (lgb.Dataset(x[at], y[at], weight=weight[at]) for at in (use == 0, use == 1))
     # one thread: beside other work, threads that wait for each other take ten times as long
     settings = {
         "objective": "regression", "learning_rate": 0.05, "num_leaves": 63, "min_data_in_leaf": 20, "verbosity": -1,
@@ -47,7 +51,7 @@ def boosted(rows: Rows, use: np.ndarray, seed: int) -> np.ndarray:
     }  # fmt: skip
     stop = [lgb.early_stopping(50, verbose=False)]
     model = lgb.train(settings, train, 2000, valid_sets=[held], callbacks=stop)
-    return np.asarray(model.predict(x))
+    return unit * np.asarray(model.predict(x))
 
 
 def networks(

@@ -19,6 +19,8 @@ from hdev_jax.learn.train import DivergedError, Plan
 
 __all__ = ["trained"]
 
+_LEAST_STEPS = 16  # of an epoch
+
 
 def trained(
     data: Data, rows: Rows, use: np.ndarray, tasks: Sequence[dict[str, Any]], spec: Any
@@ -26,7 +28,10 @@ def trained(
     """Of each task of the model `spec`, scores of its members' mean on test and unseen rows; or that all diverged."""
     choices = {f.name: getattr(spec, f.name) for f in fields(Choices)}
     recipe = Recipe(features=names_of(spec.features, data), **choices)
-    plan = Plan(tasks[0]["epochs"], spec.batch, 0.5, tasks[0]["patience"], stop_after=tasks[0]["stop_after"])
+    # few rows: passes over the data count together, so that every epoch has as many steps as of many
+    passes = max(1, -(-_LEAST_STEPS * spec.batch // max(1, int(np.sum(use == 0)))))
+    epochs, patience, stop_after = (passes * tasks[0][k] for k in ("epochs", "patience", "stop_after"))
+    plan = Plan(epochs, spec.batch, 0.5, patience, stop_after=stop_after)
     members = [(t["seed"] * 1000 + k, t["weights"]) for t in tasks for k in range(spec.members)]
     effects = tasks[0]["effects"]
     opened = sized({e: effects[e] for e in trainable(effects)})
@@ -52,6 +57,7 @@ def trained(
             "counts": data.counts(),
             "effects": list(effects),
             "epochs": int(np.isfinite(ends).sum()),
+            "still_better": bool(np.nanargmin(ends) == epochs - 1),
         }
     return out
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from experiments.pinn_data import Data
 
-__all__ = ["QUANTILES", "USES", "pooled", "scores"]
+__all__ = ["QUANTILES", "TAUGHT", "pooled", "scores"]
 
 USES = {"test": 2, "unseen": 3}
+TAUGHT = "test, vehicles trained on"
 QUANTILES = (5, 25, 50, 75, 95)
 
 
@@ -22,7 +23,8 @@ def scores(
     cda_m2: np.ndarray | None = None,
     sd_wh: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Of each use (`test`, `unseen`): sums that add up over vehicles, errors of trips, coefficients by vehicle.
+    """Of each use (`test`, `unseen`): sums that add up over vehicles, errors of trips, coefficients by vehicle. Where
+    some vehicles have no training row, also of the test rows of those that have (`TAUGHT`).
 
     **Arguments:** columns of all rows of `data` [row], or of its vehicle `only`; `use` of these rows.
     """
@@ -30,8 +32,11 @@ def scores(
     y = np.concatenate([m.energy_wh for m in members])
     route = np.concatenate([m.routes for m in members])
     out: dict[str, Any] = {}
-    for name, number in USES.items():
-        at = use == number
+    taught = np.concatenate([np.full(len(m.use), np.any(m.use == 0)) for m in members])
+    parts = {name: use == number for name, number in USES.items()}
+    if np.any(parts["test"] & ~taught):
+        parts[TAUGHT] = parts["test"] & taught
+    for name, at in parts.items():
         if not at.any():
             continue
         error = energy_wh[at] - y[at]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import pinn, pinn_pooled
+from experiments import pinn, pinn_networks, pinn_pooled
 from experiments.config import CONFIGS, resolve, typed
 from experiments.paper1_halves import coefficient
 from experiments.pinn import Config, chosen, tasks, together
@@ -18,12 +18,14 @@ from experiments.pinn_closed import closed, kernel, said, sized, trainable
 from experiments.pinn_data import Data, load, weighed
 from experiments.pinn_diagnosed import united
 from experiments.pinn_known import known
+from experiments.pinn_models import boosted
 from experiments.pinn_pooled import fleet, sizes_of
-from experiments.pinn_scores import pooled, scores
+from experiments.pinn_scores import TAUGHT, pooled, scores
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn import Pinn, Recipe, predict
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
 from hdev_jax.learn.pinn_rows import FEATURES
+from hdev_jax.learn.train import DivergedError
 from hdev_jax.physics import Grouped
 from hdev_jax.physics.battery import RegenLimit
 from hdev_jax.physics.loads import AuxiliaryPower
@@ -337,6 +339,52 @@ def test_a_networks_physics_has_the_thresholds_and_what_acts_across_rows():
     plain, _ = data.rows(("speed_mps",), (), known(data, "{}"))
     without = np.asarray(predict(model, memory, plain.take(at)).physics_wh) - data.vehicles[0].energy_wh[at]
     assert np.sqrt(np.mean(without**2)) > 8.0
+
+
+def test_test_rows_of_vehicles_that_are_trained_on_stand_apart():
+    data = load("fleet", 3, 24, (), 1.0, None, 0, ("A", "B"))
+    a, b = data.vehicles
+    b = dataclasses.replace(b, use=np.where(b.use == 0, 4, b.use))
+    two = Data((a, b), 2)
+    rng = np.random.default_rng(0)
+    told = two.column("energy_wh") + rng.standard_normal(len(two.column("use")))
+    parts = scores(two, two.column("use"), told)
+    assert parts[TAUGHT] == scores(data, a.use, told[: len(a.use)], only=0)["test"]
+    assert parts["test"]["rows"] == np.sum(two.column("use") == 2) > parts[TAUGHT]["rows"]
+    assert TAUGHT not in scores(data, data.column("use"), told)
+    assert two.counts()["routes"] == len(np.unique(a.routes[a.use == 0]))
+
+
+def test_black_boxes_without_units_know_what_a_row_weighs():
+    """Of energy that is the mass times what the features tell, trees learn the second alone, for any mass; the squares
+    are of Wh."""
+    rng = np.random.default_rng(0)
+    unit, at = rng.uniform(0.5, 2.0, 4000), rng.integers(0, 4, 4000)
+    use = np.where(np.arange(4000) < 2000, 0, np.where(np.arange(4000) < 3000, 1, 2))
+    unit[use == 2] += 3.0  # heavier than any that was trained on
+    off = np.where(rng.random(4000) < 0.5, 30.0 / unit, 0.0)  # has a weighted mean, which is the least squares' of Wh
+    rows = SimpleNamespace(features=at[:, None].astype(float), unit=unit, energy_wh=unit * (100.0 * at + off))
+    told = boosted(rows, use, 0) / unit
+    for k in range(4):
+        mine = (at == k) & (use == 0)
+        best = np.average((100.0 * at + off)[mine], weights=unit[mine] ** 2)
+        assert np.unique(told[at == k].round(4)).size == 1
+        assert told[at == k][0] == pytest.approx(best, abs=1.5)
+
+
+def test_few_rows_train_for_as_many_steps_as_many(monkeypatch):
+    plans = []
+
+    def networks(*_, plan, **__):
+        plans.append(plan)
+        raise DivergedError("enough")
+
+    monkeypatch.setattr(pinn_networks, "networks", networks)
+    (task,) = tasks(config("paper1/table2", "epochs=10", 'only=["paper"]'))
+    data = load("fleet", 3, 24, (), 1.0, None, 0, ("A", "B"))
+    for rows in (1000, 20 * 1024):
+        pinn_networks.trained(data, None, np.zeros(rows), [{**task, "effects": {}}], pinn.Model(**task["model"]))
+    assert [(p.epochs, p.patience, p.stop_after) for p in plans] == [(170, 68, 204), (10, 4, 12)]
 
 
 def test_a_task_trains_with_the_effects_of_its_config(monkeypatch):

@@ -33,7 +33,8 @@ class Choices:
 
     - `units`, `normalised`, `dropout`: the network.
     - `predicted`, what E_pred of equation 7 is: `residual`, the physics with predicted coefficients plus what the
-      energy head says; `alone`, what that head says; `table`, the physics at the tables plus what the head says.
+      energy head says; `alone`, what that head says, about the mean; `table`, the physics at the tables plus what the
+      head says.
     - `physics`: `battery` (equation 5) or `wheel` (equation 4 as equation 7 cites it).
     - `coefficients`: `bounded`, c_rr by a scaled sigmoid in (0, 0.02], C_d·A clamped `clamp` around its table;
       `free`, the table times an exponential; `table`, not predicted at all.
@@ -95,7 +96,7 @@ class Pinn(eqx.Module):
     `sizes` and `own_sizes` are the effects' sizes in units of their usual scale. What is a vehicle's own counts from
     the mean over vehicles.
 
-    `scale_wh` is the unit of the energy head.
+    `scale_wh` is the unit of the energy head where `Rows.unit` is 1, and `mean_wh` where it begins when it is alone.
 
     **Raises:** `InputError` where coefficients shall depend on `physical` features and there is none.
     """
@@ -110,11 +111,13 @@ class Pinn(eqx.Module):
     drift: Float[Array, ""]  # logarithm of the share by which a whole trip's energy is off
     effects: tuple[Sized, ...] = eqx.field(static=True)
     scale_wh: float = eqx.field(static=True)
+    mean_wh: float = eqx.field(static=True)
     recipe: Recipe = eqx.field(static=True)
 
     def __init__(
-        self, recipe: Recipe, vehicles: int, *, scale_wh: float, effects: tuple[Sized, ...] = (), key: PRNGKeyArray
-    ):
+        self, recipe: Recipe, vehicles: int, *, scale_wh: float, mean_wh: float = 0.0,
+        effects: tuple[Sized, ...] = (), key: PRNGKeyArray,
+    ):  # fmt: skip
         first, second = jax.random.split(key)
         make = lambda n, units, k: Network(  # noqa: E731
             n, units, normalised=recipe.normalised, dropout=recipe.dropout, key=k
@@ -134,6 +137,7 @@ class Pinn(eqx.Module):
         self.drift = jnp.log(jnp.array(0.03, jnp.float32))
         self.effects = effects
         self.scale_wh = scale_wh
+        self.mean_wh = mean_wh
         self.recipe = recipe
 
     # --- what holds in a row -----------------------------------------------------------------------------------------
@@ -186,9 +190,10 @@ class Pinn(eqx.Module):
         physics = law(with_coefficients(rows.car, c_rr, cda, *self.effects_of(rows)), rows.segments)
         if r.physics == "battery":  # at the wheels nothing is known of it
             physics = physics + rows.across_wh
-        residual = self.scale_wh * heads.energy if r.energy_head else jnp.zeros_like(physics)
+        unit = jnp.asarray(rows.unit)
+        residual = self.scale_wh * unit * heads.energy if r.energy_head else jnp.zeros_like(physics)
         tables = energy(rows.car, rows.segments) + rows.across_wh
-        base = {"residual": physics, "alone": jnp.zeros_like(physics), "table": tables}[r.predicted]
+        base = {"residual": physics, "alone": self.mean_wh * unit, "table": tables}[r.predicted]
         floor, share = jnp.exp(self.noise[0]) * self.scale_wh, jnp.exp(self.noise[1])
         sd = jnp.sqrt(floor**2 + (share * physics) ** 2 + jnp.asarray(rows.loose_wh) ** 2)
         if r.loss == "squares":

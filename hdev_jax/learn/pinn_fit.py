@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -169,13 +170,12 @@ def fit(
     data = stretches(_scaled(rows, scale), recipe.stretch)
     check = stretches(_scaled(held, scale), recipe.stretch)
     plan = Plan(**{**plan.__dict__, "batch": max(1, plan.batch // recipe.stretch)})
-    unit = float(np.std(rows.energy_wh))
-    made = [
-        eqx.nn.make_with_state(Pinn)(
-            recipe, vehicles, scale_wh=unit, effects=effects, key=jax.random.fold_in(jax.random.key(m.seed), 0)
-        )
-        for m in members
-    ]
+    told = np.asarray(rows.energy_wh, float) / np.asarray(rows.unit, float)
+    make = partial(
+        eqx.nn.make_with_state(Pinn), recipe, vehicles, scale_wh=float(np.std(told)), mean_wh=float(np.mean(told)),
+        effects=effects,
+    )  # fmt: skip
+    made = [make(key=jax.random.fold_in(jax.random.key(m.seed), 0)) for m in members]
     models = [model if sizes is None else sizes.of(model) for model, _ in made]
     arrays = [eqx.partition(model, _trained(model, sizes)) for model in models]
     static = arrays[0][1]

@@ -35,10 +35,12 @@ __all__ = [
 ]
 
 _REFERENCE_M = 100.0  # the length of the paper's segments; √(g·100 m) is the unit of speed
+_REFERENCE_KG = 20e3
 _PADDED = 4096
 
 # The paper's three; with what the physics needs besides; with everything that has no unit; and for black boxes without
-# any kernel the log's own columns and the sheet's numbers, nothing being worked out of them.
+# any kernel the log's own columns and the sheet's numbers, hardly anything being worked out of them (angles have a sine
+# and a cosine, and the way since the start is what warmth is told by).
 _PRINTED = ("speed_mps", "mass_kg", "grade_rad")
 _CHANNELS = (*_PRINTED, "accel_mps2", "c_rr_table", "cda_table")
 _UNITLESS = (
@@ -46,7 +48,12 @@ _UNITLESS = (
     "duration", "length", "elapsed", "mass_of_sheet", "temperature", "wind_along", "wind_across", "wet", "surface_1",
     "surface_2", "surface_3", "warmth", "cornering", "efficiency", "halt",
 )  # fmt: skip
-_RAW = (*_CHANNELS, "duration_s", "distance_m", "ambient_temp_c", "mass_table_kg", "auxiliary_table_w")
+_RAW = (
+    *_CHANNELS, "duration_s", "distance_m", "ambient_temp_c", "mass_table_kg", "auxiliary_table_w", "time_s",
+    "wind_speed_mps", "wind_sine", "wind_cosine", "wet_road", "surface_1", "surface_2", "surface_3", "curvature_1pm",
+    "gear", DISTANCE_SINCE_START,
+)  # fmt: skip
+_COLUMNS = ("grade_rad", "ambient_temp_c", "wind_speed_mps", "wet_road", "curvature_1pm", "gear", DISTANCE_SINCE_START)
 FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
 # Those that a coefficient may depend on: not the power that is asked for, nor how steep it is.
 PHYSICAL = ("froude", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3",
@@ -59,7 +66,8 @@ class Rows(eqx.Module):
     `vehicle` counts the vehicles that a model was trained on; one that it was not has the number after the last.
     `weight` is 0 for a row that only fills an array; `across_wh` is energy that effects across rows add to it;
     `loose_wh` what one standard deviation of something that its whole trip shares and the log does not tell (a mass
-    that is off) adds to it, with its sign.
+    that is off) adds to it, with its sign. `unit` is what an energy is told in: where no feature is the mass, the row's
+    over 20 t, as an energy without units is one over a weight; otherwise 1.
     """
 
     features: Float[Array, "*row feature"] | Float[np.ndarray, "*row feature"]
@@ -70,6 +78,7 @@ class Rows(eqx.Module):
     weight: Column
     across_wh: Column
     loose_wh: Column
+    unit: Column
 
     def __len__(self) -> int:
         return self.energy_wh.shape[0]
@@ -166,6 +175,7 @@ def rows_of(
         np.stack(columns, axis=1).astype(np.float32), jax.tree.map(small, s), jax.tree.map(small, car),
         np.asarray(energy_wh, np.float32), np.full(n, number, np.int32), np.ones(n, np.float32),
         *(np.zeros(n, np.float32) if x is None else np.asarray(x, np.float32) for x in (across_wh, loose_wh)),
+        unit=(np.ones(n) if "mass_kg" in features else _mass(s, vehicle) / _REFERENCE_KG).astype(np.float32),
     )  # fmt: skip
 
 
@@ -195,12 +205,16 @@ def _sheet(vehicle: Vehicle, segments: Segments, effects: tuple[Effect, ...]) ->
     return segments, {"energy": vehicle.energy(segments), "efficiency": eta, "ratio": ratio}
 
 
+def _mass(s: Segments, vehicle: Vehicle) -> np.ndarray:
+    return np.asarray(s.get("mass_kg", float(vehicle.mass_kg))) * np.ones(len(s))
+
+
 def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.ndarray]) -> np.ndarray:
     """A column of `FEATURES`. Every one of `_UNITLESS` is a ratio of two quantities of the same kind."""
     if name not in (known := tuple(dict.fromkeys(n for f in FEATURES.values() for n in f))):
         raise InputError(f"no feature {name!r}; they are {', '.join(known)}")
     one = np.ones(len(s))
-    mass = np.asarray(s.get("mass_kg", float(vehicle.mass_kg))) * one
+    mass = _mass(s, vehicle)
     square = np.asarray(mean_square_speed(s))
     weight = mass * GRAVITY_MPS2
     unit = GRAVITY_MPS2 * _REFERENCE_M
@@ -217,12 +231,16 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
     match name.rpartition("_"):
         case "surface", _, k:
             return (channel("road_surface") == int(k)) * one
-        case _ if name in ("speed_mps", "accel_mps2", "duration_s", "distance_m"):
+        case _ if name in ("speed_mps", "accel_mps2", "time_s", "duration_s", "distance_m"):
             return np.asarray(getattr(s, name))
         case _ if name == "mass_kg":
             return mass
-        case _ if name in ("grade_rad", "ambient_temp_c"):
-            return channel(name)
+        case _ if name in _COLUMNS:
+            return channel(name) * one
+        case "wind", _, "sine":
+            return np.sin(wind())
+        case "wind", _, "cosine":
+            return np.cos(wind())
         case _ if name == "mass_table_kg":
             return float(vehicle.mass_kg) * one
         case _ if name == "auxiliary_table_w":

@@ -36,7 +36,9 @@ def recipe(**changes: Any) -> Recipe:
 
 def made(recipe: Recipe, vehicles: int = 2, seed: int | None = 5, effects: tuple[Sized, ...] = ()) -> tuple[Any, Any]:
     """A model and its memory; with a seed, with random weights in its heads and in what vehicles have of their own."""
-    model, memory = eqx.nn.make_with_state(Pinn)(recipe, vehicles, scale_wh=50.0, effects=effects, key=KEY)
+    model, memory = eqx.nn.make_with_state(Pinn)(
+        recipe, vehicles, scale_wh=50.0, mean_wh=30.0, effects=effects, key=KEY
+    )
     if seed is None:
         return model, memory
     rng = np.random.default_rng(seed)
@@ -136,12 +138,13 @@ def test_equation_7_by_hand(rows, predicted, physics, coefficient_loss):
     c_rr = 0.02 * expit(logit(np.asarray(rows.c_rr, float) / 0.02) + coefficients[:, 0])
     cda = rows.cda_m2 * np.clip(1 + coefficients[:, 1], 0.5, 1.5)
     law = by_hand(rows, c_rr, cda, wheel=physics == "wheel")
-    base = {"residual": law, "alone": 0 * law, "table": by_hand(rows, rows.c_rr, rows.cda_m2)}[predicted]
+    heavy = np.asarray(rows.segments.channels["mass_kg"], float) / 20e3  # no feature tells the mass
+    base = {"residual": law, "alone": 30.0 * heavy, "table": by_hand(rows, rows.c_rr, rows.cda_m2)}[predicted]
     kept = weight > 0
     unit = (rows.c_rr, rows.cda_m2) if coefficient_loss == "relative" else (1.0, 1.0)
     mean = lambda x: np.mean(np.square(x)[kept])  # noqa: E731
     terms = (
-        mean(rows.energy_wh - base - 50.0 * energy), mean(rows.energy_wh - law),
+        mean(rows.energy_wh - base - 50.0 * heavy * energy), mean(rows.energy_wh - law),
         mean((c_rr - rows.c_rr) / unit[0]) + mean((cda - rows.cda_m2) / unit[1]),
     )  # fmt: skip
     assert min(terms) > 1e-9
@@ -177,7 +180,8 @@ def test_the_likelihood_and_its_stretches_by_hand(rows):
     law = law + watts[rows.vehicle] * rows.segments.duration_s / 3600
     floor, share = np.exp(np.asarray(model.noise[::2], float)) * 50.0, np.exp(np.asarray(model.noise[1::2], float))
     sd, loose = (np.sqrt(a**2 + (b * law) ** 2) for a, b in zip(floor, share, strict=True))
-    error, off = rows.energy_wh - law - 50.0 * energy, rows.energy_wh - law
+    heavy = np.asarray(rows.segments.channels["mass_kg"], float) / 20e3
+    error, off = rows.energy_wh - law - 50.0 * heavy * energy, rows.energy_wh - law
     minus = lambda x, s: -norm.logpdf(x, scale=s) - 0.5 * np.log(2 * np.pi)  # noqa: E731
     data = minus(error, sd).sum()
     for trip in range(4):
@@ -303,7 +307,7 @@ def test_in_use_there_is_no_dropout_the_means_run_and_each_row_is_alone(rows):
         mean, var = mean / come, var / come
         x = (np.maximum(x @ w.T + b, 0) - mean) / np.sqrt(var + normal.eps) * scale + shift
     out = x @ np.asarray(model.network.head.weight, float).T + np.asarray(model.network.head.bias, float)
-    np.testing.assert_allclose(second.residual_wh, model.scale_wh * out[:, 0], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(second.residual_wh, model.scale_wh * rows.unit * out[:, 0], rtol=1e-3, atol=1e-3)
     # whatever stands beside it
     some = np.array([70, 3, 3])
     for all_of, few in zip((first, second), made.predict(rows.take(some)), strict=True):

@@ -25,6 +25,7 @@ from hdev_jax.learn.pinn_rows import (
     wheel_energy,
 )
 from hdev_jax.physics import LIBRARY, Grouped, at_null, coefficients_that_hold
+from hdev_jax.physics.across import DISTANCE_SINCE_START
 from hdev_jax.physics.tyres import RoadSurface
 
 # Without errors of the instruments and of the payload the log is what was driven.
@@ -145,7 +146,7 @@ def test_features_without_units_do_not_change_with_the_size_of_the_world(length,
 
 
 def test_features_are_what_their_names_say():
-    s = road()
+    s = road().with_channels(gear=np.arange(60) % 3 + 1.0)
     names = tuple(dict.fromkeys(n for f in FEATURES.values() for n in f))
     x = dict(zip(names, rows_of(truck(), s, np.zeros(60), number=0, features=names).features.T, strict=True))
     g, mass, theta = 9.80665, s.channels["mass_kg"], s.channels["grade_rad"]
@@ -161,7 +162,8 @@ def test_features_are_what_their_names_say():
         "halt": distance == 0, "surface_2": s.channels["road_surface"] == 2, "warmth": np.exp(-gone / 6000),
         "wind_across": (s.channels["wind_speed_mps"] * np.sin(delta)) ** 2 / (g * 100),
         "duration_s": s.duration_s, "distance_m": distance, "ambient_temp_c": s.channels["ambient_temp_c"],
-        "mass_table_kg": np.full(60, 30e3), "auxiliary_table_w": np.full(60, 2000.0),
+        "mass_table_kg": np.full(60, 30e3), "auxiliary_table_w": np.full(60, 2000.0), "wind_cosine": np.cos(delta),
+        DISTANCE_SINCE_START: gone, "gear": s.channels["gear"], "time_s": s.time_s,
     }  # fmt: skip
     for name, column in expected.items():
         np.testing.assert_allclose(x[name], column, rtol=2e-5, atol=1e-6, err_msg=name)
@@ -169,7 +171,7 @@ def test_features_are_what_their_names_say():
 
 
 def test_what_a_black_box_without_a_kernel_is_given_does_not_depend_on_the_kernels_energy():
-    s = road()
+    s = road().with_channels(gear=np.ones(60))
     calibrated = truck({**TABLE, "c_rr": 0.012, "cda_m2": 9.0, "auxiliary_w": 9e3})
 
     def features(name, of):
