@@ -1,6 +1,6 @@
 """Pages of the networks' studies: the table with figures 6 and 7, error against the amount of data, loss weights."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,16 @@ from experiments.pinn_figures import (
     model_bars,
     weight_maps,
 )
+from experiments.pinn_results import (
+    FORM,
+    WAYS,
+    Results,
+    distinct,
+    diverged,
+    gathered_scores,
+    still_better,
+    trainings,
+)
 from experiments.pinn_scores import QUANTILES, TAUGHT, pooled
 from experiments.tables import write_tables
 from hdev_jax.errors import InputError
@@ -21,14 +31,10 @@ from hdev_jax.rundir import Run
 
 __all__ = ["coefficients", "grid", "shares", "table"]
 
-Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
-WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
-        "kernel": "physics, effects by closed form", "diagnosed": "physics, as diagnosed"}  # fmt: skip
 HELD = ("features without units hold the energy by the calibrated kernel, and efficiencies are read there: only a "
         "black box with no kernel, where there is one, is without physics")  # fmt: skip
 GIVEN = ("ours and the closed form are given the list of effects that the fleet hides; what diagnoses of "
          "training routes name by themselves is in models that say so")  # fmt: skip
-FORM = "its closed form alone"
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
@@ -41,51 +47,11 @@ NAMEABLE = {
 }
 
 
-def _gathered(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Scores by (way of predicting, use), over vehicles, folds and seeds. What no seed changes is there once."""
-    out: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    once: set[Any] = set()
-    for task, result in results:
-        name = task["name"]
-        for key, found in result.items():
-            if key not in (*WAYS, "network", "physics", "lightgbm", "form"):
-                continue
-            if task["model"]["kind"] == "vehicles":
-                way = WAYS[key]
-            else:
-                way = name + {"physics": ", its physics alone", "form": f", {FORM}"}.get(key, "")
-            for use, scored in found.items():
-                if key != "form" or (way, use, task["data"].get("fold")) not in once:
-                    out.setdefault((way, use), []).append(scored)
-                once.add((way, use, task["data"].get("fold")))
-    return out
-
-
-def _distinct(results: Results) -> dict[tuple[str, str], tuple[int, int]]:
-    """Rows and trips by (way, use) without those that another seed has, too: of each fold and vehicle once."""
-    once: dict[tuple[str, str], dict[tuple[Any, ...], tuple[int, int]]] = {}
-    for task, result in results:
-        of = (task["data"].get("fold"), task.get("vehicle"))
-        for key, (scored,) in _gathered([(task, result)]).items():
-            once.setdefault(key, {})[of] = (scored["rows"], scored["trips"])
-    return {key: (sum(n for n, _ in of.values()), sum(t for _, t in of.values())) for key, of in once.items()}
-
-
-def _trainings(results: Results) -> dict[str, tuple[int, int]]:
-    """By model that is trained: how many trainings there are, and how many of them diverged."""
-    out: dict[str, tuple[int, int]] = {}
-    for task, result in results:
-        if task["model"]["kind"] != "vehicles":
-            n, lost = out.get(task["name"], (0, 0))
-            out[task["name"]] = (n + 1, lost + ("diverged" in result))
-    return out
-
-
-def _line(name: str, use: str, found: list[dict[str, Any]], distinct: tuple[int, int]) -> dict[str, Any]:
+def _line(name: str, use: str, found: list[dict[str, Any]], of: tuple[int, int]) -> dict[str, Any]:
     """A row of the table; of several seeds, errors are of all of them together."""
     p = pooled(found)
     return {
-        "model": name, "rows of": use, "n": distinct[0], "trips": distinct[1], "RMSE [Wh]": p["rmse_wh"],
+        "model": name, "rows of": use, "n": of[0], "trips": of[1], "RMSE [Wh]": p["rmse_wh"],
         "PE [%]": p["pe_percent"], "PE of a trip, mean [%]": p["trip_pe_mean"],
         "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
@@ -95,20 +61,20 @@ def _line(name: str, use: str, found: list[dict[str, Any]], distinct: tuple[int,
 
 def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     """Every model on the same rows, the paper's numbers beside those that it prints."""
-    gathered = _gathered(results)
+    gathered = gathered_scores(results)
     data = "measured (ZTBus)" if config.data == "ztbus" else "synthetic fleet"
-    distinct, trainings = _distinct(results), _trainings(results)
+    every = distinct(results)
     rows, lines = [], []
     for (way, use), found in gathered.items():
         p = pooled(found)
-        line = _line(way, use, found, distinct[way, use])
+        line = _line(way, use, found, every[way, use])
         name = NAMED.get(way, way)
         paper = config.paper.get(name) if use == "test" else None
         lines.append({"data": data, **line, "paper RMSE": (paper or {}).get("rmse"),
                       "paper PE": (paper or {}).get("pe")})  # fmt: skip
         mine = {"rmse": p.pop("rmse_wh"), "pe": p.pop("pe_percent"), **p}
         rows.append({"name": name if use == "test" else f"{name} ({use})", "paper": paper, "ours": mine})
-    for model, (n, lost) in trainings.items():
+    for model, (n, lost) in trainings(results).items():
         if n == lost:
             name, said = NAMED.get(model, model), f"diverged, {lost} of {n} trainings"
             lines.append({"data": data, "model": f"{model}: {said}", "rows of": "test", "n": 0})
@@ -133,8 +99,8 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "training, validation and test by route" if config.data == "fleet" else "missions held out, by fold",
             HELD,
             "errors of coefficients: median of predicted over true, less one; spray counts as air",
-            *_lost(results),
-            *_capped(results),
+            *diverged(results),
+            *still_better(results),
             *([GIVEN] if config.data == "fleet" else []),
             *(f"effects in {name}: {', '.join(effects) or 'none'}" for name, effects in used.items()),
             *_nameable(gathered),
@@ -177,20 +143,8 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": rows,
         "better_than_paper": 0, "of": 0, "missed": [],
-        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth", *_lost(results)],
+        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth", *diverged(results)],
     }  # fmt: skip
-
-
-def _capped(results: Results) -> list[str]:
-    """Which models were still getting better when their epochs were over."""
-    still = sorted({t["name"] for t, r in results if r.get("still_better")})
-    return [f"still better at the last epoch, in some training: {', '.join(still)}"] if still else []
-
-
-def _lost(results: Results) -> list[str]:
-    """How many trainings diverged, where any did."""
-    lost = [f"{model} {k} of {n}" for model, (n, k) in _trainings(results).items() if k]
-    return [f"trainings that diverged, and are in no error: {', '.join(lost)}"] if lost else []
 
 
 def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound: Mapping[str, Any]) -> list[str]:
@@ -267,7 +221,7 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
     for share in sorted({t["data"]["share"] for t, _ in results}):
         part = [(t, r) for t, r in results if t["data"]["share"] == share]
         counts = next((r["counts"] for _, r in part if "counts" in r), None)
-        gathered = _gathered(part)
+        gathered = gathered_scores(part)
         if any(use == TAUGHT for _, use in curves) and not any(use == TAUGHT for _, use in gathered):
             # by now every vehicle has training routes
             gathered |= {(way, TAUGHT): found for (way, use), found in gathered.items() if use == "test"}
@@ -290,7 +244,7 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "the line is the median over seeds, the band all; seeds are of networks' weights: routes are drawn once, "
             "and LightGBM draws nothing",
             f"{TAUGHT}: what few routes leave vehicles without any is in test, not there",
-            HELD, GIVEN, *_capped(results), *_lost(results),
+            HELD, GIVEN, *still_better(results), *diverged(results),
         ],
     }  # fmt: skip
 

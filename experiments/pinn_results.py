@@ -1,0 +1,63 @@
+"""Results of the networks' tasks put together: by what predicts and on which rows, over vehicles, folds and seeds."""
+
+from collections.abc import Sequence
+from typing import Any
+
+__all__ = ["FORM", "WAYS", "Results", "distinct", "diverged", "gathered_scores", "still_better", "trainings"]
+
+Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
+WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
+        "kernel": "physics, effects by closed form", "diagnosed": "physics, as diagnosed"}  # fmt: skip
+FORM = "its closed form alone"
+
+
+def gathered_scores(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Scores by (way of predicting, use), over vehicles, folds and seeds. What no seed changes is there once."""
+    out: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    once: set[Any] = set()
+    for task, result in results:
+        name = task["name"]
+        for key, found in result.items():
+            if key not in (*WAYS, "network", "physics", "lightgbm", "form"):
+                continue
+            if task["model"]["kind"] == "vehicles":
+                way = WAYS[key]
+            else:
+                way = name + {"physics": ", its physics alone", "form": f", {FORM}"}.get(key, "")
+            for use, scored in found.items():
+                if key != "form" or (way, use, task["data"].get("fold")) not in once:
+                    out.setdefault((way, use), []).append(scored)
+                once.add((way, use, task["data"].get("fold")))
+    return out
+
+
+def distinct(results: Results) -> dict[tuple[str, str], tuple[int, int]]:
+    """Rows and trips by (way, use) without those that another seed has, too: of each fold and vehicle once."""
+    once: dict[tuple[str, str], dict[tuple[Any, ...], tuple[int, int]]] = {}
+    for task, result in results:
+        of = (task["data"].get("fold"), task.get("vehicle"))
+        for key, (scored,) in gathered_scores([(task, result)]).items():
+            once.setdefault(key, {})[of] = (scored["rows"], scored["trips"])
+    return {key: (sum(n for n, _ in of.values()), sum(t for _, t in of.values())) for key, of in once.items()}
+
+
+def trainings(results: Results) -> dict[str, tuple[int, int]]:
+    """By model that is trained: how many trainings there are, and how many of them diverged."""
+    out: dict[str, tuple[int, int]] = {}
+    for task, result in results:
+        if task["model"]["kind"] != "vehicles":
+            n, lost = out.get(task["name"], (0, 0))
+            out[task["name"]] = (n + 1, lost + ("diverged" in result))
+    return out
+
+
+def still_better(results: Results) -> list[str]:
+    """Which models were still getting better when their epochs were over."""
+    still = sorted({t["name"] for t, r in results if r.get("still_better")})
+    return [f"still better at the last epoch, in some training: {', '.join(still)}"] if still else []
+
+
+def diverged(results: Results) -> list[str]:
+    """How many trainings diverged, where any did."""
+    lost = [f"{model} {k} of {n}" for model, (n, k) in trainings(results).items() if k]
+    return [f"trainings that diverged, and are in no error: {', '.join(lost)}"] if lost else []
