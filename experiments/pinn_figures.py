@@ -97,6 +97,7 @@ def learning_curves(
         ax.set_xticks(sorted({routes[s] for k, points in curves.items() if k[1] == use for s, _ in points}))
         for axis in (ax.xaxis, ax.yaxis):
             plain_log(axis)
+        ax.minorticks_off()
         ax.set_yticks([y for y in (5, 10, 20, 50, 100, 200) if ax.get_ylim()[0] <= y <= ax.get_ylim()[1]])
         title = {"test": "Test routes", TAUGHT: "Test routes, vehicles trained on", "unseen": "Never trained on"}
         ax.set_title(title[use] + " (synthetic)")

@@ -261,11 +261,11 @@ def _against_black_boxes(config: Any, curves: Mapping[tuple[str, str], list[tupl
             others, mine_at = dict(curves[other, use]), dict(curves[OURS, use])
             for share in sorted(others)[: None if use == "unseen" else 1]:
                 if share not in mine_at:
-                    out.append(f"{share:g} of the routes, {use}: ours has no result")
+                    out.append(f"{100 * share:g} % of the routes, {use}: ours has no result")
                     continue
                 ratio = float(np.median(mine_at[share]) / np.median(others[share]))
                 if ratio > 0.7:
-                    out.append(f"{share:g} of the routes, {use}: RMSE {ratio:.2f} of {other}'s, 0.7 wanted")
+                    out.append(f"{100 * share:g} % of the routes, {use}: RMSE {ratio:.2f} of {other}'s, 0.7 wanted")
     return out
 
 

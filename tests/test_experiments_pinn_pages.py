@@ -188,10 +188,10 @@ def test_ours_against_black_boxes_at_the_least_data_and_on_what_is_unseen(run, n
     ]  # fmt: skip
     out = pinn_pages.shares(config("studies/pinn_data"), results, run)
     assert out["missed"] == [
-        "0.1 of the routes, test: RMSE 0.75 of network without physics's, 0.7 wanted",
-        "0.1 of the routes, test, vehicles trained on: RMSE 0.75 of network without physics's, 0.7 wanted",
-        "0.1 of the routes, unseen: RMSE 0.75 of network without physics's, 0.7 wanted",
-        "1 of the routes, unseen: RMSE 1.00 of network without physics's, 0.7 wanted",
+        "10 % of the routes, test: RMSE 0.75 of network without physics's, 0.7 wanted",
+        "10 % of the routes, test, vehicles trained on: RMSE 0.75 of network without physics's, 0.7 wanted",
+        "10 % of the routes, unseen: RMSE 0.75 of network without physics's, 0.7 wanted",
+        "100 % of the routes, unseen: RMSE 1.00 of network without physics's, 0.7 wanted",
     ]
     first = written(run, "shares")[0]
     expected = {"seeds": 3, "RMSE [Wh]": 3, "least": 2, "most": 4, "training routes": 2, "training rows": 90}
