@@ -98,7 +98,9 @@ def learning_curves(
         for axis in (ax.xaxis, ax.yaxis):
             plain_log(axis)
         ax.minorticks_off()
-        ax.set_yticks([y for y in (5, 7, 10, 15, 20, 30, 50, 70, 100, 200) if ax.get_ylim()[0] <= y <= ax.get_ylim()[1]])
+        ax.set_yticks(
+            [y for y in (5, 7, 10, 15, 20, 30, 50, 70, 100, 200) if ax.get_ylim()[0] <= y <= ax.get_ylim()[1]]
+        )
         title = {"test": "Test routes", TAUGHT: "Test routes, vehicles trained on", "unseen": "Never trained on"}
         ax.set_title(title[use] + " (synthetic)")
         ax.legend(fontsize=7)
