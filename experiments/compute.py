@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import json
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -88,7 +88,7 @@ def compute(
 
     if not every:
         return failed
-    groups = _groups(every.values())
+    groups = _groups(every.values(), where.workers)
     with contextlib.closing(_outcomes(where, groups)) as outcomes:
         for group, outcome in progress.track(outcomes, "running", total=len(groups)):
             ids = " ".join(t.at.stem for t in group)
@@ -111,13 +111,15 @@ def compute(
     return failed
 
 
-def _groups(every: Iterable[Todo]) -> list[list[Todo]]:
-    """The tasks that an experiment runs in one call, side by side; the others by themselves."""
+def _groups(every: Collection[Todo], workers: int) -> list[list[Todo]]:
+    """The tasks that an experiment runs in one call; the others by themselves. No group is more than a worker's share,
+    so that a study that is one group has work for all of them."""
     groups: dict[Any, list[Todo]] = {}
     for t in every:
         key = t.says("together")
         groups.setdefault(t.at if key is None else (t.module.__name__, key), []).append(t)
-    return list(groups.values())
+    most = -(-len(every) // workers)
+    return [g[i : i + most] for g in groups.values() for i in range(0, len(g), most)]
 
 
 def _outcomes(where: Where, groups: list[list[Todo]]) -> Generator[tuple[list[Todo], Outcome], None, None]:

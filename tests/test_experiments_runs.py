@@ -137,6 +137,9 @@ def test_tasks_that_run_together_are_kept_alone(tmp_path, config):
     (more,) = run_config(config, ["together=true", "count=6"], out=tmp_path / "b", kept=tmp_path / "kept")
     assert more["rows"][0]["ours"]["total"] == 55.0
     assert len(list((tmp_path / "kept").rglob("*.json"))) == 6
+    (shared,) = run_config(config, ["together=true", "count=6"], out=tmp_path / "c", workers=2)
+    assert shared["rows"] == more["rows"]
+    assert (tmp_path / "c" / "log.txt").read_text().count("3 tasks in one program") == 2, "work for both"
 
 
 def test_tasks_that_measure_time_run_last_and_here(tmp_path, config):

@@ -7,6 +7,8 @@ place of squares weighed by hand; a term for the sum over a stretch of a trip; e
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -229,24 +231,47 @@ def predict(model: Pinn, memory: eqx.nn.State, rows: Rows) -> Prediction:
 
 def ready(model: Pinn, memory: eqx.nn.State, like: Rows) -> Callable[[Rows], Prediction]:
     """`predict` for rows of the shape of `like`, a row at a time, where handing over numbers takes longest: the model's
-    are compiled in, and the row's columns go in as two arrays, of real and of whole numbers."""
-    leaves, tree = jax.tree.flatten(like)
-    whole = [np.issubdtype(np.asarray(x).dtype, np.integer) for x in leaves]
-    shapes = [np.shape(x) for x in leaves]
-    sizes = [int(np.prod(s)) for s in shapes]
+    are compiled in, the row's columns go in as one array of their bytes.
 
-    @jax.jit
-    def packed(*parts: Array) -> Prediction:
-        begin, out = [0, 0], []
-        for of, shape, n in zip(whole, shapes, sizes, strict=True):
-            out.append(parts[of][begin[of] : begin[of] + n].reshape(shape))
-            begin[of] += n
-        return predict(model, memory, jax.tree.unflatten(tree, out))
+    **Raises:** `ValueError`, of what is returned, for rows of another shape.
+    """
+    found, tree = jax.tree.flatten_with_path(like)
+    leaves = [np.asarray(x) for _, x in found]
+    ends = np.cumsum([x.nbytes for x in leaves]).tolist()
+    # from node to node: to flatten a tree of modules takes as long as the network
+    slots: dict[tuple[Any, ...], int] = {(): 0}
+    steps: list[tuple[int, Callable[[Any], Any]]] = []
+    for way, _ in found:
+        for n in range(1, len(way) + 1):
+            if way[:n] not in slots:
+                slots[way[:n]] = len(slots)
+                steps.append((slots[way[: n - 1]], _step(way[n - 1])))
+    columns = [(slots[way], x.dtype) for (way, _), x in zip(found, leaves, strict=True)]
+
+    # one row's products are too small to be worth waking another thread for
+    @partial(jax.jit, compiler_options={"xla_cpu_multi_thread_eigen": False})
+    def packed(data: Array) -> Prediction:
+        parts = []
+        for x, begin, end in zip(leaves, [0, *ends], ends, strict=False):
+            part = data[begin:end].reshape((*x.shape, x.itemsize) if x.itemsize > 1 else x.shape)
+            parts.append(jax.lax.bitcast_convert_type(part, x.dtype))
+        return predict(model, memory, jax.tree.unflatten(tree, parts))
 
     def one(rows: Rows) -> Prediction:
-        parts: tuple[list[Any], list[Any]] = ([], [])
-        for of, x in zip(whole, jax.tree.leaves(rows), strict=True):
-            parts[of].append(x.ravel())
-        return packed(*map(np.concatenate, parts))
+        nodes: list[Any] = [rows]
+        for parent, step in steps:
+            nodes.append(step(nodes[parent]))
+        data = b"".join([np.asarray(nodes[at], kind).tobytes() for at, kind in columns])
+        if len(data) != ends[-1]:
+            raise ValueError(f"rows of the shape that it was made ready for are expected ({len(like)} of them)")
+        return packed(np.frombuffer(data, np.uint8))
 
     return one
+
+
+def _step(key: Any) -> Callable[[Any], Any]:
+    """From a node of a tree to what it holds under a key of `jax.tree.flatten_with_path`."""
+    if isinstance(key, jax.tree_util.GetAttrKey):
+        name, get = key.name, object.__getattribute__  # a module's own looks for methods first, which takes long
+        return lambda node: get(node, name)
+    return itemgetter(key.idx if isinstance(key, jax.tree_util.SequenceKey) else key.key)

@@ -17,7 +17,7 @@ from scipy.special import expit, logit
 from scipy.stats import multivariate_t, norm
 
 from hdev_jax.errors import InputError
-from hdev_jax.learn.heads import Heads
+from hdev_jax.learn.heads import Heads, _kept
 from hdev_jax.learn.pinn import Pinn, Recipe, Sized, predict, ready
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, Sizes, fit, stretches
 from hdev_jax.learn.pinn_loss import Objective
@@ -98,6 +98,25 @@ def test_a_model_that_is_ready_says_the_same_of_a_row(rows):
         one = say(rows.take(np.array([k])))
         for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a[0], b[k], rtol=1e-5, atol=1e-4)
+    doubles = jax.tree.map(lambda x: x.astype(float) if x.dtype.kind == "f" else x.astype(np.int64), rows)
+    np.testing.assert_array_equal(say(doubles.take(np.array([7]))).energy_wh, say(rows.take(np.array([7]))).energy_wh)
+    with pytest.raises(ValueError, match="made ready for are expected"):
+        say(rows.take(np.array([7, 8])))
+
+
+@pytest.mark.parametrize(("shape", "dropout"), [((400, 300), 0.1), ((301, 255), 0.5), ((1, 3), 0.0)])
+def test_dropout_leaves_out_its_share_of_every_unit_by_chance(shape, dropout):
+    kept = np.asarray(_kept(jax.random.key(3), 1 - dropout, shape), float)
+    assert kept.shape == shape
+    sd = np.sqrt(dropout * (1 - dropout))
+    for axis in (None, 0, 1):  # of all, of a unit, of a row
+        mean = kept.mean(axis)
+        assert np.all(np.abs(mean - (1 - dropout)) <= 5 * sd / np.sqrt(kept.size / mean.size))
+    if dropout:  # units of one word, and words that are drawn together, know nothing of each other
+        about = kept - kept.mean()
+        for by, axis in ((1, None), (kept.size // 2, None), (-(-shape[1] // 2), 1)):
+            assert abs(np.mean(about * np.roll(about, by, axis))) / sd**2 < 5 / np.sqrt(kept.size)
+        assert np.any(kept != np.asarray(_kept(jax.random.key(4), 1 - dropout, shape)))
 
 
 @settings(max_examples=100)
