@@ -63,7 +63,7 @@ class Network(eqx.Module):
         return jax.vmap(one, in_axes=(0, None), out_axes=(0, None), axis_name="batch")(x, state)
 
 
-def _kept(key: PRNGKeyArray, share: float, shape: tuple[int, int]) -> Bool[Array, "row unit"]:
+def _kept(key: PRNGKeyArray, share: float, shape: tuple[int, ...]) -> Bool[Array, "row unit"]:
     """Which units stay: so large a share, to 2⁻¹⁷. Drawing takes a fifth of a step: of one random word 16 bits are for
     a unit and 16 for another, and the words are both of threefry's, where `jax.random.bits` makes one of them."""
     rows, half = shape[0], -(-shape[1] // 2)
