@@ -16,6 +16,11 @@ demo: $(READY)
 paper: $(READY)
 	@$(PY) -m experiments configs/paper.toml --out out/paper --workers 0 $(ARGS)
 
+# One thread for each of the processes that run tests side by side: threads that wait for each other's cores take longer
+# than the sums they share.
+test: export OMP_NUM_THREADS := 1
+test: export OPENBLAS_NUM_THREADS := 1
+test: export XLA_FLAGS := $(XLA_FLAGS) --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1
 test: $(READY)
 	@$(PY) -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
 
