@@ -9,7 +9,7 @@ from experiments.figures import save_figure, styled
 from experiments.pinn_scores import TAUGHT, pooled
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
-from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, plain_log, tidy
+from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, figure, plain_log, tidy
 from hdev_jax.rundir import Run
 
 __all__ = ["MODELS", "OURS", "PAPER_MODEL", "coefficient_boxes", "learning_curves", "model_bars", "weight_maps"]
@@ -123,13 +123,14 @@ def weight_maps(run: Run, found: Mapping[tuple[float, ...], float]) -> None:
         ax.imshow(values, origin="lower", vmin=low, vmax=high, cmap="viridis_r", aspect="auto")
         for a in range(len(rows)):
             for b in range(len(columns)):
-                ax.text(b, a, f"{values[a, b]:.1f}", ha="center", va="center", fontsize=6)
+                dark = values[a, b] > 0.5 * (low + high)
+                ax.text(b, a, f"{values[a, b]:.1f}", ha="center", va="center", fontsize=7, color="w" if dark else INK)
         ax.set_xticks(range(len(columns)), [f"{x:g}" for x in columns])
         ax.set_yticks(range(len(rows)), [f"{x:g}" for x in rows])
         ax.set_xlabel(f"λ{'₁₂₃'[j]}")
         ax.set_ylabel(f"λ{'₁₂₃'[i]}")
         third = ({0, 1, 2} - {i, j}).pop()
-        ax.set_title(f"RMSE [Wh], λ{'₁₂₃'[third]} = {PAPER_WEIGHTS[third]:g}")
+        ax.set_title(f"RMSE [Wh], λ{'₁₂₃'[third]} = {PAPER_WEIGHTS[third]:g} (synthetic)")
     save_figure(run, fig, "grid")
 
 
