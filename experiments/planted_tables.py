@@ -77,10 +77,14 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
             rows.append({**row, "wanted": least, **told})
     for table, (caption, columns) in TABLES.items():
         part = [{k: r[k] for k in ("name", "n", *columns)} for r in rows if r[columns[0]] is not None]
-        write_tables(run, table, part, f"{caption}; synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
+        if part:
+            write_tables(run, table, part, f"{caption}; synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
     able = [(t, r) for t, r in done if config.cases[t["case"]].asked == "named"]
     sized = [*_covered(able), *_near_oracle(able)]
-    write_tables(run, "planted_sizes", sized, "Sizes and errors after the loop, every log with an effect to be named")
+    if sized:
+        write_tables(
+            run, "planted_sizes", sized, "Sizes and errors after the loop, every log with an effect to be named"
+        )
     against = rival_rows(groups, config.rivals)
     if against:
         caption = "Rivals on the same logs, synthetic; without those whose effect is sought elsewhere than in columns"

@@ -26,13 +26,16 @@ from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 from hdev_jax.units import registry, unit_of
 
-__all__ = ["TERM", "Described", "DescribedForce", "Expression", "Factor", "find_expression", "monomials"]
+__all__ = [
+    "TERM", "Described", "DescribedForce", "Expression", "Factor", "described_by", "describing", "find_expression",
+    "monomials", "product", "thresholds",
+]  # fmt: skip
 
 STRICTER = 5.0  # a description of the rest has to clear a level so much lower than a cause does
 MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds of columns
 TOGETHER = 64  # monomials that are evaluated at once
 QUANTILES = (0.5, 0.75, 0.9)
-STEP = 0.2  # of the rows, on either side of a threshold that is looked at again
+STEP = 0.1  # of the rows, on either side of a threshold that is looked at again
 MOTION = ("speed_mps", "accel_mps2")
 TERM = "derived:expression"
 # units with an offset count as differences, a slope as a ratio
@@ -101,7 +104,8 @@ class DescribedForce(Effect):
         return self.k * row.channels[TERM]
 
 
-def _describing(target: Target) -> type[Described] | type[DescribedForce]:
+def describing(target: Target) -> type[Described] | type[DescribedForce]:
+    """The effect that a monomial is for this target: a power, or a force where the battery lies behind it."""
     return Described if target in BATTERY_TARGETS else DescribedForce
 
 
@@ -167,7 +171,7 @@ class Terms:
     @property
     def candidates(self) -> list[Candidate]:
         """One for each monomial."""
-        return [Candidate(_describing(self.target), ("k",), (None,), (), "size", (i,)) for i in range(self.width)]
+        return [Candidate(describing(self.target), ("k",), (None,), (), "size", (i,)) for i in range(self.width)]
 
     @property
     def left_out(self) -> dict[str, str]:
@@ -201,15 +205,22 @@ def _added(car: Vehicle, segments: Segments, target: Target, terms: Array) -> Ar
     return jax.lax.map(lambda term: predicted(term) - nothing, terms)
 
 
-def finer(factor: Factor, segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
-    """The same channel above thresholds nearer to where it may be: between the quantiles on either side."""
-    x = np.asarray(segments.channels[factor.name], dtype=float)[:rows]
-    near = [q for q in np.linspace(0.02, 0.98, 97) if abs(q - np.mean(x <= factor.above)) < STEP]
-    cuts = sorted({float(f"{np.quantile(x, q):.4g}") for q in near} - {factor.above})
-    return [(replace(factor, above=c),) for c in cuts if x.min() <= c < x.max()]
+def thresholds(factors: Sequence[Factor], segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
+    """The channels of a monomial above thresholds: at every twentieth of the first `rows` rows, or, of a threshold, at
+    every hundredth near it."""
+    near = factors[0].above if len(factors) == 1 else None
+    out: list[tuple[Factor, ...]] = []
+    for name in dict.fromkeys(f.name for f in factors if f.name not in MOTION):
+        x = np.asarray(segments.channels[name], dtype=float)[:rows]
+        at = np.arange(0.05, 0.96, 0.05)
+        if near is not None:
+            at = np.clip(np.mean(x <= near) + np.arange(-STEP, STEP + 0.005, 0.01), 0.01, 0.99)
+        cuts = {float(f"{q:.4g}") for q in np.quantile(x, at)} - {near}
+        out += [(Factor(name, above=c),) for c in sorted(cuts) if x.min() <= c < x.max()]
+    return out
 
 
-def _terms(
+def described_by(
     vehicle: Vehicle, segments: Segments, rows: int, target: Target, made: Sequence[tuple[Factor, ...]]
 ) -> Terms:
     """The monomials of `made` that vary on the first `rows` rows."""
@@ -219,7 +230,7 @@ def _terms(
         scale = float(np.sqrt(np.mean(term**2)))
         if np.isfinite(scale) and np.std(term) > 1e-9 * scale > 0:
             sets, scales = [*sets, factors], [*scales, scale]
-    return Terms(tuple(sets), tuple(scales), vehicle.plus(_describing(target)(np.asarray(1.0))), target)
+    return Terms(tuple(sets), tuple(scales), vehicle.plus(describing(target)(np.asarray(1.0))), target)
 
 
 def find_expression(
@@ -243,16 +254,20 @@ def find_expression(
     best, view = _best(start, problem, made)
     if best is None or view is None or view.q[Described.id] > problem.fdr:
         return None
-    if len(factors := best[0]) == 1 and factors[0].above is not None:
-        # a threshold that is off leaves some of the cause to whatever is near
-        made += finer(factors[0], problem.rows.segments, problem.rows.rows)
+    # what rises with a channel may be switched by it, and a threshold that is off leaves some of the cause to whatever
+    # is near
+    for _ in range(2):
+        more = thresholds(best[0], problem.rows.segments, problem.rows.rows)
+        made += [t for t in more if t not in made]
         best, view = _best(start, problem, made)
+        if best is None or best[0][0].above is None:
+            break
     return _chosen(start, problem, best, view, everything, predict, tell)
 
 
 def _best(start: Search, problem: Loop, made: Sequence[tuple[Factor, ...]]) -> tuple[Any, View | None]:
     """The best monomial of those made with its scale, None where none can be told, and the look at all of them."""
-    terms = _terms(start.fit.vehicle, problem.rows.segments, problem.rows.rows, problem.target, made)
+    terms = described_by(start.fit.vehicle, problem.rows.segments, problem.rows.rows, problem.target, made)
     view = look(problem, start, made=terms) if terms.width else None
     if view is None or Described.id not in view.best:
         return None, view
@@ -277,7 +292,7 @@ def _chosen(
     at = next(i for i, c in enumerate(chosen.fit.table.free) if c.path == "effects.expression.k")
     value, sd = chosen.fit.values[at] / scale, chosen.fit.sd[at] / scale
     words = "·".join(f.words() for f in factors)
-    unit = _coefficient_unit(factors, _describing(problem.target).parameters[0].unit)
+    unit = _coefficient_unit(factors, describing(problem.target).parameters[0].unit)
     formula = f"({value:.3g} ± {sd:.2g}) {unit} · {words}"
     everything = everything.with_channels(**{TERM: product(factors, everything) / scale})
     predicted = predict(chosen.fit.vehicle, everything)

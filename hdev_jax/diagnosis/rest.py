@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.diagnosis.expression import Described, Factor, find_expression
+from hdev_jax.diagnosis.hint import find_hint
 from hdev_jax.diagnosis.look import Loop, Search, Verdict
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.refit import as_known, refitted, without
@@ -64,12 +65,19 @@ def told_apart(
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
-            asked = _small(problem, state, loop, predicted, train, left.cycle_w)
+            asked = _small(problem, state, loop, predicted, train, _most(problem, train, left.cycle_w))
             told = checkpoint(
                 f"cycle-{round_}", lambda s=state, k=asked, c=left.cycle_w: _beside_cycle(s, fresh(), c, k, tell)
             )
+        else:
+            told = checkpoint(
+                f"hint-{round_}", lambda s=state, p=predicted: _hinted(problem, s, fresh(), p, train, tell)
+            )
+            if told:
+                left, asked = left.hinted(told["words"], told["channels"], told["rms"]), tuple(told["asked"])
         gone = next(iter(told.get("superfluous", ())), None)
-        why = f"not found again beside {'the formula' if 'formula' in told else 'the cycle'} for what is left"
+        description = "the formula" if "formula" in told else "what rows follow" if "words" in told else "the cycle"
+        why = f"not found again beside {description} for what is left"
         if gone is None:  # of what was asked about, that word stands
             gone, why = _shadow(problem, state, predicted, train, left, asked), MEAN_OF_MORE
         if gone is None or round_ == MOST_SHADOWS:
@@ -120,17 +128,45 @@ def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collect
     return {"superfluous": list(stand_ins(*beside(loop, state, load), (), tell, asked))}
 
 
+def _hinted(
+    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, tell: Tell
+) -> dict[str, Any]:
+    """What rows follow though no formula is borne out, as plain values; empty where they follow nothing."""
+    tell("what is left: what its rows follow")
+    hint = find_hint(state, loop)
+    if hint is None:
+        return {}
+    rms = float(np.sqrt(np.mean(hint.column[: loop.rows.rows] ** 2)))
+    beside_it, known = beside(loop, state, 1000.0 * hint.column / rms)
+    swing = float(np.std(known.fit.predicted - state.fit.predicted))
+    if swing**2 < LEAST_SHARE * np.mean((problem.measured - predicted[-1])[train] ** 2):
+        return {}
+    channels = tuple(dict.fromkeys(f.name for f in hint.factors))
+    # a mean as it goes with a wave of the same variance; nothing is asked beside a fit that did not converge
+    most = 2.0 * (MEAN_OVER_SWING * swing) ** 2
+    asked = _small(problem, state, loop, predicted, train, most) if known.fit.converged else ()
+    gone = stand_ins(beside_it, known, channels, tell, asked)
+    return {
+        "words": hint.words(), "channels": list(channels), "rms": swing,
+        "asked": list(asked), "superfluous": list(gone),
+    }  # fmt: skip
+
+
+def _most(problem: Problem, train: np.ndarray, cycle_w: np.ndarray) -> float:
+    """Mean square, in the target's unit, of the mean that a load with a cycle of this amplitude can have."""
+    to_unit = np.asarray(problem.segments.duration_s)[train] / 3600.0 if problem.target == "energy_wh" else 1e-3
+    return float(np.mean((MEAN_OVER_SWING * cycle_w * to_unit) ** 2))
+
+
 def _small(
-    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, cycle_w: np.ndarray
+    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, most: float
 ) -> tuple[str, ...]:
-    """Effects that explain no more of the training rows than the mean of the cycle that is left could, when they were
-    found or now, beside all others.
+    """Effects that explain no more of the training rows than the mean (`most`, its square) of what is left could, when
+    they were found or now, beside all others.
 
     A heater's cycle is larger in the cold, and beside it what the cabin takes is hardly found again: but it takes more
     than a swing of this size could, and so is no stand-in for it.
     """
-    to_unit = np.asarray(problem.segments.duration_s)[train] / 3600.0 if problem.target == "energy_wh" else 1e-3
-    most = float(np.mean((MEAN_OVER_SWING * cycle_w * to_unit) ** 2))
     mse = float(np.mean((problem.measured - predicted[-1])[train] ** 2))
 
     def now(effect_id: str) -> float:

@@ -71,9 +71,10 @@ class Clocked:
 def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Period | None:
     """The peak that stands out most of the noise around it; None where the trips are too short for a cycle.
 
-    Periodograms of the whitened residual in windows of equal length, added up whatever the phase (Bartlett 1948): at
-    each frequency a sum of as many exponential variables as there are windows, times the level of the noise there,
-    which its neighbours tell: the noise as estimated has the cycle in it, and is too high there.
+    Periodograms of what a load of each frequency meets in the whitened residual, in windows of equal length, added up
+    whatever the phase (Bartlett 1948): at each frequency a sum of as many exponential variables as there are windows,
+    times the level of the noise there, which its neighbours tell: the noise as estimated has the cycle in it, and is
+    too high there.
     """
     # An autoregression of a higher order predicts a strong cycle, and would take it out; so would levels of trips and
     # of blocks a slow one. What one coefficient leaves of the noise's colour is smooth.
@@ -87,15 +88,14 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
         window /= 2  # a single trip is its own repetition
     if window < 64 * step:
         return None
-    white = rows.whitened(residual[:, None])[:, 0]
+    signal, weight = _matched(rows.whitened(residual[:, None])[:, 0], rows)
     size = 1 << int(np.ceil(np.log2(2 * window / step)))  # twice as fine as the window tells apart
     power, count = np.zeros(size // 2 + 1), 0
     pieces = [w for s in rows.slices for w in _windows(rows.clock_s, s, window)]
     for piece in pieces:
         clock = rows.clock_s[piece] - rows.clock_s[piece.start]
-        weight = rows.worth[piece]
-        even = np.bincount((clock / step).astype(int), white[piece] * weight, minlength=size)[:size]
-        power += np.abs(np.fft.rfft(even)) ** 2 / float(weight @ weight)
+        even = np.bincount((clock / step).astype(int), signal[piece], minlength=size)[:size]
+        power += np.abs(np.fft.rfft(even)) ** 2 / float(weight[piece] @ weight[piece])
         count += 1
     if count < 2:
         return None
@@ -115,6 +115,23 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
     for piece, x in zip(pieces, by_window, strict=True):
         amplitudes[piece] = x
     return Period(period, mean, min(p, 1.0), amplitudes)
+
+
+def _matched(white: np.ndarray, rows: Clocked) -> tuple[np.ndarray, np.ndarray]:
+    """What of each row a load meets: the load's products with it are those of its whitened column with `white`. Second,
+    what a row weighs.
+
+    Rows differ in length, and whitening takes from each what the one before predicts: what is left of a slow load is
+    mostly what a long row has more of it than a short one. First rows, which none predicts, would outweigh many others
+    and are left out.
+    """
+    signal, weight = np.empty_like(white), np.empty_like(white)
+    for k, s in enumerate(rows.slices):
+        sd = float(rows.noise.scales[1]) * float(rows.noise.trip_scale[min(k, len(rows.noise.trip_scale) - 1)])
+        v = np.r_[0.0, white[s][1:], 0.0] / sd
+        signal[s] = rows.worth[s] * (v[:-1] - float(rows.noise.coefficients[1, 0]) * v[1:])
+        weight[s] = rows.worth[s] / sd
+    return signal, weight
 
 
 def _windows(clock: np.ndarray, trip: slice, window: float) -> list[slice]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hdev_jax.diagnosis.cycles import add_cycle
-from hdev_jax.diagnosis.expression import TERM, Described
+from hdev_jax.diagnosis.expression import TERM, Described, describing
 from hdev_jax.diagnosis.look import Found, Loop, Search, look
 from hdev_jax.diagnosis.modes import add_mode
 from hdev_jax.diagnosis.refit import sharpened, without
@@ -26,11 +26,12 @@ Tell = Callable[[str], None]
 
 
 def beside(problem: Loop, state: Search, load_w: Float[np.ndarray, " row"]) -> tuple[Loop, Search]:
-    """The loop and the state with a load in proportion to `load_w` [W, padded as the loop's rows] in the base."""
+    """The loop and the state with a load in proportion to `load_w` [W or, in front of the battery, N; padded as the
+    loop's rows] in the base."""
     scale = float(np.sqrt(np.mean(load_w[: problem.rows.rows] ** 2)))
     segments = problem.rows.segments.with_channels(**{TERM: load_w / scale})
     problem = replace(problem, rows=replace(problem.rows, segments=segments))
-    effect = Described(np.asarray(scale))
+    effect = describing(problem.target)(np.asarray(scale))
     table = state.table.plus(*effect_coefficients(effect, ("k",), shapes=False))
     fit = calibrate(state.fit.vehicle.plus(effect), table, problem.rows, problem.target, problem.clusters)
     return problem, replace(state, vehicle=fit.vehicle, table=table, fit=fit)
@@ -61,5 +62,6 @@ def _again(problem: Loop, state: Search, f: Found, tell: Tell) -> bool:
     if (by := f.score.candidate.effect.searched) in BY_TRIP:
         return BY_TRIP[by](problem, start)[0] is not None
     view = sharpened(problem, look(problem, start))
-    others = [id_ for id_ in view.best if id_ not in (f.id, *f.twins)]
+    # itself: a twin may do no more than take back what the description has too much of
+    others = [id_ for id_ in view.best if id_ != f.id]
     return choose(problem, start, view, tell, skip=others, forms=False) is not None

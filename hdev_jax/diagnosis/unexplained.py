@@ -22,6 +22,7 @@ OFFSET_LEVEL = 0.01  # of a mean over trips, once it is known that something is 
 LEAST_LEVEL = 0.1  # of the residual's variance, of levels by trip
 LEAST_ROWS = 8  # of a trip that is asked for its level
 LEAST_SHARE = 0.02  # of the test variance; below it structure is real perhaps, but explains nothing
+BASIC_WAVE = 3.0 / (2.0 * np.pi**2)  # share of it in the mean square of a load that rises and falls back (a saw-tooth)
 ROUNDS = 400
 APART = 2.0  # in log-likelihood, that one amount explains trips' remainders better than the next
 GROWS_AS = {"time": "a power", "distance": "a force", "energy": "an efficiency"}
@@ -55,10 +56,18 @@ class Remainder:
         """The same with a formula that fits it; `rms` is the formula's own, `error` on test rows without and with."""
         errors = f"test RMSE {error[0]:.4g} → {error[1]:.4g} {unit}"
         words = f"it follows {formula}, which the library does not hold ({errors})"
+        return replace(self._saying(words, channels, rms), expression=formula)
+
+    def hinted(self, words: str, channels: Sequence[str], rms: float) -> "Remainder":
+        """The same with what rows of training trips follow, of which no formula is borne out."""
+        more = f"its rows follow {words} more closely than chance could; no formula for it is borne out"
+        return self._saying(more, channels, rms)
+
+    def _saying(self, words: str, channels: Sequence[str], rms: float) -> "Remainder":
         start, between = (self.signature.rstrip("."), "; ") if self.significant else ("What is left", ": ")
         return replace(
             self, significant=True, depends_on=tuple(dict.fromkeys((*channels, *self.depends_on))),
-            signature=f"{start}{between}{words}.", rms=max(self.rms, rms), expression=formula,
+            signature=f"{start}{between}{words}.", rms=max(self.rms, rms),
         )  # fmt: skip
 
 
@@ -265,7 +274,8 @@ def _rms(rows: Rows, amplitude: float) -> float:
 def _period(rows: Rows, noise: Noise) -> Period | None:
     """A cycle that noise with the spectrum around it could not have made."""
     hit = strongest_period(rows.residual, Clocked.of(rows.trip, rows.duration_s, rows.worth, noise))
-    if hit is None or hit.p > LEVEL or _rms(rows, hit.amplitude) ** 2 < LEAST_SHARE * np.mean(rows.residual**2):
+    least = BASIC_WAVE * LEAST_SHARE * np.mean(rows.residual**2)
+    if hit is None or hit.p > LEVEL or _rms(rows, hit.amplitude) ** 2 < least:
         return None
     return hit
 

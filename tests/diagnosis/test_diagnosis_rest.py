@@ -112,8 +112,10 @@ def test_what_takes_more_than_a_cycle_could_is_no_stand_in_for_it(target, unit, 
     monkeypatch.setattr(Problem, "predict", lambda _, size: np.where(train, size, 0.0))
     cycle = np.full(10, 1000.0)
     small = ("cabin_warmup", "auxiliary_power", "inverter_loss")
-    assert rest._small(problem, state, bare(Loop), predicted, train, cycle) == small
-    assert rest._small(problem, state, bare(Loop), predicted, train, 0.1 * cycle) == ()
+    most = rest._most(problem, train, cycle)
+    assert most == pytest.approx(4.0 * unit**2)
+    assert rest._small(problem, state, bare(Loop), predicted, train, most) == small
+    assert rest._small(problem, state, bare(Loop), predicted, train, 0.01 * most) == ()
 
 
 @pytest.mark.parametrize(
@@ -150,6 +152,7 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
     for name, answer in {
         "_path": lambda p, s, _: [bare(Calibration, vehicle=k) for k in range(len(s.found) + 1)],
         "_remainder": lambda *_: left, "_formula": lambda *_: {}, "_small": lambda *_: small,
+        "_most": lambda *_: 1.0,
         "beside": lambda loop, state, _: (loop, state), "stand_ins": stand_ins, "_gone": take_out, "MOST_SHADOWS": 1,
         "replace": lambda loop, **_: loop,
     }.items():  # fmt: skip
@@ -161,6 +164,50 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
     rest.told_apart(problem, split, state, loop, seed=0, tell=silent, checkpoint=lambda _, make: make())
     assert said == gone
     assert asked[:1] == ([small] if small else [])
+
+
+@pytest.mark.parametrize("again", [(), ("hvac_power",)])
+def test_beside_what_rows_follow_effects_are_asked_again_and_it_is_said(again, monkeypatch):
+    """A stand-in goes with its reason; what is left is called by its channel in either case, and told once."""
+    train, said, kept = np.ones(10, bool), [], []
+    found = SimpleNamespace(id="hvac_power", score=SimpleNamespace(candidate=SimpleNamespace(sizes=("power_w",))))
+
+    def hinted(problem, state, loop, predicted, train, tell):
+        asked = [f.id for f in state.found]
+        gone = [k for k in asked if k not in again]
+        return {
+            "words": "[humidity_pct > 70]", "channels": ["humidity_pct"], "rms": 3.0,
+            "asked": asked, "superfluous": gone,
+        }  # fmt: skip
+
+    def take_out(loop, state, id_, why):
+        said.append((id_, why))
+        return bare(Search, found=[])
+
+    left = left_of(side(0, size=0.0), side(1, size=0.0))
+    assert not left.significant
+    for name, answer in {
+        "_path": lambda p, s, _: [bare(Calibration, vehicle=k) for k in range(len(s.found) + 1)],
+        "_remainder": lambda *_: left, "_formula": lambda *_: {}, "_hinted": hinted, "_gone": take_out,
+        "replace": lambda loop, **_: loop,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(rest, name, answer)
+    monkeypatch.setattr(Problem, "rows", lambda *_: train)
+    monkeypatch.setattr(Problem, "predict", lambda _, k: np.full(10, float(k)))
+    problem, split = bare(Problem, measured=np.zeros(10)), bare(Split, train=(0,), test=(1,))
+    state = bare(Search, found=[found])
+    loop = bare(Loop, rows=SimpleNamespace(measured=np.zeros(10)))
+    state, _, _, rest_of_it = rest.told_apart(
+        problem, split, state, loop, seed=0, tell=silent,
+        checkpoint=lambda name, make: (kept.append(name), make())[1],
+    )  # fmt: skip
+    assert rest_of_it.significant
+    assert rest_of_it.depends_on == ("humidity_pct",)
+    assert rest_of_it.rms == 3.0
+    assert "rows follow [humidity_pct > 70]" in rest_of_it.signature
+    assert [f.id for f in state.found] == list(again)
+    assert said == ([] if again else [("hvac_power", "not found again beside what rows follow for what is left")])
+    assert kept.count("hint-0") == 1
 
 
 @pytest.mark.parametrize("duty", [0.05, 0.3, 0.5, 0.78])

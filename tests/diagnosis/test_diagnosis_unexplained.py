@@ -11,6 +11,7 @@ from planted import ROAD_SIDE
 from hdev_jax.diagnosis.expression import TERM, DescribedForce, Factor, _coefficient_unit, find_expression, monomials
 from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _period, _scale, remainder
 from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.fleet import synthetic_log
@@ -133,6 +134,37 @@ def test_a_trip_of_a_few_rows_does_not_hide_the_levels_of_the_others():
     assert found.told
     assert found.worst == int(np.argmax(np.abs(level[::200])))
     assert found.sd == pytest.approx(np.std(level), rel=0.3)
+
+
+def _uneven(rng, shortest: float, longest: float, period: float, load: float) -> Rows:
+    """Eight trips of 400 rows that differ in length: energy with AR(1) noise, and a load of so many mean rows a cycle
+    whose phase is each trip's own. Sizes are over the noise's sd."""
+    shape = (8, 400)
+    seconds = rng.uniform(shortest, longest, shape)
+    noise = residual(rng, *shape, rho=0.97).residual
+    clock = np.cumsum(seconds, axis=1) - 0.5 * seconds
+    turn = clock / (period * 0.5 * (shortest + longest)) + rng.random((8, 1))
+    energy = load * (np.sqrt(2) * np.sin(2 * np.pi * turn) * seconds).ravel() / float(np.mean(seconds))
+    rows = rows_of(noise + energy, Clusters(np.repeat(np.arange(8), 400), 8, "trip"))
+    return replace(rows, duration_s=seconds.ravel(), worth=seconds.ravel() / 3.6, amounts={})
+
+
+@pytest.mark.parametrize(
+    ("rows", "period", "load"),
+    [((5.0, 5.5), 6, 0.06), ((5.0, 5.5), 20, 0.2), ((4.0, 9.0), 6, 0.06), ((4.0, 9.0), 40, 0.15)],
+)
+def test_a_weak_load_is_seen_in_rows_of_unequal_length(rows, period, load):
+    """It stands out of coloured noise by what a long row has more of it than a short one."""
+    rng = np.random.default_rng(11)
+
+    def told(log: Rows) -> float | None:
+        clocked = Clocked.of(log.trip, log.duration_s, log.worth, _without_levels(log))
+        hit = strongest_period(log.residual, clocked)
+        return hit.period_s if hit is not None and hit.p < 1e-3 else None
+
+    found = [told(_uneven(rng, *rows, period, load)) for _ in range(8)]
+    assert sum(f == pytest.approx(period * np.mean(rows), rel=0.03) for f in found) >= 7
+    assert sum(told(_uneven(rng, *rows, period, 0.0)) is not None for _ in range(8)) <= 1
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.9])

@@ -111,3 +111,18 @@ def test_a_surface_of_its_own_resistance_is_named_with_its_size(tmp_path):
     size = summary["effects"][0]["parameters"]
     assert abs(size["excess[2]"]["value"] - 0.35) < 3 * size["excess[2]"]["sd"] + 0.05, size
     assert abs(size["excess[1]"]["value"]) < 3 * size["excess[1]"]["sd"] + 0.02, size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [93265, 93281])
+def test_a_weak_cause_outside_the_library_is_called_unexplained_by_its_channel(seed):
+    """A ninth of the variance, and too few trips for a formula: rows say that something follows the humidity. In the
+    second log, a constant load stood in for it."""
+    trips = 12 if seed == 93265 else 24
+    options = {"trips": trips, "rows_per_trip": 250, "noise": "ar1", "ar_coefficient": 0.97}
+    _, result = run(seed, effects={"outside_humidity_load": {}}, ratio=0.35, **options)
+    assert breaches(result, SHARED) == []
+    assert result.summary["effects"] == []
+    left = result.summary["unexplained"]
+    assert left["significant"]
+    assert "humidity_pct" in left["depends_on"], left["signature"]
