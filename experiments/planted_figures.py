@@ -125,7 +125,7 @@ def confusion_figure(run: Run, done: Done) -> None:
         for r in logs:
             for name in {right[p] if right[p] in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
-    fig = figure(max(0.32 * len(columns) + 2.2, 4.6), 0.3 * len(planted) + 1.8)
+    fig = figure(max(0.32 * len(columns) + 2.2, 4.6), 0.3 * len(planted) + 1.8)  # the title's at least
     axes = fig.add_subplot()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)

@@ -28,7 +28,7 @@ from hdev_jax.units import registry, unit_of
 
 __all__ = [
     "TERM", "Described", "DescribedForce", "Expression", "Factor", "described_by", "describing", "find_expression",
-    "monomials", "product", "thresholds",
+    "monomials", "product", "thresholds", "words_of",
 ]  # fmt: skip
 
 STRICTER = 5.0  # a description of the rest has to clear a level so much lower than a cause does
@@ -138,6 +138,11 @@ def product(factors: Sequence[Factor], segments: Segments) -> np.ndarray:
     for f in factors:
         out = out * f(segments)
     return out
+
+
+def words_of(factors: Sequence[Factor]) -> str:
+    """A monomial as it is written: `humidity_pct·speed_mps`."""
+    return "·".join(f.words() for f in factors)
 
 
 def monomials(segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
@@ -291,9 +296,8 @@ def _chosen(
         return None
     at = next(i for i, c in enumerate(chosen.fit.table.free) if c.path == "effects.expression.k")
     value, sd = chosen.fit.values[at] / scale, chosen.fit.sd[at] / scale
-    words = "·".join(f.words() for f in factors)
     unit = _coefficient_unit(factors, describing(problem.target).parameters[0].unit)
-    formula = f"({value:.3g} ± {sd:.2g}) {unit} · {words}"
+    formula = f"({value:.3g} ± {sd:.2g}) {unit} · {words_of(factors)}"
     everything = everything.with_channels(**{TERM: product(factors, everything) / scale})
     predicted = predict(chosen.fit.vehicle, everything)
     ways = view.ways[Described.id]

@@ -22,8 +22,10 @@ from hdev_jax.diagnosis.expression import (
     monomials,
     product,
     thresholds,
+    words_of,
 )
 from hdev_jax.diagnosis.look import Loop, Search
+from hdev_jax.diagnosis.whiten import without_level
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Hint", "find_hint"]
@@ -42,7 +44,7 @@ class Hint:
 
     def words(self) -> str:
         """`[humidity_pct > 70]`."""
-        return "·".join(f.words() for f in self.factors)
+        return words_of(self.factors)
 
 
 def find_hint(state: Search, problem: Loop) -> Hint | None:
@@ -128,11 +130,8 @@ def _whitened(state: Search, problem: Loop, terms: Terms) -> tuple[np.ndarray, n
     parts, before = [], np.zeros(len(state.table.free) + terms.width + 1)
     for chunk in ground.chunks():
         white = ground.white(chunk, ground.rows(chunk, terms.width, lambda out, c: terms.write(out, c.segments)))
-        out, level = white[:, :-1], white[:, -1]
-        before += np.sum(out**2, axis=0)
-        for s in chunk.slices():
-            out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
-        parts.append(out)
+        before += np.sum(white[:, :-1] ** 2, axis=0)
+        parts.append(without_level(white[:, :-1], white[:, -1], chunk.slices()))
     out, base = np.concatenate(parts), len(state.table.free)
     out[:, np.sum(out**2, axis=0) <= ABSORBED * before] = 0.0  # what only trips tell
     scaled = out[:, :base] / np.sqrt(np.maximum(before[:base], 1e-300))

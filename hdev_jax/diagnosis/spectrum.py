@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special, stats
 
-from hdev_jax.diagnosis.whiten import Noise, whiten
+from hdev_jax.diagnosis.whiten import Noise, whiten, without_level
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Clocked", "Period", "strongest_period"]
@@ -62,10 +62,7 @@ class Clocked:
     def whitened(self, columns: Float[np.ndarray, "row k"]) -> Float[np.ndarray, "row k"]:
         """Columns as white noise of variance 1 would be met, without the level of each trip."""
         both = whiten(np.column_stack([columns, self.worth]), self.noise, self.trip, self.duration_s)
-        out, level = both[:, :-2], both[:, -2]
-        for s in self.slices:
-            out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
-        return out
+        return without_level(both[:, :-2], both[:, -2], self.slices)
 
 
 def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Period | None:

@@ -1,6 +1,7 @@
 """The noise of a log: its colour, the level of each trip, the scale of each trip; and what makes it white."""
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from hdev_jax.inference import padded_rows
 from hdev_jax.segments import trip_slices
 
-__all__ = ["Noise", "estimate_noise", "whiten"]
+__all__ = ["Noise", "estimate_noise", "whiten", "without_level"]
 
 MAX_ORDER = 24
 ORDERS = (4, 12, MAX_ORDER)  # that the filter is compiled for; the rest of the coefficients are zero
@@ -252,4 +253,14 @@ def whiten(
             square = float(level @ level)
             shrink = 1.0 - 1.0 / np.sqrt(1.0 + noise.block_sd**2 * square)
             out[b] -= (shrink / square) * np.outer(level, level @ out[b])
+    return out
+
+
+def without_level(
+    columns: Float[np.ndarray, "row k"], level: Float[np.ndarray, " row"], slices: Iterable[slice]
+) -> Float[np.ndarray, "row k"]:
+    """Whitened columns with each trip's level taken out whole; `level` is what one of 1 looks like."""
+    out = columns.copy()
+    for s in slices:
+        out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
     return out
