@@ -4,7 +4,7 @@ The mean of a cause that the library does not hold is left to whatever named cau
 taken out again and what is left is looked at anew.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -20,9 +20,10 @@ from hdev_jax.diagnosis.refit import as_known, refitted, without
 from hdev_jax.diagnosis.select import prune
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.standins import beside, stand_ins
-from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder
+from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder, swing_w
 from hdev_jax.inference import Calibration, calibrate, cluster_rows
 from hdev_jax.physics.across import distance_since_start
+from hdev_jax.physics.loads import PeriodicLoad
 
 __all__ = ["told_apart"]
 
@@ -75,6 +76,10 @@ def told_apart(
             )
             if told:
                 left, asked = left.hinted(told["words"], told["channels"], told["rms"]), tuple(told["asked"])
+            elif state.found:
+                told = checkpoint(
+                    f"hidden-{round_}", lambda s=state, p=predicted: _hidden(problem, split, s, fresh(), p, tell)
+                )
         gone = next(iter(told.get("superfluous", ())), None)
         description = "the formula" if "formula" in told else "what rows follow" if "words" in told else "the cycle"
         why = f"not found again beside {description} for what is left"
@@ -126,6 +131,25 @@ def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collect
         return {}
     load = np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))]
     return {"superfluous": list(stand_ins(*beside(loop, state, load), (), tell, asked))}
+
+
+def _hidden(
+    problem: Problem, split: Split, state: Search, loop: Loop, predicted: list[np.ndarray], tell: Tell
+) -> dict[str, Any]:
+    """The effect that took a cycle out of sight, if it is not found again beside that cycle.
+
+    A cycle that is slow for its trips has a mean in each of them, and what trips may differ by can take so much of it
+    that the spectrum of what is left shows no peak, though that of the step before does. What was found before a
+    periodic load hides none of its cycle: the load is the cycle.
+    """
+    train, ids = problem.rows(split.train), [f.id for f in state.found]
+    first = ids.index(PeriodicLoad.id) + 1 if PeriodicLoad.id in ids else 0
+    for k in reversed(range(first, len(ids))):
+        cycle_w = swing_w(_side(problem, train, predicted[k], np.zeros((len(predicted[k]), 0))))
+        if np.any(cycle_w):
+            small = _small(problem, state, loop, predicted, train, _most(problem, train, cycle_w))
+            return _beside_cycle(state, loop, cycle_w, {ids[k]} & {*small}, tell)
+    return {}
 
 
 def _hinted(
@@ -256,19 +280,18 @@ def _remainder(
     problem: Problem, split: Split, predicted: np.ndarray, declared: np.ndarray, seed: int, tell: Tell
 ) -> Remainder:
     features, names = _features(problem, predicted, declared)
+    train, test = (_side(problem, problem.rows(trips), predicted, features) for trips in (split.train, split.test))
+    return remainder(train, test, names, problem.unit, problem.log.trip_names, seed=seed, tell=tell)
 
-    def side(trips: Sequence[int]) -> Rows:
-        at = problem.rows(trips)
-        segments = problem.segments.take(at)
-        residual, seconds = (problem.measured - predicted)[at], np.asarray(segments.duration_s)
-        worth, unit = np.ones(len(seconds)), problem.unit
-        if problem.target == "energy_wh":  # a load in kW, whatever the rows' lengths
-            worth, unit = seconds / SECONDS_PER_WH_OF_A_KW, "kW"
-        trip = np.asarray(segments.trip)
-        weight = problem.weight()[at]
-        meters, energy = np.asarray(segments.distance_m), weight * np.abs(problem.measured[at])
-        amounts = {"time": seconds, "distance": meters, "energy": energy}
-        return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit, weight, amounts)
 
-    trip_names = problem.log.trip_names
-    return remainder(side(split.train), side(split.test), names, problem.unit, trip_names, seed=seed, tell=tell)
+def _side(problem: Problem, at: np.ndarray, predicted: np.ndarray, features: np.ndarray) -> Rows:
+    """Rows of one side of the split with what a prediction leaves of them; predictions and features are of all rows."""
+    segments = problem.segments.take(at)
+    residual, seconds = (problem.measured - predicted)[at], np.asarray(segments.duration_s)
+    worth, unit = np.ones(len(seconds)), problem.unit
+    if problem.target == "energy_wh":  # a load in kW, whatever the rows' lengths
+        worth, unit = seconds / SECONDS_PER_WH_OF_A_KW, "kW"
+    trip, weight = np.asarray(segments.trip), problem.weight()[at]
+    meters, energy = np.asarray(segments.distance_m), weight * np.abs(problem.measured[at])
+    amounts = {"time": seconds, "distance": meters, "energy": energy}
+    return Rows(features[at], residual, cluster_rows(segments), trip, seconds, worth, unit, weight, amounts)

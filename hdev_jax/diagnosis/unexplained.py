@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.whiten import Noise, estimate_noise, whiten
 from hdev_jax.inference import Clusters
 from hdev_jax.segments import trip_slices
 
-__all__ = ["LEAST_SHARE", "Remainder", "remainder"]
+__all__ = ["LEAST_SHARE", "Remainder", "Rows", "remainder", "swing_w"]
 
 # For the flexible learner and for cycles, a tenth of it for change points and levels, as far as their p hold:
 # docs/planted.md counts false alarms by noise
@@ -116,7 +116,7 @@ def remainder(
     share = _share(test.residual, correction)
     learned = p_learner < LEVEL and share > LEAST_SHARE
     tell("what is left: periods, change points, levels of trips")
-    noise = estimate_noise(train.residual, train.trip, train.duration_s, levels=False)
+    noise = _noise(train)
     white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
     period = _period(train, noise)
     change = _change_point(white, train.trip)
@@ -159,12 +159,10 @@ def remainder(
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     signature = "What is left looks like noise: " + _colour(noise) if not parts else "What is left: " + "; ".join(parts)
     rms = max(sizes)
-    watts = {"kW": 1000.0, "W": 1.0}.get(train.cycle_unit, 0.0)
-    cycle_w = watts * period.amplitudes if period is not None else np.zeros(len(train.residual))
     depends_on = tuple(dict.fromkeys(depends))
     curve = _curve(correction, test, list(names), order[0], unit) if learned and order else None
     return Remainder(
-        bool(parts), share, floor, depends_on, signature + ".", rms, cycle_w, differing is not None,
+        bool(parts), share, floor, depends_on, signature + ".", rms, _watts(train, period), differing is not None,
         scales_with=scales_with, correction=curve,
     )  # fmt: skip
 
@@ -264,6 +262,20 @@ def _learner(
 
 def _safe(names: Sequence[str]) -> list[str]:
     return [f"f{i}" for i in range(len(names))]
+
+
+def _noise(rows: Rows) -> Noise:
+    return estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=False)
+
+
+def swing_w(rows: Rows) -> Float[np.ndarray, " row"]:
+    """The amplitude [W] of the cycle that the residual has about each row; 0 where it has none or it is no power."""
+    return _watts(rows, _period(rows, _noise(rows)))
+
+
+def _watts(rows: Rows, period: Period | None) -> np.ndarray:
+    watts = {"kW": 1000.0, "W": 1.0}.get(rows.cycle_unit, 0.0)
+    return watts * period.amplitudes if period is not None else np.zeros(len(rows.residual))
 
 
 def _rms(rows: Rows, amplitude: float) -> float:
