@@ -1,5 +1,6 @@
 """What differs from trip to trip: the phase of a cycle, the trips of a mode."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -60,6 +61,20 @@ def test_a_cycle_that_the_library_does_not_hold_is_not_named():
     assert summary["effects"] == []
     assert summary["unexplained"]["significant"]
     assert "time_s" in summary["unexplained"]["depends_on"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "stood_in"), [(93344, "mode_change"), (93347, "cooling_power")])
+def test_what_took_a_cycle_out_of_sight_is_not_named(seed, stood_in):
+    """A cycle of a tenth of the variance in eight trips: beside what was named of it, its peak was no longer told."""
+    _, result = run(
+        seed, effects={"outside_thermal_cycle": {}}, ratio=0.35, trips=12, rows_per_trip=700, ar_coefficient=0.97
+    )
+    summary = result.summary
+    assert summary["effects"] == []
+    assert "the cycle" in next(c["why_not"] for c in summary["candidates"] if c["id"] == stood_in)
+    assert summary["unexplained"]["significant"]
+    assert re.search(r"a 2[456]-minute cycle", summary["unexplained"]["signature"])
 
 
 @pytest.mark.slow

@@ -166,6 +166,36 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
     assert asked[:1] == ([small] if small else [])
 
 
+@pytest.mark.parametrize(
+    ("found", "seen", "small", "asked"),
+    [
+        # seen: the cycle of the residual before each effect
+        (["hvac_power", "mode_change"], [1, 1], ["hvac_power", "mode_change"], ("mode_change", 1)),
+        (["hvac_power", "mode_change"], [2, 0], ["hvac_power", "mode_change"], ("hvac_power", 2)),
+        (["hvac_power", "mode_change"], [0, 0], ["hvac_power", "mode_change"], None),
+        (["hvac_power", "mode_change"], [0, 3], ["hvac_power"], None),  # takes more than a cycle could
+        (["hvac_power", "periodic_load"], [1, 1], ["hvac_power", "periodic_load"], None),  # the load is the cycle
+        (["periodic_load", "mode_change"], [1, 2], ["periodic_load", "mode_change"], ("mode_change", 2)),
+    ],
+)
+def test_who_took_a_cycle_out_of_sight_is_asked(found, seen, small, asked, monkeypatch):
+    """The last effect before which it was seen, if the mean of the cycle could be all that it is."""
+    calls = []
+    for name, answer in {
+        "_side": lambda problem, train, predicted, features: int(predicted[0]),
+        "swing_w": lambda k: np.full(5, float(seen[k])),
+        "_small": lambda *_: tuple(small), "_most": lambda *_: 1.0,
+        "_beside_cycle": lambda state, loop, w, of, tell: calls.extend((k, w[0]) for k in of) or {"superfluous": [*of]},
+    }.items():  # fmt: skip
+        monkeypatch.setattr(rest, name, answer)
+    monkeypatch.setattr(Problem, "rows", lambda *_: np.ones(5, bool))
+    state = bare(Search, found=[SimpleNamespace(id=k) for k in found])
+    predicted = [np.full(5, float(k)) for k in range(len(found) + 1)]
+    told = rest._hidden(bare(Problem), bare(Split, train=(0,)), state, bare(Loop), predicted, silent)
+    assert calls == ([asked] if asked else [])
+    assert told.get("superfluous", []) == ([asked[0]] if asked else [])
+
+
 @pytest.mark.parametrize("again", [(), ("hvac_power",)])
 def test_beside_what_rows_follow_effects_are_asked_again_and_it_is_said(again, monkeypatch):
     """A stand-in goes with its reason; what is left is called by its channel in either case, and told once."""
