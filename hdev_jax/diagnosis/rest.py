@@ -22,6 +22,7 @@ from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.standins import beside, stand_ins
 from hdev_jax.diagnosis.unexplained import LEAST_SHARE, Remainder, Rows, remainder, swing_w
 from hdev_jax.inference import Calibration, calibrate, cluster_rows
+from hdev_jax.inference.sheet import BATTERY_TARGETS
 from hdev_jax.physics.across import distance_since_start
 from hdev_jax.physics.loads import PeriodicLoad
 
@@ -66,23 +67,27 @@ def told_apart(
         if told:
             left, first = _described(problem, split, left, told, predicted[-1]), told
         elif np.any(left.cycle_w):
-            asked = _small(problem, state, loop, predicted, train, _most(problem, train, left.cycle_w))
+            small = _small(problem, state, loop, predicted, train, _most(problem, train, left.cycle_w))
             told = checkpoint(
-                f"cycle-{round_}", lambda s=state, k=asked, c=left.cycle_w: _beside_cycle(s, fresh(), c, k, tell)
+                f"cycle-{round_}", lambda s=state, k=small, c=left.cycle_w: _beside_cycle(s, fresh(), c, k, tell)
             )
+            asked = tuple(told.get("asked", ()))
         else:
             told = checkpoint(
                 f"hint-{round_}", lambda s=state, p=predicted: _hinted(problem, s, fresh(), p, train, tell)
             )
             if told:
-                left, asked = left.hinted(told["words"], told["channels"], told["rms"]), tuple(told["asked"])
-            elif state.found:
+                left = left.hinted(told["words"], told["channels"], told["rms"])
+            elif state.found and problem.target in BATTERY_TARGETS:
                 told = checkpoint(
-                    f"hidden-{round_}", lambda s=state, p=predicted: _hidden(problem, split, s, fresh(), p, tell)
+                    f"covered-{round_}",
+                    lambda s=state, p=predicted: _beside_covered(problem, s, fresh(), p, train, tell),
                 )
+            asked = tuple(told.get("asked", ()))
         gone = next(iter(told.get("superfluous", ())), None)
         description = "the formula" if "formula" in told else "what rows follow" if "words" in told else "the cycle"
-        why = f"not found again beside {description} for what is left"
+        of = "that it covered" if "covered" in told else "for what is left"
+        why = f"not found again beside {description} {of}"
         if gone is None:  # of what was asked about, that word stands
             gone, why = _shadow(problem, state, predicted, train, left, asked), MEAN_OF_MORE
         if gone is None or round_ == MOST_SHADOWS:
@@ -126,30 +131,38 @@ def _formula(
 
 
 def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collection[str], tell: Tell) -> dict[str, Any]:
-    """Which of the effects asked for are not found again beside a load as large in each trip as the cycle there."""
+    """Which of the effects asked for are not found again beside a load as large in each trip as the cycle there, as
+    plain values; empty where none is asked for, or nothing can be asked beside a fit that did not converge."""
     if not asked:
         return {}
-    load = np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))]
-    return {"superfluous": list(stand_ins(*beside(loop, state, load), (), tell, asked))}
+    beside_it, known = beside(loop, state, np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))])
+    if not known.fit.converged:
+        return {}
+    return {"asked": list(asked), "superfluous": list(stand_ins(beside_it, known, (), tell, asked))}
 
 
-def _hidden(
-    problem: Problem, split: Split, state: Search, loop: Loop, predicted: list[np.ndarray], tell: Tell
+def _beside_covered(
+    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, tell: Tell
 ) -> dict[str, Any]:
-    """The effect that took a cycle out of sight, if it is not found again beside that cycle.
+    """Whether the last effect to take a cycle out of sight is found again beside that cycle, as plain values; empty
+    where none did.
 
-    A cycle that is slow for its trips has a mean in each of them, and what trips may differ by can take so much of it
-    that the spectrum of what is left shows no peak, though that of the step before does. What was found before a
-    periodic load hides none of its cycle: the load is the cycle.
+    A cycle that is slow for its trips has a mean in each of them. What trips differ by may take so much of it that the
+    peak in the spectrum no longer passes, though before the effect was added, and without it now, it does. What was
+    found before a periodic load covers none of its cycle: that load is the cycle.
     """
-    train, ids = problem.rows(split.train), [f.id for f in state.found]
+
+    def cycle_without(prediction: np.ndarray) -> np.ndarray:
+        return swing_w(_side(problem, train, prediction, np.zeros((len(prediction), 0))))
+
+    ids = [f.id for f in state.found]
     first = ids.index(PeriodicLoad.id) + 1 if PeriodicLoad.id in ids else 0
-    for k in reversed(range(first, len(ids))):
-        cycle_w = swing_w(_side(problem, train, predicted[k], np.zeros((len(predicted[k]), 0))))
-        if np.any(cycle_w):
-            small = _small(problem, state, loop, predicted, train, _most(problem, train, cycle_w))
-            return _beside_cycle(state, loop, cycle_w, {ids[k]} & {*small}, tell)
-    return {}
+    k = next((k for k in reversed(range(first, len(ids))) if np.any(cycle_without(predicted[k]))), None)
+    if k is None or not np.any(cycle_w := cycle_without(problem.predict(without(loop, state, ids[k]).fit.vehicle))):
+        return {}
+    small = _small(problem, state, loop, predicted, train, _most(problem, train, cycle_w), of=(ids[k],))
+    told = _beside_cycle(state, loop, cycle_w, small, tell)
+    return told and {**told, "covered": True}
 
 
 def _hinted(
@@ -183,10 +196,11 @@ def _most(problem: Problem, train: np.ndarray, cycle_w: np.ndarray) -> float:
 
 
 def _small(
-    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, most: float
-) -> tuple[str, ...]:
-    """Effects that explain no more of the training rows than the mean (`most`, its square) of what is left could, when
-    they were found or now, beside all others.
+    problem: Problem, state: Search, loop: Loop, predicted: list[np.ndarray], train: np.ndarray, most: float,
+    of: Collection[str] | None = None,
+) -> tuple[str, ...]:  # fmt: skip
+    """Effects, of these or of all, that explain no more of the training rows than the mean (`most`, its square) of what
+    is left could, when they were found or now, beside all others.
 
     A heater's cycle is larger in the cold, and beside it what the cabin takes is hardly found again: but it takes more
     than a swing of this size could, and so is no stand-in for it.
@@ -198,7 +212,7 @@ def _small(
         return float(np.mean((problem.measured - bare)[train] ** 2)) - mse
 
     gains = _gains(problem, state, predicted, train)
-    return tuple(k for k, gain in gains.items() if gain < most or now(k) < most)
+    return tuple(k for k, gain in gains.items() if (of is None or k in of) and (gain < most or now(k) < most))
 
 
 def _gains(problem: Problem, state: Search, predicted: list[np.ndarray], train: np.ndarray) -> dict[str, float]:

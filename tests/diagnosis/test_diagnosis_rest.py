@@ -142,6 +142,9 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
         asked.append(tuple(of))
         return tuple(k for k in of if k not in again)
 
+    def known(state):
+        return bare(Search, found=state.found, fit=SimpleNamespace(converged=True))
+
     def take_out(loop, state, id_, why):
         said.append((id_, why))
         return bare(Search, found=[f for f in state.found if f.id != id_])
@@ -153,7 +156,8 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
         "_path": lambda p, s, _: [bare(Calibration, vehicle=k) for k in range(len(s.found) + 1)],
         "_remainder": lambda *_: left, "_formula": lambda *_: {}, "_small": lambda *_: small,
         "_most": lambda *_: 1.0,
-        "beside": lambda loop, state, _: (loop, state), "stand_ins": stand_ins, "_gone": take_out, "MOST_SHADOWS": 1,
+        "beside": lambda loop, state, _: (loop, known(state)), "stand_ins": stand_ins,
+        "_gone": take_out, "MOST_SHADOWS": 1,
         "replace": lambda loop, **_: loop,
     }.items():  # fmt: skip
         monkeypatch.setattr(rest, name, answer)
@@ -167,33 +171,49 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
 
 
 @pytest.mark.parametrize(
-    ("found", "seen", "small", "asked"),
+    ("found", "seen", "now", "small", "asked"),
     [
-        # seen: the cycle of the residual before each effect
-        (["hvac_power", "mode_change"], [1, 1], ["hvac_power", "mode_change"], ("mode_change", 1)),
-        (["hvac_power", "mode_change"], [2, 0], ["hvac_power", "mode_change"], ("hvac_power", 2)),
-        (["hvac_power", "mode_change"], [0, 0], ["hvac_power", "mode_change"], None),
-        (["hvac_power", "mode_change"], [0, 3], ["hvac_power"], None),  # takes more than a cycle could
-        (["hvac_power", "periodic_load"], [1, 1], ["hvac_power", "periodic_load"], None),  # the load is the cycle
-        (["periodic_load", "mode_change"], [1, 2], ["periodic_load", "mode_change"], ("mode_change", 2)),
+        # seen: the cycle of the residual before each effect; now: of that without it, beside all others
+        (["hvac_power", "mode_change"], [1, 1], [5, 6], ["hvac_power", "mode_change"], ("mode_change", 6)),
+        (["hvac_power", "mode_change"], [2, 0], [5, 6], ["hvac_power", "mode_change"], ("hvac_power", 5)),
+        (["hvac_power", "mode_change"], [2, 0], [0, 6], ["hvac_power", "mode_change"], None),  # the other covers it too
+        (["hvac_power", "mode_change"], [0, 0], [5, 6], ["hvac_power", "mode_change"], None),
+        (["hvac_power", "mode_change"], [0, 3], [5, 6], ["hvac_power"], None),  # takes more than a cycle could
+        (["hvac_power", "periodic_load"], [1, 1], [5, 6], ["hvac_power", "periodic_load"], None),  # it is the cycle
+        (["periodic_load", "mode_change"], [1, 2], [5, 6], ["periodic_load", "mode_change"], ("mode_change", 6)),
     ],
-)
-def test_who_took_a_cycle_out_of_sight_is_asked(found, seen, small, asked, monkeypatch):
-    """The last effect before which it was seen, if the mean of the cycle could be all that it is."""
+)  # fmt: skip
+@pytest.mark.parametrize("again", [False, True])
+def test_who_took_a_cycle_out_of_sight_is_asked(found, seen, now, small, asked, again, monkeypatch):
+    """The last effect before which it was seen, if it is seen without it now and its mean could be all that it is."""
     calls = []
+
+    def stand_ins(loop, state, channels, tell, of):
+        calls.extend((k, state.found) for k in of)
+        return () if again else tuple(of)
+
     for name, answer in {
-        "_side": lambda problem, train, predicted, features: int(predicted[0]),
-        "swing_w": lambda k: np.full(5, float(seen[k])),
-        "_small": lambda *_: tuple(small), "_most": lambda *_: 1.0,
-        "_beside_cycle": lambda state, loop, w, of, tell: calls.extend((k, w[0]) for k in of) or {"superfluous": [*of]},
+        "_side": lambda problem, train, prediction, features: prediction, "swing_w": lambda prediction: prediction,
+        "without": lambda loop, state, k: SimpleNamespace(fit=SimpleNamespace(vehicle=now[found.index(k)])),
+        "_small": lambda *_, of: tuple(k for k in small if k in of), "_most": lambda *_: 1.0, "stand_ins": stand_ins,
+        "beside": lambda loop, state, w: (loop, bare(Search, found=w[0], fit=SimpleNamespace(converged=True))),
     }.items():  # fmt: skip
         monkeypatch.setattr(rest, name, answer)
-    monkeypatch.setattr(Problem, "rows", lambda *_: np.ones(5, bool))
+    monkeypatch.setattr(Problem, "predict", lambda _, vehicle: np.full(5, float(vehicle)))
     state = bare(Search, found=[SimpleNamespace(id=k) for k in found])
-    predicted = [np.full(5, float(k)) for k in range(len(found) + 1)]
-    told = rest._hidden(bare(Problem), bare(Split, train=(0,)), state, bare(Loop), predicted, silent)
+    loop = bare(Loop, rows=SimpleNamespace(measured=np.zeros(8)))
+    predicted = [np.full(5, float(x)) for x in (*seen, 0)]
+    told = rest._beside_covered(bare(Problem), state, loop, predicted, np.ones(5, bool), silent)
     assert calls == ([asked] if asked else [])
-    assert told.get("superfluous", []) == ([asked[0]] if asked else [])
+    superfluous = [] if again else [asked[0]] if asked else []
+    assert told == ({"asked": [asked[0]], "superfluous": superfluous, "covered": True} if asked else {})
+
+
+def test_beside_a_fit_that_did_not_converge_nothing_is_asked(monkeypatch):
+    known = bare(Search, fit=SimpleNamespace(converged=False))
+    monkeypatch.setattr(rest, "beside", lambda loop, state, w: (loop, known))
+    loop = bare(Loop, rows=SimpleNamespace(measured=np.zeros(8)))
+    assert rest._beside_cycle(bare(Search), loop, np.ones(5), ("hvac_power",), silent) == {}
 
 
 @pytest.mark.parametrize("again", [(), ("hvac_power",)])

@@ -12,7 +12,7 @@ from hdev_jax.diagnosis.expression import TERM, DescribedForce, Factor, _coeffic
 from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
-from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _period, _scale, remainder
+from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _noise, _period, _scale, remainder, swing_w
 from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Clusters, calibrate, cluster_rows, padded
@@ -42,12 +42,8 @@ def rows_of(residual: np.ndarray, clusters: Clusters) -> Rows:
     )
 
 
-def _without_levels(rows):
-    return estimate_noise(rows.residual, rows.trip, rows.duration_s, levels=False)
-
-
 def cycle_of(rows):
-    return _period(rows, _without_levels(rows))
+    return _period(rows, _noise(rows))
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.97])
@@ -57,6 +53,13 @@ def test_a_cycle_is_found_with_its_period_and_size(rho, trips, cycles, size):
     assert found is not None
     assert found.period_s == pytest.approx(600.0 / cycles, rel=0.03)
     assert found.amplitude == pytest.approx(np.sqrt(2) * size, rel=0.12)
+
+
+def test_a_cycle_swings_by_its_amplitude_in_watts_where_the_rows_are_a_power():
+    rows = residual(np.random.default_rng(1), 8, 300, rho=0.9, cycles=6, size=2.0)
+    np.testing.assert_allclose(swing_w(rows), 1000.0 * np.sqrt(2) * 2.0, rtol=0.3)
+    np.testing.assert_array_equal(swing_w(replace(rows, cycle_unit="N")), np.zeros(2400))
+    np.testing.assert_array_equal(swing_w(residual(np.random.default_rng(1), 8, 300, rho=0.9)), np.zeros(2400))
 
 
 def test_a_single_trip_is_its_own_repetition():
@@ -158,7 +161,7 @@ def test_a_weak_load_is_seen_in_rows_of_unequal_length(rows, period, load):
     rng = np.random.default_rng(11)
 
     def told(log: Rows) -> float | None:
-        clocked = Clocked.of(log.trip, log.duration_s, log.worth, _without_levels(log))
+        clocked = Clocked.of(log.trip, log.duration_s, log.worth, _noise(log))
         hit = strongest_period(log.residual, clocked)
         return hit.period_s if hit is not None and hit.p < 1e-3 else None
 
