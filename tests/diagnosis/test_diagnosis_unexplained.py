@@ -13,7 +13,6 @@ from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _noise, _period, _scale, remainder, swing_w
-from hdev_jax.diagnosis.whiten import estimate_noise
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Clusters, calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
