@@ -15,7 +15,19 @@ from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unava
 from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
 
-__all__ = ["FIXED", "Candidate", "Column", "Plan", "Source", "beyond", "columns", "finer", "plan_of", "realised"]
+__all__ = [
+    "FIXED",
+    "Candidate",
+    "Column",
+    "Grids",
+    "Plan",
+    "Source",
+    "beyond",
+    "columns",
+    "finer",
+    "plan_of",
+    "realised",
+]
 
 FIXED = ("shape", "choice")  # what has no column of its own
 TOGETHER = 6  # effects in one program: more of them run slower, fewer take longer to compile

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.normal_equations import NormalEquations
+from hdev_jax.diagnosis.normal_equations import NormalEquations, solved
 from hdev_jax.diagnosis.significance import least_clusters, wald
 
 __all__ = ["ABSORBED", "Evidence", "Score"]
@@ -83,6 +83,12 @@ class Evidence(NormalEquations):
         beta, g = x[v, self.base :], self.count
         spread = self._jackknife(at, v)[:, self.base :] - beta
         return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
+
+    def traded(self, own: Sequence[int], other: int) -> Float[np.ndarray, " k"]:
+        """What a unit of another column adds to the coefficients of a candidate's own."""
+        at, totals = self.base + np.asarray(own, dtype=int), self.totals()
+        v = int(np.argmax(self._fit(totals, at)[0]))
+        return -solved(self._normal(totals[v], at)[0], totals[v][self._with_base(at), self.base + other])[self.base :]
 
     def plain_score(self, candidate: Candidate) -> Score:
         """A candidate's tests where rows are as they were measured and only clusters count as independent."""

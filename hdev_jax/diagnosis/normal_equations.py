@@ -14,12 +14,12 @@ from jaxtyping import Bool, Float, Int
 from hdev_jax.diagnosis.significance import wald
 from hdev_jax.segments import trip_slices
 
-__all__ = ["NormalEquations"]
+__all__ = ["NormalEquations", "solved"]
 
 AT_ONCE = 2_000_000  # numbers of the matrices of candidates that are scored together: 16 MB
 
 
-def _solved(a: Float[np.ndarray, "*way n n"], b: Float[np.ndarray, "*way n"]) -> Float[np.ndarray, "*way n"]:
+def solved(a: Float[np.ndarray, "*way n n"], b: Float[np.ndarray, "*way n"]) -> Float[np.ndarray, "*way n"]:
     """Solutions of normal equations in units of each column's own length."""
     d = np.sqrt(np.maximum(np.einsum("...ii->...i", a), 1e-300))
     return np.linalg.solve(a / (d[..., :, None] * d[..., None, :]), (b / d)[..., None])[..., 0] / d
@@ -108,7 +108,7 @@ class NormalEquations:
         alone = (-0.5 * gram[..., -1, -1] - self.cost).reshape(-1, *(1,) * (at.ndim - 1))
         if not a.shape[-1]:
             return alone, b
-        x = _solved(a, b)
+        x = solved(a, b)
         return alone + 0.5 * np.einsum("...i,...i->...", b, x), x
 
     def base_likelihood(self, gram: np.ndarray) -> float:
@@ -206,7 +206,7 @@ class NormalEquations:
         index = np.concatenate([self._with_base(at), np.full((*at.shape[:-1], 1), self.grams.shape[-1] - 1)], axis=-1)
         grams = self.by_cluster(v)[:, index[..., :, None], index[..., None, :]]
         a, b = self._normal(grams.sum(axis=0) - grams, np.arange(self.base, index.shape[-1] - 1))
-        return _solved(a, b) if a.shape[-1] else b
+        return solved(a, b) if a.shape[-1] else b
 
     def _loss(self, x: np.ndarray, index: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way"]:
         """Half the sum of squares of each cluster under its own left-out coefficients of columns `index` [*way n]."""

@@ -1,7 +1,9 @@
-"""What thresholds and time constants that a log hardly tells leave open of a found effect's sizes.
+"""What thresholds, time constants and other sizes that a log hardly tells leave open of a found effect's sizes.
 
 A fit knows a size at the shapes where it stands, or at best near them. A log of a few trips may allow other shapes as
-well, a limit of heating anywhere between two trips' temperatures, with quite another size at each.
+well, a limit of heating anywhere between two trips' temperatures, with quite another size at each. And of an effect
+that may have two sizes it may show one alone, a loss that grows with the speed or with its square, though both are
+there: the one then holds some of the other.
 """
 
 from dataclasses import dataclass, replace
@@ -10,24 +12,25 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, stats
 
-from hdev_jax.diagnosis.candidates import Candidate, beyond, plan_of
-from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.candidates import Candidate, Grids, Plan, beyond, plan_of
+from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.ranking import plausible
 from hdev_jax.diagnosis.sums import both_looks
 from hdev_jax.inference import Calibration
 
-__all__ = ["Open", "left_open", "shapes_of"]
+__all__ = ["Open", "left_open", "other_size", "shapes_of"]
 
 BETWEEN = 3  # steps from one value of the library's grid to the next
 BEYOND = 2  # of its steps, on either side, that are looked at too
 NEGLIGIBLE = 1e-3  # likelihood over the best one's
+POINTS = 41  # of another size, over four standard errors to either side
 
 
 @dataclass(frozen=True)
 class Open:
-    """Of one parameter: how far `away` it would be at each set of shapes that the log allows, how likely these are
-    (`share`), and for a size its standard error (`inside`) at the shapes that were found. In the parameter's unit."""
+    """Of one parameter: how far `away` it would be at each set of shapes, or of another size, that the log allows, how
+    likely these are (`share`), and for a size its standard error (`inside`) where it was found. In its unit."""
 
     away: Float[np.ndarray, " set"]
     share: Float[np.ndarray, " set"]
@@ -60,28 +63,24 @@ class Open:
 
 
 def left_open(problem: Loop, state: Search, s: Score) -> dict[str, Open]:
-    """Sizes and shapes of a found effect over a grid of its shapes, as likely as rows and usual values make them.
+    """Sizes and shapes of a found effect over a grid of its shapes, as likely as rows and usual values make them; or
+    its sizes over another that it may have, as likely as rows make it.
 
     All other coefficients are fitted at every point. Rows and noise are those that found it: whitened ones, or trips
-    alone. Empty for effects without such shapes, for switches, and for what is sought elsewhere than on a grid.
+    alone. Empty for effects without such shapes or sizes, for switches, and for what is sought elsewhere than on a
+    grid.
 
     **Returns:** what is open, by parameter.
     """
     c, names = s.candidate, shapes_of(s.candidate)
     if not names:
-        return {}
-    facts = problem.facts
+        return _other_open(problem, state, s, other) if (other := other_size(c)) else {}
     effect = state.fit.vehicle.effect(c.id)
     here = {n: float(np.asarray(getattr(effect, n))) for n in names}
-    grids = {n: _wide(c, n, here[n], facts.row_s) for n in names}
+    grids = {n: _wide(c, n, here[n], problem.facts.row_s) for n in names}
     cells = {n: dict(zip(g, np.gradient(g) if len(g) > 1 else [1.0], strict=True)) for n, g in grids.items()}
-    plan = plan_of(state.fit.vehicle.minus(c.id), [c.effect], facts, problem.target,
-                   grids | {n: (v,) for n, v in c.shapes if n not in names})  # fmt: skip
+    plan, evidence = _apart(problem, state, s, grids | {n: (v,) for n, v in c.shapes if n not in names})
     same = [k for k in plan.candidates if (k.sizes, k.groups) == (c.sizes, c.groups)]
-    ground = problem.ground(_without(state.fit, c.id), problem.noise(state.fit))
-    with_it = float(np.mean((problem.measured - state.fit.predicted) ** 2))
-    white, plain, _ = both_looks(ground, plan, variance=with_it)
-    evidence = plain if s.plain else white
     totals = evidence.totals()
     points = []
     for k in same:
@@ -103,6 +102,47 @@ def left_open(problem: Loop, state: Search, s: Score) -> dict[str, Open]:
     away = np.array([[*(p[1] - found), *(p[2] - [here[n] for n in names])] for p in points])[kept]
     inside = [*inside, *(0.0 for _ in names)]
     return {n: Open(away[:, k], share, float(inside[k])) for k, n in enumerate((*c.sizes, *names))}
+
+
+def _apart(problem: Loop, state: Search, s: Score, grids: Grids) -> tuple[Plan, Evidence]:
+    """The ways to have a found effect on these grids, and what the rows that found it say of them without it."""
+    c = s.candidate
+    plan = plan_of(state.fit.vehicle.minus(c.id), [c.effect], problem.facts, problem.target, grids)
+    ground = problem.ground(_without(state.fit, c.id), problem.noise(state.fit))
+    with_it = float(np.mean((problem.measured - state.fit.predicted) ** 2))
+    white, plain, _ = both_looks(ground, plan, variance=with_it)
+    return plan, plain if s.plain else white
+
+
+def _other_open(problem: Loop, state: Search, s: Score, other: str) -> dict[str, Open]:
+    """Sizes of a found effect over the plausible values of another one, which it was found without."""
+    c, p = s.candidate, s.candidate.parameter(other)
+    plan, evidence = _apart(problem, state, s, {})
+    own = next((k for k in plan.candidates if k.sizes == c.sizes), None)
+    both = next((k for k in plan.candidates if {*k.sizes} == {*c.sizes, other}), None)
+    if own is None or both is None:
+        return {}
+    column = both.columns[both.sizes.index(other)]
+    beta, error = (float(x[both.sizes.index(other)]) for x in evidence.estimate(both))
+    inside = evidence.estimate(own)[1]
+    if evidence.left([column]) <= ABSORBED or not np.all(np.isfinite([beta, error, *inside])) or error <= 0:
+        return {}
+    at = beta + error * np.linspace(-4, 4, POINTS)
+    at = np.unique(np.clip(at, p.lower, p.upper))
+    share = stats.t.pdf((at - beta) / error, max(evidence.count - 1, 1)) * (np.gradient(at) if len(at) > 1 else 1.0)
+    if not share.sum() > 0:  # plausible values are far from all that the rows say
+        return {}
+    share /= share.sum()
+    each = evidence.traded(own.columns, column)
+    return {n: Open(x * at, share, float(e)) for n, x, e in zip(c.sizes, each, inside, strict=True)}
+
+
+def other_size(c: Candidate) -> str | None:
+    """The one other size that its effect may have beside those that it was found with; None where there is none."""
+    if c.kind != "size" or c.effect.searched or c.shapes or any(g is not None for g in c.groups):
+        return None
+    more = ({*v} - {*c.sizes} for v in c.effect.variants if {*v} > {*c.sizes})
+    return next((m.pop() for m in more if len(m) == 1), None)
 
 
 def shapes_of(c: Candidate) -> list[str]:

@@ -130,6 +130,18 @@ def test_the_jackknife_leaves_clusters_out(at, level):
     assert score.p_model == pytest.approx(stats.chi2.sf(2 * score.gain, k), rel=1e-6)
 
 
+@pytest.mark.parametrize("level", [0.0, 0.8])
+@pytest.mark.parametrize("own", [(0,), (0, 2)])
+def test_what_another_column_takes_over_is_what_a_fit_beside_it_gives_up(own, level):
+    """Coefficients of a fit with so much of the other column taken off the residual."""
+    rows = Rows(level=level)
+    per_unit = rows.evidence().traded(own, 1)
+    before = rows.evidence().estimate(candidate(*own))[0]
+    rows.residual = rows.residual - 0.05 * rows.columns[:, 1]
+    np.testing.assert_allclose(rows.evidence().estimate(candidate(*own))[0], before + 0.05 * per_unit, atol=1e-9)
+    assert np.all(np.abs(per_unit) > 1e-3)
+
+
 def test_what_is_left_of_a_column():
     """1 − R² of a column on the Jacobian; nothing where it lies in it, all where there is no Jacobian."""
     rows = Rows(level=0.0)

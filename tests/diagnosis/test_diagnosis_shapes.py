@@ -13,7 +13,7 @@ from scipy import stats
 from hdev_jax.diagnosis.candidates import Candidate, finer
 from hdev_jax.diagnosis.diagnose import diagnose
 from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.shapes import Open, _wide, shapes_of
+from hdev_jax.diagnosis.shapes import Open, _wide, other_size, shapes_of
 from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import read_sheet
@@ -136,3 +136,37 @@ def test_a_users_effect_without_bounds_goes_through_the_loop(tmp_path):
 def test_shapes_that_lie_on_a_grid_beside_sizes(effect, sizes, groups, shapes, kind, expected):
     c = Candidate(LIBRARY[effect], sizes, groups, shapes, kind, tuple(range(len(sizes))))
     assert shapes_of(c) == expected
+
+
+@pytest.mark.parametrize(
+    ("effect", "sizes", "groups", "kind", "expected"),
+    [
+        ("iron_loss", ("w_per_radps",), (None,), "size", "w_per_radps2"),
+        ("iron_loss", ("w_per_radps", "w_per_radps2"), (None, None), "size", None),
+        ("wet_road", ("spray",), (None,), "size", "excess"),
+        ("sampling_filter", ("tau_s",), (None,), "size", None),
+        ("mode_change", ("loss",), (None,), "size", None),
+        ("headwind", ("scale",), (None,), "size", None),
+        ("wet_road", ("spray",), (1,), "size", None),
+        ("wet_road", ("spray",), (None,), "limit", None),
+    ],
+)
+def test_the_other_size_that_an_effect_may_have(effect, sizes, groups, kind, expected):
+    c = Candidate(LIBRARY[effect], sizes, groups, (), kind, tuple(range(len(sizes))))
+    assert other_size(c) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_size_found_alone_leaves_room_for_the_one_beside_it(seed):
+    """Losses that grow with the speed and with its square look alike in twelve trips; one alone is found."""
+    shaft = {"entry": "shaft", "mode": "samples", "rows_per_trip": 600}
+    synthetic, result = run(
+        seed, effects={"iron_loss": {}}, ratio=0.5, trips=12, ar_coefficient=0.97, **shaft
+    )  # fmt: skip
+    found = next(e for e in result.summary["effects"] if e["id"] == "iron_loss")["parameters"]
+    assert len(found) == 1
+    ((name, told),) = found.items()
+    low, high = told["interval_90"]
+    assert 0.0 <= low <= synthetic.vehicle.effects["iron_loss"][name] <= high
+    assert high - low > 0.2 * told["value"]
