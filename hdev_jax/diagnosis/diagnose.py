@@ -81,7 +81,7 @@ def diagnose(
     loop = Loop(rows, problem.target, cluster_rows(real), effects, fdr, np.random.default_rng([seed, 999]), gears)
     state, steps, predicted, left = told_apart(problem, split, state, loop, seed=seed, tell=tell, checkpoint=checkpoint)
     base = steps[0]
-    leeway = {f.id: left_open(loop, state, f.score) for f in state.found}
+    leeway = {f.id: left_open(loop, state, f.score, steps[-1]) for f in state.found}
     summary = summarise(problem, split, state, steps, predicted, left, leeway)
     summary["excluded"] = excluded
     rivals = [(f.id, library[t]) for f in state.found for t in f.twins if t in library]

@@ -86,8 +86,8 @@ def told_apart(
             asked = tuple(told.get("asked", ()))
         gone = next(iter(told.get("superfluous", ())), None)
         description = "the formula" if "formula" in told else "what rows follow" if "words" in told else "the cycle"
-        of = "that it covered" if "covered" in told else "for what is left"
-        why = f"not found again beside {description} {of}"
+        whose = "that it covered" if "covered" in told else "for what is left"
+        why = f"not found again beside {description} {whose}"
         if gone is None:  # of what was asked about, that word stands
             gone, why = _shadow(problem, state, predicted, train, left, asked), MEAN_OF_MORE
         if gone is None or round_ == MOST_SHADOWS:
@@ -148,13 +148,14 @@ def _beside_covered(
     where none did.
 
     A cycle that is slow for its trips has a mean in each of them. What trips differ by may take so much of it that the
-    peak in the spectrum no longer passes, though before the effect was added, and without it now, it does. What was
+    peak in the spectrum no longer passes, though before the effect was added one does, and without it now. What was
     found before a periodic load covers none of its cycle: that load is the cycle.
     """
 
     def cycle_without(prediction: np.ndarray) -> np.ndarray:
         return swing_w(_side(problem, train, prediction, np.zeros((len(prediction), 0))))
 
+    tell("what is left: a cycle that an effect covers")
     ids = [f.id for f in state.found]
     first = ids.index(PeriodicLoad.id) + 1 if PeriodicLoad.id in ids else 0
     k = next((k for k in reversed(range(first, len(ids))) if np.any(cycle_without(predicted[k]))), None)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, stats
 
-from hdev_jax.diagnosis.candidates import Candidate, Grids, Plan, beyond, plan_of
+from hdev_jax.diagnosis.candidates import FIXED, Candidate, Grids, Plan, beyond, plan_of
 from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.ranking import plausible
@@ -24,7 +24,7 @@ __all__ = ["Open", "left_open", "other_size", "shapes_of"]
 BETWEEN = 3  # steps from one value of the library's grid to the next
 BEYOND = 2  # of its steps, on either side, that are looked at too
 NEGLIGIBLE = 1e-3  # likelihood over the best one's
-POINTS = 41  # of another size, over four standard errors to either side
+POINTS, REACH = 41, 4.0  # of another size, over so many standard errors to either side
 
 
 @dataclass(frozen=True)
@@ -62,24 +62,25 @@ class Open:
         return at(0.5 - 0.5 * level), at(0.5 + 0.5 * level)
 
 
-def left_open(problem: Loop, state: Search, s: Score) -> dict[str, Open]:
-    """Sizes and shapes of a found effect over a grid of its shapes, as likely as rows and usual values make them; or
-    its sizes over another that it may have, as likely as rows make it.
+def left_open(problem: Loop, state: Search, s: Score, reported: Calibration) -> dict[str, Open]:
+    """Sizes and shapes of a found effect over a grid of its shapes, as likely as rows and usual values make them; or,
+    of an effect without shapes, its sizes over another that it may have, as likely as rows make it.
 
-    All other coefficients are fitted at every point. Rows and noise are those that found it: whitened ones, or trips
-    alone. Empty for effects without such shapes or sizes, for switches, and for what is sought elsewhere than on a
-    grid.
+    All other coefficients are fitted at every point. Rows and noise are those that found it, whitened ones or trips
+    alone; where another size is open those that its own is `reported` by, whitened ones or rows of equal weight. Empty
+    for effects without such shapes or sizes, for switches, and for what is sought elsewhere than on a grid.
 
     **Returns:** what is open, by parameter.
     """
     c, names = s.candidate, shapes_of(s.candidate)
     if not names:
-        return _other_open(problem, state, s, other) if (other := other_size(c)) else {}
+        return _other_open(problem, state, s, other, reported) if (other := other_size(c)) else {}
     effect = state.fit.vehicle.effect(c.id)
     here = {n: float(np.asarray(getattr(effect, n))) for n in names}
     grids = {n: _wide(c, n, here[n], problem.facts.row_s) for n in names}
     cells = {n: dict(zip(g, np.gradient(g) if len(g) > 1 else [1.0], strict=True)) for n, g in grids.items()}
-    plan, evidence = _apart(problem, state, s, grids | {n: (v,) for n, v in c.shapes if n not in names})
+    plan, white, plain = _apart(problem, state, c, grids | {n: (v,) for n, v in c.shapes if n not in names})
+    evidence = plain if s.plain else white
     same = [k for k in plan.candidates if (k.sizes, k.groups) == (c.sizes, c.groups)]
     totals = evidence.totals()
     points = []
@@ -104,45 +105,55 @@ def left_open(problem: Loop, state: Search, s: Score) -> dict[str, Open]:
     return {n: Open(away[:, k], share, float(inside[k])) for k, n in enumerate((*c.sizes, *names))}
 
 
-def _apart(problem: Loop, state: Search, s: Score, grids: Grids) -> tuple[Plan, Evidence]:
-    """The ways to have a found effect on these grids, and what the rows that found it say of them without it."""
-    c = s.candidate
+def _apart(problem: Loop, state: Search, c: Candidate, grids: Grids) -> tuple[Plan, Evidence, Evidence]:
+    """The ways to have a found effect on these grids, and what rows say of them without it: whitened, plain."""
     plan = plan_of(state.fit.vehicle.minus(c.id), [c.effect], problem.facts, problem.target, grids)
     ground = problem.ground(_without(state.fit, c.id), problem.noise(state.fit))
     with_it = float(np.mean((problem.measured - state.fit.predicted) ** 2))
-    white, plain, _ = both_looks(ground, plan, variance=with_it)
-    return plan, plain if s.plain else white
+    return plan, *both_looks(ground, plan, variance=with_it)[:2]
 
 
-def _other_open(problem: Loop, state: Search, s: Score, other: str) -> dict[str, Open]:
+def _other_open(problem: Loop, state: Search, s: Score, other: str, reported: Calibration) -> dict[str, Open]:
     """Sizes of a found effect over the plausible values of another one, which it was found without."""
-    c, p = s.candidate, s.candidate.parameter(other)
-    plan, evidence = _apart(problem, state, s, {})
+    c = s.candidate
+    plan, white, plain = _apart(problem, state, c, {})
+    told = any(r.told for r in reported.table.free if r.path.startswith(f"effects.{c.id}."))
+    evidence = white if told else plain
     own = next((k for k in plan.candidates if k.sizes == c.sizes), None)
     both = next((k for k in plan.candidates if {*k.sizes} == {*c.sizes, other}), None)
     if own is None or both is None:
         return {}
-    column = both.columns[both.sizes.index(other)]
-    beta, error = (float(x[both.sizes.index(other)]) for x in evidence.estimate(both))
-    inside = evidence.estimate(own)[1]
-    if evidence.left([column]) <= ABSORBED or not np.all(np.isfinite([beta, error, *inside])) or error <= 0:
+    place, p = both.sizes.index(other), c.parameter(other)
+    beta, error = (float(x[place]) for x in evidence.estimate(both))
+    found, inside = evidence.estimate(own)
+    known = np.all(np.isfinite([beta, error, *found, *inside])) and error > 0
+    if not known or evidence.left([both.columns[place]]) <= ABSORBED:
         return {}
-    at = beta + error * np.linspace(-4, 4, POINTS)
-    at = np.unique(np.clip(at, p.lower, p.upper))
-    share = stats.t.pdf((at - beta) / error, max(evidence.count - 1, 1)) * (np.gradient(at) if len(at) > 1 else 1.0)
-    if not share.sum() > 0:  # plausible values are far from all that the rows say
+    per_unit = evidence.traded(own.columns, both.columns[place])
+
+    def possible(x: float) -> bool:
+        values = {other: x, **dict(zip(c.sizes, found + per_unit * x, strict=True))}
+        return plausible(replace(s, candidate=both, beta=np.array([values[n] for n in both.sizes])))
+
+    reach = np.clip(beta + error * np.array([-REACH, REACH]), p.lower - p.null, p.upper - p.null)
+    at = np.array([x for x in np.linspace(*reach, POINTS) if possible(float(x))])
+    if not len(at):
         return {}
+    share = stats.t.pdf((at - beta) / error, max(evidence.count - 1, 1))
     share /= share.sum()
-    each = evidence.traded(own.columns, column)
-    return {n: Open(x * at, share, float(e)) for n, x, e in zip(c.sizes, each, inside, strict=True)}
+    return {n: Open(x * at, share, float(e)) for n, x, e in zip(c.sizes, per_unit, inside, strict=True)}
 
 
 def other_size(c: Candidate) -> str | None:
-    """The one other size that its effect may have beside those that it was found with; None where there is none."""
-    if c.kind != "size" or c.effect.searched or c.shapes or any(g is not None for g in c.groups):
+    """The one other size that an effect without shapes may have beside those that it was found with; None where there
+    is none, or more than one."""
+    if c.kind != "size" or c.effect.searched or any(g is not None for g in c.groups):
         return None
-    more = ({*v} - {*c.sizes} for v in c.effect.variants if {*v} > {*c.sizes})
-    return next((m.pop() for m in more if len(m) == 1), None)
+    if any(p.kind in FIXED for p in c.effect.parameters):
+        return None
+    more = {frozenset({*v} - {*c.sizes}) for v in c.effect.variants if {*v} > {*c.sizes}}
+    others = [n for m in more if len(m) == 1 for n in m]
+    return others[0] if len(others) == 1 else None
 
 
 def shapes_of(c: Candidate) -> list[str]:

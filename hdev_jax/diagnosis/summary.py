@@ -58,13 +58,13 @@ def _heavier(clusters: int) -> float:
 
 
 def _opened(told: dict[str, Any], p: Parameter, left: Open, error: float | None, clusters: int) -> dict[str, Any]:
-    """What is known of a parameter with what its effect's shapes leave open of it, inside its plausible range.
+    """What is known of a parameter with what its effect's shapes or other size leave open of it, inside its plausible
+    range: what was `told` of it, widened where that is too narrow.
 
-    `error`: its standard error where the shapes are held; None where it was fitted with them or is one of them, and
-    what was `told` of it is widened where that is too narrow.
+    `error`: its standard error where those are held; None where it was fitted with them or is one of them.
     """
     low, high = (told["value"] + x for x in left.interval(0.9, _freedom(clusters), error))
-    inner = told.get("interval_90", [told["value"]] * 2) if error is None else [low, high]
+    inner = told.get("interval_90", [told["value"]] * 2)
     sd = max(told["sd"], left.error(error) * _heavier(clusters))
     within = np.clip([min(low, inner[0]), max(high, inner[1])], p.lower, p.upper).tolist()
     return {
@@ -83,7 +83,7 @@ def parameters_of(f: Found, fit: Calibration, leeway: Mapping[str, Open], cluste
     """A found effect's parameters, each with value, sd, unit and, unless it is a choice, its 90 % interval.
 
     What was held has an sd of 0 by the fit alone, `leeway` empty: the sheet's numbers, which belong together. With what
-    its shapes leave open every number stands for itself.
+    its shapes or its other size leave open every number stands for itself.
     """
     c = f.score.candidate
     prefix = f"effects.{f.id}."
@@ -135,7 +135,7 @@ def summarise(
     left: Remainder,
     leeway: Mapping[str, Mapping[str, Open]],
 ) -> dict[str, Any]:
-    """The contract's diagnosis.json. `leeway`: by effect and parameter, what its shapes leave open."""
+    """The contract's diagnosis.json. `leeway`: by effect and parameter, what is left open."""
     weight, y = problem.weight(), problem.measured
     train, test = problem.rows(split.train), problem.rows(split.test)
 

@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
+from bare import bare
 
 from hdev_jax.diagnosis import rest
 from hdev_jax.diagnosis.expression import Expression
@@ -21,14 +21,6 @@ TRIPS, ROWS = 8, 150
 
 def silent(_: str) -> None:
     return None
-
-
-def bare(cls: type, **values: Any) -> Any:
-    """An object of the class that has these attributes alone."""
-    made = object.__new__(cls)
-    for name, value in values.items():
-        object.__setattr__(made, name, value)
-    return made
 
 
 def side(seed: int, *, size: float) -> Rows:

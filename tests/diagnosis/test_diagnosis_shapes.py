@@ -1,21 +1,28 @@
 """Sizes whose thresholds few trips tell: what is said of them has room for every threshold that the log allows."""
 
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bare import bare
 from hypothesis import given
 from hypothesis import strategies as st
 from planted import run
 from scipy import stats
 
+from hdev_jax.diagnosis import shapes
 from hdev_jax.diagnosis.candidates import Candidate, finer
 from hdev_jax.diagnosis.diagnose import diagnose
+from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.look import Loop, Search
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.shapes import Open, _wide, other_size, shapes_of
 from hdev_jax.diagnosis.split import split_trips
+from hdev_jax.diagnosis.summary import _opened
 from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import Calibration
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter
@@ -147,13 +154,59 @@ def test_shapes_that_lie_on_a_grid_beside_sizes(effect, sizes, groups, shapes, k
         ("sampling_filter", ("tau_s",), (None,), "size", None),
         ("mode_change", ("loss",), (None,), "size", None),
         ("headwind", ("scale",), (None,), "size", None),
-        ("wet_road", ("spray",), (1,), "size", None),
+        ("hvac_power", ("below_w_per_k",), (None,), "size", None),
         ("wet_road", ("spray",), (None,), "limit", None),
     ],
 )
 def test_the_other_size_that_an_effect_may_have(effect, sizes, groups, kind, expected):
     c = Candidate(LIBRARY[effect], sizes, groups, (), kind, tuple(range(len(sizes))))
     assert other_size(c) == expected
+
+
+def _open(monkeypatch, *, other: float, error: float, traded: float, told: bool = True, nothing_left: bool = False):
+    """What 5 ± 0.3 W·s/rad leave open, where rows say that the loss by the square is `other` ± `error`."""
+    ways = [Candidate(LIBRARY["iron_loss"], v, (None,) * len(v), (), "size", (0, 1)[: len(v)]) for v in
+            (("w_per_radps",), ("w_per_radps", "w_per_radps2"))]  # fmt: skip
+    answers = {1: (np.array([5.0]), np.array([0.3])), 2: (np.array([4.0, other]), np.array([1.0, error]))}
+    evidence = SimpleNamespace(
+        count=9, left=lambda _: 0.0 if nothing_left else 1.0, traded=lambda own, column: np.array([traded]),
+        estimate=lambda k: answers[len(k.columns)],
+    )  # fmt: skip
+    looks = (evidence, None) if told else (None, evidence)
+    monkeypatch.setattr(shapes, "_apart", lambda *_: (SimpleNamespace(candidates=ways), *looks))
+    row = SimpleNamespace(path="effects.iron_loss.w_per_radps", told=(5.0, 0.3) if told else None)
+    reported = bare(Calibration, table=SimpleNamespace(free=[row]))
+    s = Score(ways[0], np.array([5.0]), 9.0, 0.0, 0.0, 9.0, 1.0)
+    return shapes._other_open(bare(Loop), bare(Search), s, "w_per_radps2", reported)
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_room_for_another_size_is_as_wide_as_rows_leave_it(told, monkeypatch):
+    """Plausible values of the other, and those with which the own one stays plausible."""
+    wide = _open(monkeypatch, other=0.01, error=0.002, traded=-100.0, told=told)["w_per_radps"]
+    mean, sd = np.sum(wide.share * wide.away), np.sqrt(np.cov(wide.away, aweights=wide.share, ddof=0))
+    assert mean == pytest.approx(-1.0, abs=0.01)
+    assert sd == pytest.approx(0.2 * np.sqrt(8 / 6), rel=0.1)  # Student's t of eight degrees, cut off at four errors
+    assert wide.inside == 0.3
+    at_bound = _open(monkeypatch, other=0.0, error=0.002, traded=-100.0, told=told)["w_per_radps"]
+    assert np.all(at_bound.away <= 0.0)  # no loss is negative
+    free = _open(monkeypatch, other=0.0, error=10.0, traded=-100.0, told=told)["w_per_radps"]
+    assert np.all(free.away >= -5.0)  # nor is this one
+
+
+def test_no_room_where_nothing_is_known_of_the_other_size(monkeypatch):
+    assert _open(monkeypatch, other=0.01, error=0.002, traded=-100.0, nothing_left=True) == {}
+    assert _open(monkeypatch, other=np.nan, error=0.002, traded=-100.0) == {}
+    assert _open(monkeypatch, other=0.0, error=0.0, traded=-100.0) == {}
+
+
+def test_what_is_left_open_never_narrows_what_a_fit_says():
+    told = {"value": 5.0, "sd": 0.34, "interval_90": [4.44, 5.56]}
+    p = LIBRARY["iron_loss"].parameters[0]
+    one_sided = Open(np.array([-2.0, -1.0]), np.array([0.5, 0.5]), 0.3)
+    low, high = _opened(told, p, one_sided, 0.3, 9)["interval_90"]
+    assert low < 3.5
+    assert high == 5.56
 
 
 @pytest.mark.slow
