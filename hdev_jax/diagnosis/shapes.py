@@ -135,8 +135,8 @@ def _other_open(problem: Loop, state: Search, s: Score, other: str, reported: Ca
         values = {other: x, **dict(zip(c.sizes, found + per_unit * x, strict=True))}
         return plausible(replace(s, candidate=both, beta=np.array([values[n] for n in both.sizes])))
 
-    reach = np.clip(beta + error * np.array([-REACH, REACH]), p.lower - p.null, p.upper - p.null)
-    at = np.array([x for x in np.linspace(*reach, POINTS) if possible(float(x))])
+    low, high = np.clip(beta + error * np.array([-REACH, REACH]), p.lower - p.null, p.upper - p.null)
+    at = np.array([x for x in np.linspace(low, high, POINTS) if possible(float(x))])
     if not len(at):
         return {}
     share = stats.t.pdf((at - beta) / error, max(evidence.count - 1, 1))
