@@ -132,12 +132,14 @@ def _formula(
 
 def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collection[str], tell: Tell) -> dict[str, Any]:
     """Which of the effects asked for are not found again beside a load as large in each trip as the cycle there, as
-    plain values; empty where none is asked for, or nothing can be asked beside a fit that did not converge."""
+    plain values; empty where none is asked for.
+
+    Beside a fit that did not converge they are asked all the same: a cycle is a fact, and what is not found again beside
+    it is named on its account.
+    """
     if not asked:
         return {}
     beside_it, known = beside(loop, state, np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))])
-    if not known.fit.converged:
-        return {}
     return {"asked": list(asked), "superfluous": list(stand_ins(beside_it, known, (), tell, asked))}
 
 
