@@ -134,8 +134,8 @@ def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collect
     """Which of the effects asked for are not found again beside a load as large in each trip as the cycle there, as
     plain values; empty where none is asked for.
 
-    Beside a fit that did not converge they are asked all the same: a cycle is a fact, and what is not found again beside
-    it is named on its account.
+    Beside a fit that did not converge they are asked all the same: a cycle is a fact, and what is not found again
+    beside it is named on its account.
     """
     if not asked:
         return {}
