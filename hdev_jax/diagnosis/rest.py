@@ -139,8 +139,8 @@ def _beside_cycle(state: Search, loop: Loop, cycle_w: np.ndarray, asked: Collect
     """
     if not asked:
         return {}
-    beside_it, known = beside(loop, state, np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))])
-    return {"asked": list(asked), "superfluous": list(stand_ins(beside_it, known, (), tell, asked))}
+    load = np.r_[cycle_w, np.zeros(len(loop.rows.measured) - len(cycle_w))]
+    return {"asked": list(asked), "superfluous": list(stand_ins(*beside(loop, state, load), (), tell, asked))}
 
 
 def _beside_covered(

@@ -134,9 +134,6 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
         asked.append(tuple(of))
         return tuple(k for k in of if k not in again)
 
-    def known(state):
-        return bare(Search, found=state.found, fit=SimpleNamespace(converged=True))
-
     def take_out(loop, state, id_, why):
         said.append((id_, why))
         return bare(Search, found=[f for f in state.found if f.id != id_])
@@ -148,8 +145,7 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
         "_path": lambda p, s, _: [bare(Calibration, vehicle=k) for k in range(len(s.found) + 1)],
         "_remainder": lambda *_: left, "_formula": lambda *_: {}, "_small": lambda *_: small,
         "_most": lambda *_: 1.0,
-        "beside": lambda loop, state, _: (loop, known(state)), "stand_ins": stand_ins,
-        "_gone": take_out, "MOST_SHADOWS": 1,
+        "beside": lambda loop, state, _: (loop, state), "stand_ins": stand_ins, "_gone": take_out, "MOST_SHADOWS": 1,
         "replace": lambda loop, **_: loop,
     }.items():  # fmt: skip
         monkeypatch.setattr(rest, name, answer)
@@ -188,7 +184,7 @@ def test_who_took_a_cycle_out_of_sight_is_asked(found, seen, now, small, asked, 
         "_side": lambda problem, train, prediction, features: prediction, "swing_w": lambda prediction: prediction,
         "without": lambda loop, state, k: SimpleNamespace(fit=SimpleNamespace(vehicle=now[found.index(k)])),
         "_small": lambda *_, of: tuple(k for k in small if k in of), "_most": lambda *_: 1.0, "stand_ins": stand_ins,
-        "beside": lambda loop, state, w: (loop, bare(Search, found=w[0], fit=SimpleNamespace(converged=True))),
+        "beside": lambda loop, state, w: (loop, bare(Search, found=w[0])),
     }.items():  # fmt: skip
         monkeypatch.setattr(rest, name, answer)
     monkeypatch.setattr(Problem, "predict", lambda _, vehicle: np.full(5, float(vehicle)))
