@@ -121,14 +121,15 @@ def withheld(runs: Mapping[str, Mapping[str, Any]], pairs: Mapping[str, str], ti
             ": ".join(part.replace(" ", "\n" if n else " ") for n, part in enumerate(x.split(": "))) for x in labels
         ]
         right.set_xticks(range(len(labels)), [x.replace(": ", "\n") for x in said])
-        right.set_title("Effects found (hatched: another of its class is)")
+        hatched = any(patch.get_hatch() for patch in right.patches)
+        right.set_title("Effects found" + " (hatched: another of its class is)" * hatched)
         for side in ("left", "bottom"):
             right.spines[side].set_visible(False)
         right.tick_params(length=0)
         right.tick_params(axis="x", labelsize=7)
-        _legend(
-            fig, [("before", BEFORE), ("after (hollow or pale: channel withheld; dashed: with every channel)", AFTER)]
-        )
+        withheld_ = {"markerfacecolor": "white", "markeredgecolor": AFTER, "markeredgewidth": 1.3}
+        _legend(fig, [("before", BEFORE), ("after", AFTER), ("after, channel withheld (pale on the right)", withheld_),
+                      ("dashed: with every channel", None)])  # fmt: skip
         return _small(fig)
 
 
@@ -150,7 +151,7 @@ def _power(row: SizeRow) -> int:
 
 def _scaled(unit: str, power: int) -> str:
     text = f"10{str(power).translate(SUPERSCRIPT)}" if power else ""
-    return " ".join(filter(None, (text, "" if unit == "1" else unit))) or "a pure number"
+    return " ".join(filter(None, (text, "(no unit)" if unit == "1" else unit)))
 
 
 def _cell(x: float, y: float, colour: str, *, hatch: bool) -> Any:
@@ -161,16 +162,24 @@ def _cell(x: float, y: float, colour: str, *, hatch: bool) -> Any:
 
 
 def _panel(paths: Sequence[str]) -> str:
-    """A size in few words; the effects of one class share a panel."""
+    """A size in few words; sizes of one class share a panel."""
     if len(paths) > 1:
-        return "\nor ".join(short(names.effect(p.partition(".")[0]), 40) for p in paths)
+        parts = [p.partition(".") for p in paths]
+        return "one of a class:\n" + "\n".join(
+            f"{short(names.effect(id_), 40)}: {names.parameter(name)}" for id_, _, name in parts
+        )
     id_, _, name = paths[0].partition(".")
     return f"{short(names.effect(id_), 40)}:\n{names.parameter(name)}"
 
 
-def _legend(fig: Any, entries: Sequence[tuple[str, str]]) -> None:
-    """One legend above the panels, where it covers nothing."""
+def _legend(fig: Any, entries: Sequence[tuple[str, str | Mapping[str, Any] | None]]) -> None:
+    """One legend above the panels, where it covers nothing: words with a dot's colour or look, or, for None, a dash."""
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], linestyle="none", marker="o", markersize=5, color=c, label=w) for w, c in entries]
+    dash: Any = {"linestyle": (0, (2, 1.5)), "color": AFTER, "linewidth": 1.0}
+    dot: Any = {"linestyle": "none", "marker": "o", "markersize": 5}
+    handles = [
+        Line2D([], [], label=w, **(dash if e is None else dot | ({"color": e} if isinstance(e, str) else dict(e))))
+        for w, e in entries
+    ]
     fig.legend(handles=handles, loc="outside upper right", ncols=len(handles), columnspacing=1.6)

@@ -107,6 +107,9 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             found = (
                 f"Every one of them finds {named(always)}." if always else "There is no effect that all of them find."
             )
+            if turned := [r for r in size_rows(runs) if len({np.sign(v) for _, v, _ in r.cells.values()}) > 1]:
+                said = names.verbose_join([" or ".join(f"`{p}`" for p in row.paths) for row in turned])
+                found += f" They do not agree on the sign of {said}."
             out.append(
                 f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. {found} "
                 f"In {open_} of {len(runs)} the loop says that something more is missing."
@@ -144,12 +147,14 @@ def _reading(runs: Runs) -> list[str]:
 
 def _agreement(runs: Runs, caution: str) -> list[str]:
     """How many sizes agree between training sets, and which do not."""
-    rows = [row for row in size_rows(runs) if len(row.cells) > 1]
+    rows = [row for row in size_rows(runs) if len(row.cells) > 1 and not row.at_bound]
     apart = sorted((row for row in rows if row.furthest() > AGREE), key=lambda row: -row.furthest())
-    text = f"Of {len(rows)} sizes found more than once, {len(rows) - len(apart)} agree within {AGREE:.0f} sd."
+    bound = [row for row in size_rows(runs) if row.at_bound]
+    text = f"Of {len(rows)} sizes found more than once{', none at a bound,' if bound else ','} "
+    text += f"{len(rows) - len(apart)} agree within {AGREE:.0f} sd."
     if apart:
         said = names.verbose_join([f"{' or '.join(f'`{p}`' for p in r.paths)} ({r.furthest():.1f} sd)" for r in apart])
-        text += f" The others are further apart: {said}."
+        text += f" Further apart: {said}."
     lines = [f"{text} {caution}"]
     if together := {k: r["together"] for k, r in runs.items() if r["together"]}:
         lines += ["", "Coefficients that a training set knows together far better than one by one:", ""]
@@ -230,7 +235,7 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     before = {n: m for r in runs.values() for n, m in r["before"]["test_by_trip"].items()}
     lines = ["## ZTBus: electric power from traction force and speed", ""]
     lines += [
-        "A trolleybus in Zurich; the sheet declares two efficiencies. Each fold holds every third mission out.",
+        "Two trolleybuses in Zurich; their sheet declares two efficiencies. Each fold holds every third mission out.",
         "",
     ]
     rows = [
@@ -252,7 +257,7 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     lines += ["### What stays unexplained", "", *left_table(runs, "fold", "kW"), *_left_notes(runs), ""]
     lines += ["Where the rest is, test RMSE [kW] before → after:", "", *_subsets(runs)]
     order = sorted(after, key=lambda n: warm.get(n, 0.0))
-    label = {n: f"{n[:18]} h{f', {warm[n]:.0f} °C' if n in warm else ''}".replace("_", " ") for n in order}
+    label = {n: f"{n[:18]} h{f', {warm[n]:.1f} °C' if n in warm else ''}".replace("_", " ") for n in order}
     blocks = {"": [(label[n], before[n]["rmse"], after[n]["rmse"]) for n in order]}
     title = "ZTBus (measured): error of electric power" + (", missions from cold to warm" if warm else "")
     return lines, {

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.summary import SUSPICIOUS
+from hdev_jax.physics import LIBRARY
 from hdev_jax.report import names, words
 
 __all__ = [
@@ -48,10 +49,22 @@ class SizeRow:
         said = [f"{names.effect(p.partition('.')[0])}: {names.parameter(p.partition('.')[2])}" for p in self.paths]
         return said[0] if len(said) == 1 else names.verbose_join(said, "or")
 
+    @property
+    def at_bound(self) -> set[str]:
+        """The training sets in which the size ends where its plausible range does: what it says there is the range."""
+        return {run for run, (path, value, _) in self.cells.items() if _bounded(path, value)}
+
     def furthest(self) -> float:
         """The largest difference between two training sets, in standard deviations of that difference."""
         pairs = itertools.combinations(self.cells.values(), 2)
         return max((abs(a[1] - b[1]) / math.hypot(a[2], b[2]) for a, b in pairs), default=math.nan)
+
+
+def _bounded(path: str, value: float) -> bool:
+    id_, _, name = path.partition(".")
+    parameters = {p.name: p for p in LIBRARY[id_].parameters} if id_ in LIBRARY else {}
+    p = parameters.get(name.partition("[")[0])
+    return p is not None and any(math.isclose(value, end, rel_tol=1e-3) for end in (p.lower, p.upper) if end)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -150,6 +163,7 @@ def size_table(runs: Runs, head: str) -> list[str]:
         for run in runs:
             path, value, sd = row.cells.get(run, ("", math.nan, math.nan))
             text = words.plus_minus(value, sd)
+            text += ", at its bound" if run in row.at_bound else ""
             size.append(text if len(row.paths) == 1 or not path else f"{text} (`{path.partition('.')[0]}`)")
         apart = row.furthest()
         unit = "–" if row.unit == "1" else row.unit

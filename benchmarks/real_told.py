@@ -41,7 +41,7 @@ def withheld(folds: Runs, held: Runs, rest: Mapping[str, Any], picture: str) -> 
     lines = [
         "## A channel withheld and given back", "",
         "Each run repeats a fold of ZTBus with an adapter that leaves out one channel and whatever is made from the",
-        "same source. A *new name* is an effect that no run with every channel finds.", "",
+        "same source. A *new name* is an effect that no fold of ZTBus with every channel finds.", "",
         f"![ZTBus: error and effects found with and without each channel]({picture})", "",
     ]  # fmt: skip
     runs: dict[str, Result] = {}
@@ -184,12 +184,12 @@ def _stand_ins(change: Change, needing: Sequence[str], without: Result, full: Re
         b, a = words.pair(e["test_rmse_before"], e["test_rmse_after"])
         where = [k for k, r in others.items() if i in found_ids(r)]
         if i in new:
-            kind = "a **new name**: no run with every channel finds it"
+            kind = "a **new name**: no fold with every channel finds it"
         elif where:
             kind = f"no new name: fold {names.verbose_join(where)} finds it with every channel"
         else:
             kind = "no new name: with every channel it is one class with what is found"
-        out.append(f"{_first(i)} is {kind}. When it comes in, the test RMSE goes from {b} to {a}.")
+        out.append(f"{_first(i)} is {kind}. When it comes in, the test RMSE goes from {b} to {a} kW.")
     cause = [i for i in change.lost if i in needing]
     if not cause:
         text = "With every channel this fold finds no effect that needs the channel, so there was no cause to replace."
@@ -197,7 +197,7 @@ def _stand_ins(change: Change, needing: Sequence[str], without: Result, full: Re
     if new:
         return [
             *out,
-            f"So the place of {named(cause)} is taken by a name that the full log does not bear out: {named(new)}.",
+            f"So the place of {named(cause)} is taken by what the full log does not bear out: {named(new)}.",
         ]
     return [*out, f"No false name takes the place of {named(cause)}."]
 
@@ -221,11 +221,11 @@ def _error(words_: str, without: Result, full: Result) -> str:
     trips = full["after"]["test_by_trip"]
     better = sum(m["rmse"] < without["after"]["test_by_trip"][k]["rmse"] for k, m in trips.items())
     if abs(a - b) < UNCHANGED * a:
-        return f"Giving the {words_} back leaves the test RMSE as it is ({a:.2f} and {b:.2f})."
+        return f"Giving the {words_} back leaves the test RMSE as it is ({a:.2f} and {b:.2f} kW)."
     way = "lowers" if b < a else "raises"
     return (
-        f"Giving the {words_} back {way} the test RMSE from {a:.2f} to {b:.2f} ({words.percent(100 * (b / a - 1))}); "
-        f"it is lower on {better} of {len(trips)} missions."
+        f"Giving the {words_} back {way} the test RMSE from {a:.2f} to {b:.2f} kW "
+        f"({words.percent(100 * (b / a - 1))}); it is lower on {better} of {len(trips)} missions."
     )
 
 

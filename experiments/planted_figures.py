@@ -27,6 +27,9 @@ COLOURS = {
 }
 LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, classes set aside", "stlsq": "STLSQ (PySINDy)",
           "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}  # fmt: skip
+NOISES = {"white": "white", "ar1": "AR(1)", "ar1_white": "AR(1)\n+ white", "trip_levels": "levels\nof trips",
+          "student_t": "Student's t", "trip_variance": "variance\nby trip"}  # fmt: skip
+LEVEL = 5.0  # per cent of logs with nothing planted that may be given a name
 
 
 def _methods(rivals: Sequence[str]) -> list[str]:
@@ -57,6 +60,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     colours, lowest = list(COLOURS.values()), 0.0 if rivals else 50.0
     for k, (method, trips) in enumerate(series):
         points = []
+        kinds = len({t["effects"][0] for t, _ in single if t["trips"] == trips})
         for size in sorted({t["size"] for t, _ in single}):
             hits = [outcome(t["effects"], r, method)[0] for t, r in single if (t["size"], t["trips"]) == (size, trips)]
             if hits:
@@ -68,7 +72,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
         x, y, low, high = np.array(points).T
         beside = x * 1.02 ** (k - (len(series) - 1) / 2)  # so that no interval hides another
         axes.plot(beside, 100 * y, dashes[trips], color=colour, marker="o", ms=4,
-                  label=f"{LABELS[method]}, {trips} trips")  # fmt: skip
+                  label=f"{LABELS[method]}, {trips} trips ({kinds} effects)")  # fmt: skip
         axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
         lowest = min(lowest, 95 * float(np.min(low)))
     axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(lowest, 102),
@@ -100,8 +104,8 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
             axes.bar(x, 100 * y, 0.75 / len(methods), color=COLOURS[method], label=LABELS[method] if k == 0 else None)
             axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
             highest = max(highest, 102 * high)
-    axes.axhline(5, color="#333", lw=0.8, ls=":")
-    axes.set_xticks(range(len(noises)), [n.replace("_", " ") for n in noises], fontsize=8)
+    axes.axhline(LEVEL, color="#333", lw=0.8, ls=":", label=f"{LEVEL:g} %: the most that is wanted")
+    axes.set_xticks(range(len(noises)), [NOISES[n] for n in noises], fontsize=8)
     axes.set(ylabel="something named [%]", ylim=(0, highest), title="Synthetic logs with nothing missing")
     tidy(axes)
     fig.legend(fontsize=7, loc="outside right center")
@@ -110,7 +114,8 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
 
 @styled
 def confusion_figure(run: Run, done: Done) -> None:
-    """What was named (columns) where one effect was planted (rows), in per cent of its logs."""
+    """What was named (columns) where one effect was planted (rows), in per cent of its logs. A class that holds what
+    was planted counts as that."""
     single = [(t, r) for t, r in done if len(t["effects"]) == 1]
     if not single:
         return
@@ -120,19 +125,21 @@ def confusion_figure(run: Run, done: Done) -> None:
     columns = list(dict.fromkeys(r for r in right.values() if r in LIBRARY))
     columns += [*sorted(others - set(columns)), "nothing"]
     share = np.zeros((len(planted), len(columns)))
+    rows = []
     for i, p in enumerate(planted):
         logs = [r for t, r in single if t["effects"][0] == p]
+        rows.append(f"{p} ({len(logs)})")
         for r in logs:
             for name in {right[p] if right[p] in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
-    fig = figure(max(0.32 * len(columns) + 2.2, 4.6), 0.3 * len(planted) + 1.8)  # the title's at least
+    fig = figure(max(0.32 * len(columns) + 2.5, 4.9), 0.3 * len(planted) + 1.8)  # the title's at least
     axes = fig.add_subplot()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(planted)), planted, fontsize=7)
+    axes.set_yticks(range(len(planted)), rows, fontsize=7)
     for i, k in zip(*np.nonzero(share >= 0.5), strict=True):
         axes.text(k, i, f"{share[i, k]:.0f}", ha="center", va="center", fontsize=6,
                   color="white" if share[i, k] > 55 else "#222")  # fmt: skip
-    axes.set(xlabel="named", ylabel="planted", title="Synthetic logs: what was named [%]")
+    axes.set(xlabel="named", ylabel="planted (logs)", title="Synthetic logs: what was named [%]")
     fig.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
     save_figure(run, fig, "confusion")

@@ -142,6 +142,28 @@ def test_sizes_of_one_class_share_a_row_and_a_unit(results):
     assert all("shape" not in path for paths in rows for path in paths)  # chosen among a few: no size
 
 
+def test_a_size_at_the_end_of_its_range_is_marked_and_agrees_with_nothing():
+    import real_page
+    from real_tables import size_rows, size_table
+
+    ends = {"1": 24.3, "2": 26.0}  # °C; hvac_power's heat_c ends at 26
+    runs = {k: result([effect("hvac_power", "heat_c", v, 1.0, "°C")]) for k, v in ends.items()}
+    assert size_rows(runs)[0].at_bound == {"2"}
+    assert "| 24.3 ± 1.0 | 26.0 ± 1.0, at its bound | 1.2 sd |" in size_table(runs, "fold")[-1]
+    assert "Of 0 sizes found more than once, none at a bound, 0 agree" in real_page._agreement(runs, "")[0]
+
+
+def test_an_effect_whose_sign_turns_is_told_first(results):
+    import real_page
+
+    offsets = {"niro_1": -5.5, "niro_2": 0.7}  # Nm
+    turned = {k: result([effect("torque_offset", "offset_nm", v, 0.1, "Nm")]) for k, v in offsets.items()}
+    text, _ = real_page.page(turned, warm={}, rest={})
+    assert "They do not agree on the sign of `torque_offset.offset_nm`." in text.partition("## Kia Niro")[0]
+    text, _ = real_page.page(results, warm={}, rest={})
+    assert "agree on the sign" not in text
+
+
 def test_bars_of_sizes_are_the_intervals_of_the_diagnosis(results, monkeypatch):
     """Few clusters: a size's distribution has heavier tails than its standard deviation says."""
     import real_figures
@@ -183,7 +205,7 @@ def test_a_false_name_is_called_one(results):
     assert new_names(without, full, others) == ["step_change"]
     text = " ".join(sentences("outside temperature", without, full, others))
     assert "a **new name**" in text
-    assert "taken by a name that the full log does not bear out" in text
+    assert "taken by what the full log does not bear out" in text
     assert new_names(without, full, {"2": result([STEP])}) == []  # another training set finds it with every channel
 
 

@@ -185,6 +185,20 @@ def test_classes_are_not_what_was_asked_without_them(tmp_path):
     assert (row["named_exactly"], row["mean_class"]) == (0.0, 8.0)
 
 
+def test_a_page_explains_the_tables_that_it_has(tmp_path):
+    def notes(logs, folder) -> str:
+        with open_run(tmp_path / folder, {"a": 1}, seed=1) as run:
+            return " ".join(collect(config(), logs, run)["notes"])
+
+    single = notes([(t, result(["headwind"])) for t in every("single", effects=["headwind"])], "single")
+    assert "one before by 0.97" in single
+    assert "Named first" in single
+    undecided = notes([(t, result()) for t in every("undecidable")], "undecided")
+    assert "Called unexplained" in undecided
+    assert "Named first" not in undecided, "what cannot be decided is not asked for its name"
+    assert "ours_first" not in single + undecided
+
+
 def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):
     study = config()
     assert all(case.logs >= 10 for case in study.cases.values())
