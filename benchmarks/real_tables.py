@@ -191,7 +191,7 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
     for run, r in runs.items():
         u = r["unexplained"]
         on = ", ".join(f"`{c}`" for c in u["depends_on"]) or "–"
-        share = words.percent(100 * u["share_of_test_variance"], signed=False)
+        share = words.percent(100 * u["share_of_test_variance"], signed=False) + words.doubt(u)
         rows.append(
             [str(run), r["verdict"].replace("_", " "), words.number(r["after"]["test"]["rmse"]),
              words.number(u["noise_floor_rmse"]), share, on, signature(u), nearest(r)]

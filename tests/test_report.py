@@ -278,6 +278,15 @@ def test_what_is_left_is_told_with_what_it_grows_with(scale, said, tmp_path):
     assert "Grows with" not in plain(written(fake("nothing_missing"), tmp_path / "bare"))
 
 
+@pytest.mark.parametrize(("told", "share", "doubt"), [(True, 0.12, False), (False, 0.12, True), (False, 0.01, False)])
+def test_a_share_that_training_trips_do_not_bear_out_is_told_so(told, share, doubt, tmp_path):
+    data = fake("unexplained_structure")
+    data.summary["unexplained"] |= {"share_of_test_variance": share, "share_borne_out": told}
+    page = plain(written(data, tmp_path))
+    assert ("training trips do not bear out" in answer(data)) == doubt
+    assert ("of the variance of the remaining error, which training trips do not bear out" in page) == doubt
+
+
 def test_synthetic_data_are_labelled(tmp_path):
     text = written(fake(), tmp_path / "a")
     assert re.search(r"<title>synthetic", text)

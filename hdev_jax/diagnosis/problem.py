@@ -10,7 +10,7 @@ import numpy as np
 from hdev_jax.diagnosis.facts import GROUPS
 from hdev_jax.diagnosis.metrics import sum_weight
 from hdev_jax.inference import Fit, ParameterTable, padded, predict
-from hdev_jax.inference.sheet import Sheet, choose_entry, traction_force_from_torque
+from hdev_jax.inference.sheet import BATTERY_TARGETS, Sheet, choose_entry, traction_force_from_torque
 from hdev_jax.logs import Log
 from hdev_jax.physics import Vehicle
 from hdev_jax.physics.vehicle import Target
@@ -27,6 +27,8 @@ _FOLLOWS = {
     "traction_force_n": ("traction_force_n", "motor_torque_nm", "current_a"),
 }
 UNITS = {"energy_wh": "Wh", "battery_power_kw": "kW", "motor_torque_nm": "Nm", "traction_force_n": "N"}
+PLAUSIBLE_KWH_PER_KM = (0.02, 50.0)  # a light car has 0.1; the largest mining trucks, uphill, some 30
+LEAST_KM = 1.0  # standing still a vehicle may take any
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,23 @@ def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured:
     for group in (g for g in GROUPS if segments.has(g)):
         if below := int(np.sum(np.asarray(segments.channels[group]) <= -1)):
             notes.append(f"{group} is below 0 in {below} rows: a coefficient by {group} takes them for 0")
+    if need_measured and (odd := _consumption(log, name)):
+        notes.append(odd)
     if not segments.has("grade_rad") and built.vehicle.entry == "road":
         notes.append("the log has no slope: the declared model takes the road as flat")
     return Problem(log, sheet, name, segments, measured, built.vehicle, built.table, tuple(notes))
+
+
+def _consumption(log: Log, target: str) -> str | None:
+    """A remark on a consumption that no road vehicle has; None where it may be one."""
+    if target not in BATTERY_TARGETS:
+        return None
+    km, kwh = (float(np.sum(np.abs(x))) / 1e3 for x in (log.segments.distance_m, log.target("energy_wh")))
+    least, most = PLAUSIBLE_KWH_PER_KM
+    if km < LEAST_KM or least * km <= kwh <= most * km:
+        return None
+    column = next(c for c in ("energy_wh", "battery_power_w") if c in log.measured)
+    return (
+        f"{kwh / km:.3g} kWh/km go in and out of the battery, which no road vehicle has ({least:g} to {most:g}): check "
+        f"the unit of {column}"
+    )

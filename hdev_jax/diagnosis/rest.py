@@ -28,7 +28,6 @@ from hdev_jax.physics.loads import PeriodicLoad
 
 __all__ = ["told_apart"]
 
-MOST_SHADOWS = 4
 SECONDS_PER_WH_OF_A_KW = 3.6
 CONSTANTS = {("auxiliary_power", "power_w"), ("power_gain", "offset_w")}  # loads that read nothing and choose nothing
 MEAN_OVER_SWING = 2.0  # of a load that is on for up to 78 % of its cycle, over its basic wave's amplitude
@@ -51,7 +50,7 @@ def told_apart(
     def fresh() -> Loop:  # what is kept of an earlier round draws nothing: every stage has its own numbers
         return replace(loop, rng=np.random.default_rng([seed, 999]))
 
-    for round_ in range(MOST_SHADOWS + 1):
+    for round_ in range(len(state.found) + 1):  # each takes one out at least, until none goes
         steps = _path(problem, state, loop)
         predicted = [problem.predict(fit.vehicle) for fit in steps]
         plain = checkpoint(
@@ -90,10 +89,10 @@ def told_apart(
         why = f"not found again beside {description} {whose}"
         if gone is None:  # of what was asked about, that word stands
             gone, why = _shadow(problem, state, predicted, train, left, asked), MEAN_OF_MORE
-        if gone is None or round_ == MOST_SHADOWS:
+        if gone is None:
             break
         tell(f"taking {gone} out: {why}")
-        state = _gone(loop, state, gone, why)
+        state = _gone(loop, state, gone, why, tell)
     if state.found and not left.rms:  # of training rows alone: what test rows say of the rest is no choice
         known = as_known(loop, state)
         steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
@@ -251,11 +250,13 @@ def _shadow(
     return None
 
 
-def _gone(loop: Loop, state: Search, effect_id: str, why: str) -> Search:
-    """The state without a stand-in, with the verdict on it."""
-    gone = next(f for f in state.found if f.id == effect_id)
-    verdicts = [Verdict(effect_id, gone.score.gain, gone.q_value, why), *state.verdicts]
-    return replace(without(loop, state, effect_id), verdicts=verdicts)
+def _gone(loop: Loop, state: Search, effect_id: str, why: str, tell: Tell) -> Search:
+    """The state without a stand-in and without what only stood beside it, with the verdict on each."""
+    left = prune(loop, without(loop, state, effect_id), tell, newest=True)
+    kept, beside_it = {f.id for f in left.found}, f"not told from nothing without {effect_id}, which was taken out"
+    gone = [f for f in state.found if f.id not in kept]
+    verdicts = [Verdict(f.id, f.score.gain, f.q_value, why if f.id == effect_id else beside_it) for f in gone]
+    return replace(left, verdicts=[*verdicts, *state.verdicts])
 
 
 def _path(problem: Problem, state: Search, loop: Loop) -> list[Calibration]:

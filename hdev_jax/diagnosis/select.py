@@ -239,12 +239,15 @@ def _stability(problem: Loop, view: View, chosen: Score, names: set[str], refuse
     return hits / RESAMPLES
 
 
-def prune(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search:
-    """Backward: an effect that the later ones made superfluous goes, the weakest first."""
-    while len(state.found) > 1:
+def prune(problem: Loop, state: Search, tell: Callable[[str], None], *, newest: bool = False) -> Search:
+    """Backward: an effect that the others made superfluous goes, the weakest first.
+
+    The `newest` has just cleared every bar beside the others and is not asked, unless those are others now.
+    """
+    while asked := state.found if newest else state.found[:-1]:
         evidence = evidence_of(problem.ground(state.fit, problem.noise(state.fit)))
         worst: tuple[float, Found] | None = None
-        for f in state.found[:-1]:
+        for f in asked:
             if f.score.candidate.kind == "limit":
                 continue  # a switch is either there or not: its size says nothing against zero
             at = [k for k, c in enumerate(state.table.free) if is_size(c.path, f)]

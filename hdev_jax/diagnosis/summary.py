@@ -182,6 +182,7 @@ def summarise(
         "unexplained": {
             "significant": left.significant,
             "share_of_test_variance": left.share,
+            "share_borne_out": left.borne_out,
             "noise_floor_rmse": left.noise_floor_rmse,
             "depends_on": list(left.depends_on),
             "signature": left.signature,

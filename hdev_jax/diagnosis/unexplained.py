@@ -49,6 +49,7 @@ class Remainder:
     scales_with: str | None = None
     correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
     expression: str | None = None
+    borne_out: bool = False  # whether training clusters left out of the learner's fit bear its share out
 
     def described(
         self, formula: str, channels: Sequence[str], rms: float, unit: str, error: tuple[float, float]
@@ -56,7 +57,8 @@ class Remainder:
         """The same with a formula that fits it; `rms` is the formula's own, `error` on test rows without and with."""
         errors = f"test RMSE {error[0]:.4g} → {error[1]:.4g} {unit}"
         words = f"it follows {formula}, which the library does not hold ({errors})"
-        return replace(self._saying(words, channels, rms), expression=formula)
+        floor = min(self.noise_floor_rmse, error[1])
+        return replace(self._saying(words, channels, rms), expression=formula, noise_floor_rmse=floor)
 
     def hinted(self, words: str, channels: Sequence[str], rms: float) -> "Remainder":
         """The same with what rows of training trips follow, of which no formula is borne out."""
@@ -163,7 +165,7 @@ def remainder(
     curve = _curve(correction, test, list(names), order[0], unit) if learned and order else None
     return Remainder(
         bool(parts), share, floor, depends_on, signature + ".", rms, _watts(train, period), differing is not None,
-        scales_with=scales_with, correction=curve,
+        scales_with=scales_with, correction=curve, borne_out=learned,
     )  # fmt: skip
 
 

@@ -10,10 +10,20 @@ from hdev_jax.logs.columns import Piece
 from hdev_jax.logs.intervals import starts
 from hdev_jax.logs.ledger import Ledger
 
-__all__ = ["BAD_SHARE", "MAX_POWER_W", "MAX_SPEED_MPS", "REVERSE_MPS", "Rows", "check_rows", "concatenate"]
+__all__ = [
+    "BAD_SHARE",
+    "MAX_GRADE_RAD",
+    "MAX_POWER_W",
+    "MAX_SPEED_MPS",
+    "REVERSE_MPS",
+    "Rows",
+    "check_rows",
+    "concatenate",
+]
 
 MAX_SPEED_MPS = 60.0  # contract §1: above, the column is in km/h or broken
 REVERSE_MPS = 0.5  # contract §1: down to −0.5 m/s a sensor's undershoot, set to 0
+MAX_GRADE_RAD = 0.5  # 55 %: the steepest street, Baldwin Street in Dunedin, has 35 %
 MAX_POWER_W = 2e7  # no road vehicle draws it: the largest mining trucks have under 4 MW
 BAD_SHARE = 0.01  # contract §1: bad rows in needed columns, at most
 _SPEEDS = ("speed_mps", "speed_start_mps", "speed_end_mps")
@@ -100,7 +110,7 @@ def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
                 f"{rows.where(i)}, column {c}: {rows.data[c][i]:.6g} m/s is above {MAX_SPEED_MPS:g} m/s; "
                 f"if the file has km/h, name the column {c.replace('_mps', '_kmh')} or give its unit in an adapter"
             )
-    rows = _fill_durations(rows, sampled)
+    rows = _fill_durations(_without_cliffs(rows), sampled)
     bad, reasons = _bad_rows(rows, sampled, measured)
     rows = _one_vehicle(_check_order(rows, bad))
     if bad.any():
@@ -116,6 +126,22 @@ def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
             ledger = ledger.add("dropped", f"{why}; first in {rows.where(first)}", count=n)
         rows = replace(rows, ledger=ledger).take(~bad)
     return _clip_speeds(rows)
+
+
+def _without_cliffs(rows: Rows) -> Rows:
+    """Slopes that no road has: a few count as missing, more are in another unit."""
+    grade = rows.data.get("grade_rad")
+    if grade is None or not (steep := np.isfinite(grade) & (np.abs(grade) > MAX_GRADE_RAD)).any():
+        return rows
+    count, total, i = int(steep.sum()), len(grade), int(np.argmax(steep))
+    what = f"steeper than {MAX_GRADE_RAD:g} rad ({np.tan(MAX_GRADE_RAD):.0%}), which no road is"
+    if count > BAD_SHARE * total:
+        raise InputError(
+            f"{rows.where(i)}, column grade_rad: {grade[i]:.4g} rad, and {count} of {total} rows are {what}; if the "
+            f"file has per cent, name the column grade_pct or give its unit in an adapter"
+        )
+    ledger = rows.ledger.add("noted", f"{what}: taken as missing", count=count, column="grade_rad")
+    return replace(rows, data={**rows.data, "grade_rad": np.where(steep, np.nan, grade)}, ledger=ledger)
 
 
 def _drop_duplicates(rows: Rows) -> Rows:

@@ -198,7 +198,7 @@ def _tiles(data: ReportData) -> list[dict[str, str]]:
         {
             "label": "Still predictable",
             "value": words.percent(None if share is None else 100 * share, signed=False, decimals=0),
-            "note": "of the variance of the remaining error",
+            "note": "of the variance of the remaining error" + words.doubt(u),
         },
     ]
     if fit is not None:

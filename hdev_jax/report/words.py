@@ -1,6 +1,7 @@
 """Numbers and sentences as a reader wants them: the answer first."""
 
 import math
+from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
@@ -14,6 +15,7 @@ __all__ = [
     "answer",
     "answer_parts",
     "count",
+    "doubt",
     "known",
     "next_drives",
     "number",
@@ -29,6 +31,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _DASH = "–"
 MOST_SUSPECTS = 3
+WORTH_TELLING = 0.02  # of the remaining variance, from which on a learner's share is worth a word
 LEANING = 1.5  # one side of an interval over the other
 
 
@@ -119,6 +122,13 @@ def percent(x: Any, *, signed: bool = True, decimals: int = 1) -> str:
     text = _fixed(x, decimals)
     plus = "+" if signed and x > 0 and float(f"{x:.{decimals}f}") else ""
     return f"{plus}{text}{NBSP}%"
+
+
+def doubt(unexplained: Mapping[str, Any]) -> str:
+    """What to say behind a flexible learner's share that training trips do not bear out; nothing where they do."""
+    share = unexplained.get("share_of_test_variance")
+    told = unexplained.get("share_borne_out", True) or not _finite(share) or share < WORTH_TELLING
+    return "" if told else ", which training trips do not bear out"
 
 
 def q_value(q: Any) -> str:
@@ -233,7 +243,8 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
         text = f"\x02Something is missing that {_unnamed(data)}\x03: {remaining(data)}."
         if _finite(share):
             text += (
-                f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left."
+                f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left"
+                f"{doubt(s['unexplained'])}."
             )
     else:
         untried = ("not tried", "declared in the sheet")

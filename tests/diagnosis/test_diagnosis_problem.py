@@ -32,6 +32,21 @@ def read(folder: Path, change: Callable[[pd.DataFrame], None] = lambda _: None, 
     return read_log([files["log"]]), read_sheet(files["sheet"])
 
 
+@pytest.mark.parametrize(("factor", "odd"), [(1.0, False), (1e-3, True), (40.0, True)])
+@pytest.mark.parametrize("target", ["energy_wh", "battery_power_kw"])
+def test_a_consumption_that_no_vehicle_has_is_told(target, factor, odd, tmp_path):
+    """kWh under the name of Wh, or forty times as much: the log is read, and a note says so."""
+
+    def scaled(frame: pd.DataFrame) -> None:
+        frame["energy_wh"] *= factor
+
+    log, sheet = read(tmp_path, scaled, trips=2)
+    told = [n for n in prepare(log, sheet, target).notes if "check the unit of energy_wh" in n]
+    assert len(told) == odd
+    short = log.take(np.flatnonzero(np.cumsum(log.segments.distance_m) < 900.0))
+    assert not [n for n in prepare(short, sheet, target).notes if "check the unit" in n], "too short to tell"
+
+
 # --- what the target would leak --------------------------------------------------------------------------------------
 
 

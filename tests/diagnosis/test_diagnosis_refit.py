@@ -11,8 +11,9 @@ from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.refit import grow, joined, refit, without
+from hdev_jax.diagnosis.select import prune
 from hdev_jax.fleet import synthetic_log
-from hdev_jax.inference import calibrate, cluster_rows, padded
+from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
@@ -98,3 +99,21 @@ def test_what_is_told_beside_an_effect_is_told_anew_without_it(tmp_path):
 def test_nothing_joins_where_nothing_is(tmp_path):
     _, loop, state = heating_found(tmp_path, 0.0)
     assert grow(loop, state, silent) is None
+
+
+def test_the_newest_effect_is_asked_only_where_told_so(tmp_path):
+    """A size that is nothing stays right after it was added, since it has just cleared every bar, and no longer."""
+    _, loop, state = heating_found(tmp_path, 0.0)
+    effect = LIBRARY["standstill_load"](power_w=jnp.asarray(1.0), by_door=jnp.asarray(0.0))
+    rows = effect_coefficients(effect, ("power_w",), shapes=False)
+    vehicle, table = state.fit.vehicle.plus(effect), state.table.plus(*rows)
+    fit = calibrate(vehicle, table, loop.rows, loop.target, loop.clusters)
+    heating = state.found[0]
+    candidate = replace(heating.score.candidate, effect=type(effect), sizes=("power_w",))
+    nothing = replace(heating, id=effect.id, score=replace(heating.score, candidate=candidate))
+    both = replace(state, vehicle=fit.vehicle, table=table, fit=fit, found=[heating, nothing])
+    assert [f.id for f in prune(loop, both, silent).found] == [heating.id, nothing.id]
+    assert [f.id for f in prune(loop, both, silent, newest=True).found] == [heating.id]
+    turned = replace(both, found=[nothing, heating])
+    assert [f.id for f in prune(loop, turned, silent).found] == [heating.id]
+    assert [f.id for f in prune(loop, state, silent, newest=True).found] == [heating.id]

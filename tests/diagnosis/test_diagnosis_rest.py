@@ -9,7 +9,7 @@ from bare import bare
 
 from hdev_jax.diagnosis import rest
 from hdev_jax.diagnosis.expression import Expression
-from hdev_jax.diagnosis.look import Loop, Search
+from hdev_jax.diagnosis.look import Found, Loop, Search
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
@@ -17,6 +17,7 @@ from hdev_jax.inference import Calibration, Clusters
 from hdev_jax.physics import LIBRARY
 
 TRIPS, ROWS = 8, 150
+CYCLE = "not found again beside the cycle for what is left"
 
 
 def silent(_: str) -> None:
@@ -55,6 +56,16 @@ def test_what_decides_is_seen_on_training_rows_alone():
     assert gone.scales_with is None
     assert gone.rms == there.rms == pytest.approx(1.0, abs=0.15)
     assert left_of(side(2, size=0.0), side(1, size=1.0)).rms == 0.0
+
+
+def test_what_a_formula_or_the_learner_predicts_is_no_noise():
+    """The floor is under both; a share that training rows do not bear out is told, and lowers nothing."""
+    there, chance = left_of(side(0, size=1.0), side(1, size=1.0)), left_of(side(2, size=0.0), side(1, size=1.0))
+    assert there.borne_out
+    assert not chance.borne_out
+    assert there.noise_floor_rmse == pytest.approx(1.0, abs=0.05)
+    assert there.described("k·soc", ["soc"], 1.0, "Wh", (1.4, 0.9)).noise_floor_rmse == 0.9
+    assert there.described("k·soc", ["soc"], 1.0, "Wh", (1.4, 1.3)).noise_floor_rmse == there.noise_floor_rmse
 
 
 def test_a_formula_that_explains_test_rows_alone_is_none(monkeypatch):
@@ -110,13 +121,38 @@ def test_what_takes_more_than_a_cycle_could_is_no_stand_in_for_it(target, unit, 
     assert rest._small(problem, state, bare(Loop), predicted, train, 0.01 * most) == ()
 
 
+@pytest.mark.parametrize(("kept", "gone"), [(["headwind"], ["grade_lag"]), (["headwind", "grade_lag"], []), ([], None)])
+def test_what_only_stood_beside_a_stand_in_goes_with_it(kept, gone, monkeypatch):
+    """All that is left is asked once more, the effect found last too, and each that goes is told why."""
+    ids = ["headwind", "traction_limit", "grade_lag"]
+    gone = ["headwind", "grade_lag"] if gone is None else gone
+
+    def state_of(ids) -> Search:
+        found = [bare(Found, id=k, score=SimpleNamespace(gain=9.0), q_value=1e-4) for k in ids]
+        return bare(Search, found=found, verdicts=[])
+
+    def prune(loop, state, tell, *, newest):
+        assert newest
+        return state_of(kept)
+
+    monkeypatch.setattr(rest, "without", lambda loop, state, k: state_of([f.id for f in state.found if f.id != k]))
+    monkeypatch.setattr(rest, "prune", prune)
+    monkeypatch.setattr(rest, "replace", lambda state, **new: bare(Search, found=state.found, **new))
+    left = rest._gone(bare(Loop), state_of(ids), "traction_limit", "why", silent)
+    assert [f.id for f in left.found] == kept
+    beside_it = "not told from nothing without traction_limit, which was taken out"
+    why = {"traction_limit": "why", **dict.fromkeys(gone, beside_it)}
+    assert {v.id: v.why_not for v in left.verdicts} == why
+
+
 @pytest.mark.parametrize(
     ("small", "again", "gone"),
     [
         ((), (), [("auxiliary_power", rest.MEAN_OF_MORE)]),
         (("hvac_power",), ("hvac_power",), [("auxiliary_power", rest.MEAN_OF_MORE)]),
-        (("hvac_power",), (), [("hvac_power", "not found again beside the cycle for what is left")]),
+        (("hvac_power",), (), [("hvac_power", CYCLE), ("auxiliary_power", rest.MEAN_OF_MORE)]),
         (("hvac_power", "auxiliary_power"), ("hvac_power", "auxiliary_power"), []),
+        (("hvac_power", "auxiliary_power"), (), [("hvac_power", CYCLE), ("auxiliary_power", CYCLE)]),
     ],
 )
 def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_what_was_not(
@@ -134,7 +170,7 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
         asked.append(tuple(of))
         return tuple(k for k in of if k not in again)
 
-    def take_out(loop, state, id_, why):
+    def take_out(loop, state, id_, why, tell):
         said.append((id_, why))
         return bare(Search, found=[f for f in state.found if f.id != id_])
 
@@ -143,9 +179,10 @@ def test_of_a_cycle_only_what_is_small_is_asked_and_of_more_that_is_left_only_wh
     predicted = [np.full(10, np.sqrt(x)) for x in (50.0, 30.0, 20.0)]
     for name, answer in {
         "_path": lambda p, s, _: [bare(Calibration, vehicle=k) for k in range(len(s.found) + 1)],
-        "_remainder": lambda *_: left, "_formula": lambda *_: {}, "_small": lambda *_: small,
+        "_remainder": lambda *_: left, "_formula": lambda *_: {},
+        "_small": lambda _, s, *__: tuple(k for k in small if k in [f.id for f in s.found]),
         "_most": lambda *_: 1.0,
-        "beside": lambda loop, state, _: (loop, state), "stand_ins": stand_ins, "_gone": take_out, "MOST_SHADOWS": 1,
+        "beside": lambda loop, state, _: (loop, state), "stand_ins": stand_ins, "_gone": take_out,
         "replace": lambda loop, **_: loop,
     }.items():  # fmt: skip
         monkeypatch.setattr(rest, name, answer)
@@ -221,7 +258,7 @@ def test_beside_what_rows_follow_effects_are_asked_again_and_it_is_said(again, m
             "asked": asked, "superfluous": gone,
         }  # fmt: skip
 
-    def take_out(loop, state, id_, why):
+    def take_out(loop, state, id_, why, tell):
         said.append((id_, why))
         return bare(Search, found=[])
 

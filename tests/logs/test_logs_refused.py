@@ -107,6 +107,20 @@ def test_speeds_above_60(tmp_path):
     refused(lambda: read(tmp_path, frame), "speed_mps", "60 m/s", "speed_kmh", "row ")
 
 
+def test_slopes_that_no_road_has(tmp_path):
+    """Per cent under the name of radians; a few wild values are missing ones, counted."""
+    frame = intervals()
+    frame["grade_rad"] *= 100.0
+    refused(lambda: read(tmp_path, frame), "grade_rad", "0.5 rad (55%)", "grade_pct", "row ")
+    frame = intervals()
+    frame.loc[[7, 8], "grade_rad"] = [0.9, -3.0]
+    frame.loc[9, "grade_rad"] = -0.49
+    log = read(tmp_path, frame)
+    grade = log.segments.channels["grade_rad"]
+    np.testing.assert_allclose(grade[7:10], np.interp([7, 8, 9], [6, 9], frame.grade_rad[[6, 9]]), atol=0.01)
+    assert [(e.kind, e.count) for e in log.ledger if e.column == "grade_rad"] == [("noted", 2), ("filled", 2)]
+
+
 def test_cumulative_distance(tmp_path):
     frame = intervals()
     frame["distance_m"] = frame["distance_m"].cumsum()
