@@ -92,15 +92,17 @@ def _more_channels(frame: Any, rng: np.random.Generator) -> None:
 
 def table(results: list[dict], cores: int) -> list[str]:
     """The page, line by line."""
+    from hdev_jax.inference.clusters import MOST_CLUSTERS
+
     r = results[-1]
     lines = [
         "# Scoring and the length of a log",
         "",
         "Made by `python benchmarks/scaling.py --write`. All logs are synthetic: the demo's truck with a few more",
         "channels, AR(1) noise, a headwind that the sheet does not declare; pieces are made as they are read, and that",
-        "is in the time. Timed is",
-        "one look at all candidates: all readings, noise, the coefficients as whitened rows have them, columns,",
-        "whitening, Gram matrices, every score. The vehicle was calibrated on the first piece.",
+        "is in the time. Timed is one look at all candidates: all readings, noise, the coefficients as whitened rows",
+        "have them, columns, whitening, Gram matrices, every score. The vehicle was calibrated on the first piece.",
+        f"A cluster is a trip; of more than {MOST_CLUSTERS} trips, neighbours share one.",
         "",
         f"Candidates: {r['effects']} effects, in {r['ways']} ways, by {r['columns']} columns (a column is a size at",
         f"one value of its shapes); {cores} cores, float64.",
