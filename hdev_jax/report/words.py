@@ -127,8 +127,9 @@ def percent(x: Any, *, signed: bool = True, decimals: int = 1) -> str:
 def doubt(unexplained: Mapping[str, Any]) -> str:
     """What to say behind a flexible learner's share that training trips do not bear out; nothing where they do."""
     share = unexplained.get("share_of_test_variance")
-    told = unexplained.get("share_borne_out", True) or not _finite(share) or share < WORTH_TELLING
-    return "" if told else ", which training trips do not bear out"
+    if unexplained.get("share_borne_out", True) or share is None or not share >= WORTH_TELLING:
+        return ""
+    return ", which training trips do not bear out"
 
 
 def q_value(q: Any) -> str:
