@@ -230,7 +230,8 @@ def _error(words_: str, without: Result, full: Result) -> str:
 
 
 def _share(r: Result) -> str:
-    return words.percent(100 * r["unexplained"]["share_of_test_variance"], signed=False)
+    u = r["unexplained"]
+    return words.percent(100 * u["share_of_test_variance"], signed=False) + words.doubt(u)
 
 
 def _rest(without: Result, full: Result) -> str:

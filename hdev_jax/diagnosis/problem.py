@@ -27,7 +27,7 @@ _FOLLOWS = {
     "traction_force_n": ("traction_force_n", "motor_torque_nm", "current_a"),
 }
 UNITS = {"energy_wh": "Wh", "battery_power_kw": "kW", "motor_torque_nm": "Nm", "traction_force_n": "N"}
-PLAUSIBLE_KWH_PER_KM = (0.02, 50.0)  # a light car has 0.1; the largest mining trucks, uphill, some 30
+PLAUSIBLE_KWH_PER_KM = (0.002, 50.0)  # a bicycle with a motor has 0.005; the largest mining trucks, uphill, some 30
 LEAST_KM = 1.0  # standing still a vehicle may take any
 
 
@@ -88,23 +88,26 @@ def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured:
     for group in (g for g in GROUPS if segments.has(g)):
         if below := int(np.sum(np.asarray(segments.channels[group]) <= -1)):
             notes.append(f"{group} is below 0 in {below} rows: a coefficient by {group} takes them for 0")
-    if need_measured and (odd := _consumption(log, name)):
+    if need_measured and (odd := _consumption(log, name, measured)):
         notes.append(odd)
     if not segments.has("grade_rad") and built.vehicle.entry == "road":
         notes.append("the log has no slope: the declared model takes the road as flat")
     return Problem(log, sheet, name, segments, measured, built.vehicle, built.table, tuple(notes))
 
 
-def _consumption(log: Log, target: str) -> str | None:
+def _consumption(log: Log, target: str, measured: np.ndarray) -> str | None:
     """A remark on a consumption that no road vehicle has; None where it may be one."""
     if target not in BATTERY_TARGETS:
         return None
-    km, kwh = (float(np.sum(np.abs(x))) / 1e3 for x in (log.segments.distance_m, log.target("energy_wh")))
+    wh = measured if target == "energy_wh" else measured * log.segments.duration_s / 3.6
+    km, kwh = (float(np.sum(np.abs(x))) / 1e3 for x in (log.segments.distance_m, wh))
     least, most = PLAUSIBLE_KWH_PER_KM
     if km < LEAST_KM or least * km <= kwh <= most * km:
         return None
-    column = next(c for c in ("energy_wh", "battery_power_w") if c in log.measured)
+    mine = ("energy_wh", "battery_power_w") if target == "energy_wh" else ("battery_power_w", "energy_wh")
+    column = next(c for c in mine if c in log.measured)
+    source = next((c.source for c in log.columns if c.name == column), column)
     return (
         f"{kwh / km:.3g} kWh/km go in and out of the battery, which no road vehicle has ({least:g} to {most:g}): check "
-        f"the unit of {column}"
+        f"the unit of column {source}"
     )

@@ -251,7 +251,7 @@ def _shadow(
 
 
 def _gone(loop: Loop, state: Search, effect_id: str, why: str, tell: Tell) -> Search:
-    """The state without a stand-in and without what only stood beside it, with the verdict on each."""
+    """The state without a stand-in and without what `prune` finds superfluous now, with the verdict on each."""
     left = prune(loop, without(loop, state, effect_id), tell, newest=True)
     kept, beside_it = {f.id for f in left.found}, f"not told from nothing without {effect_id}, which was taken out"
     gone = [f for f in state.found if f.id not in kept]

@@ -248,9 +248,10 @@ def prune(problem: Loop, state: Search, tell: Callable[[str], None], *, newest: 
         evidence = evidence_of(problem.ground(state.fit, problem.noise(state.fit)))
         worst: tuple[float, Found] | None = None
         for f in asked:
-            if f.score.candidate.kind == "limit":
-                continue  # a switch is either there or not: its size says nothing against zero
-            at = [k for k, c in enumerate(state.table.free) if is_size(c.path, f)]
+            c = f.score.candidate
+            if c.kind == "limit" and not c.parameter(c.sizes[0]).smooth:
+                continue  # a switch is either there or not: its size says nothing against zero, as a lag's does
+            at = [k for k, free in enumerate(state.table.free) if is_size(free.path, f)]
             p = evidence.present(at, state.fit.values[at])
             if p > 0.05 and (worst is None or p > worst[0]):
                 worst = (p, f)

@@ -15,7 +15,7 @@ from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import MEASURED, Log
 from hdev_jax.logs.readers import find_files, read_raw
 from hdev_jax.logs.repair import repair
-from hdev_jax.logs.rows import Rows, check_rows, concatenate
+from hdev_jax.logs.rows import MAX_GRADE_RAD, Rows, check_rows, concatenate
 from hdev_jax.logs.trips import split_trips
 from hdev_jax.segments import Segments
 from hdev_jax.units import accepted
@@ -122,6 +122,12 @@ def _log(
     if "grade_rad" not in channels and "altitude_m" in channels:
         channels["grade_rad"] = grade_from_altitude(trip, distance, channels["altitude_m"])
         ledger = ledger.add("derived", f"from altitude_m over {SLOPE_WINDOW_M:g} m of the way", column="grade_rad")
+        if (steep := np.abs(channels["grade_rad"]) > MAX_GRADE_RAD).any():
+            why = f"steeper than {MAX_GRADE_RAD:g} rad where altitude_m jumps: taken as missing"
+            ledger = ledger.add("noted", why, count=int(steep.sum()), column="grade_rad")
+            gaps = {"grade_rad": np.where(steep, np.nan, channels["grade_rad"])}
+            filled, ledger = repair(gaps, trip, time, ledger)
+            channels = {k: v for k, v in channels.items() if k != "grade_rad"} | filled
     elif "grade_rad" not in channels:
         ledger = ledger.add("noted", "neither slope nor altitude in the log: taken as level", column="grade_rad")
     segments = Segments(

@@ -23,9 +23,11 @@ __all__ = [
 
 MAX_SPEED_MPS = 60.0  # contract §1: above, the column is in km/h or broken
 REVERSE_MPS = 0.5  # contract §1: down to −0.5 m/s a sensor's undershoot, set to 0
-MAX_GRADE_RAD = 0.5  # 55 %: the steepest street, Baldwin Street in Dunedin, has 35 %
+MAX_GRADE_RAD = 0.8  # beyond 45°, which is more than tyres hold; the steepest street has 35 %, test tracks 60 %
+MANY_STEEP = 0.1  # of the slopes driven: no instrument's faults, but another unit
 MAX_POWER_W = 2e7  # no road vehicle draws it: the largest mining trucks have under 4 MW
 BAD_SHARE = 0.01  # contract §1: bad rows in needed columns, at most
+SLOPE_COUNTS_MPS = 1.0  # below, a slope from altitude over distance is noise, and costs little
 _SPEEDS = ("speed_mps", "speed_start_mps", "speed_end_mps")
 
 
@@ -129,18 +131,22 @@ def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
 
 
 def _without_cliffs(rows: Rows) -> Rows:
-    """Slopes that no road has: a few count as missing, more are in another unit."""
+    """Slopes that no road has: where they are few, or the vehicle hardly moves, they count as missing; where they are
+    many, the column is in another unit."""
     grade = rows.data.get("grade_rad")
     if grade is None or not (steep := np.isfinite(grade) & (np.abs(grade) > MAX_GRADE_RAD)).any():
         return rows
-    count, total, i = int(steep.sum()), len(grade), int(np.argmax(steep))
+    speed = next(rows.data[c] for c in _SPEEDS if c in rows.data)
+    driven = np.isfinite(grade) & (speed > SLOPE_COUNTS_MPS)
+    count, total = int((steep & driven).sum()), int(driven.sum())
     what = f"steeper than {MAX_GRADE_RAD:g} rad ({np.tan(MAX_GRADE_RAD):.0%}), which no road is"
-    if count > BAD_SHARE * total:
+    if count > MANY_STEEP * total:
+        i = int(np.argmax(steep & driven))
         raise InputError(
-            f"{rows.where(i)}, column grade_rad: {grade[i]:.4g} rad, and {count} of {total} rows are {what}; if the "
-            f"file has per cent, name the column grade_pct or give its unit in an adapter"
+            f"{rows.where(i)}, slope: {grade[i]:.4g} rad, and {count} of {total} rows driven are {what}; check the "
+            f"unit in the column's name (grade_rad, grade_tan, grade_pct, grade_deg) or in the adapter"
         )
-    ledger = rows.ledger.add("noted", f"{what}: taken as missing", count=count, column="grade_rad")
+    ledger = rows.ledger.add("noted", f"{what}: taken as missing", count=int(steep.sum()), column="grade_rad")
     return replace(rows, data={**rows.data, "grade_rad": np.where(steep, np.nan, grade)}, ledger=ledger)
 
 

@@ -152,6 +152,7 @@ def write_page(template: str, context: dict[str, Any], images: dict[str, bytes],
     )
     env.globals.update(
         number=words.number,
+        doubt=words.doubt,
         percent=words.percent,
         pair=words.pair,
         plus_minus=words.plus_minus,
@@ -193,7 +194,7 @@ def _tiles(data: ReportData) -> list[dict[str, str]]:
         {
             "label": "Noise floor",
             "value": words.number(u.get("noise_floor_rmse"), 2, data.unit),
-            "note": "estimated: what a flexible learner does not predict either",
+            "note": "estimated: what nothing that is borne out predicts",
         },
         {
             "label": "Still predictable",

@@ -41,10 +41,22 @@ def test_a_consumption_that_no_vehicle_has_is_told(target, factor, odd, tmp_path
         frame["energy_wh"] *= factor
 
     log, sheet = read(tmp_path, scaled, trips=2)
-    told = [n for n in prepare(log, sheet, target).notes if "check the unit of energy_wh" in n]
+    told = [n for n in prepare(log, sheet, target).notes if "check the unit of column energy_wh" in n]
     assert len(told) == odd
     short = log.take(np.flatnonzero(np.cumsum(log.segments.distance_m) < 900.0))
     assert not [n for n in prepare(short, sheet, target).notes if "check the unit" in n], "too short to tell"
+
+
+def test_the_target_is_asked_and_not_what_is_measured_beside_it(tmp_path):
+    """Power in kW under the name of W, energy beside it as it should be; and the column is called as the file does."""
+
+    def with_power(frame: pd.DataFrame) -> None:
+        frame["battery_power_kw"] = frame.energy_wh * 3.6 / frame.duration_s / 1000.0
+
+    log, sheet = read(tmp_path, with_power, trips=2)
+    told = {t: [n for n in prepare(log, sheet, t).notes if "check the unit" in n] for t in log.targets[:2]}
+    assert {t: len(n) for t, n in told.items()} == {"energy_wh": 0, "battery_power_kw": 1}
+    assert "battery_power_kw" in told["battery_power_kw"][0]
 
 
 # --- what the target would leak --------------------------------------------------------------------------------------

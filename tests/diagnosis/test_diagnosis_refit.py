@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from hdev_jax.diagnosis import look as looks
 from hdev_jax.diagnosis.candidates import Candidate, columns
@@ -117,3 +118,23 @@ def test_the_newest_effect_is_asked_only_where_told_so(tmp_path):
     turned = replace(both, found=[nothing, heating])
     assert [f.id for f in prune(loop, turned, silent).found] == [heating.id]
     assert [f.id for f in prune(loop, state, silent, newest=True).found] == [heating.id]
+
+
+@pytest.mark.parametrize(("lag_s", "stays"), [(0.0, False), (3.0, True)])
+def test_a_lag_is_asked_as_a_size_is_and_a_switch_is_not(lag_s, stays, tmp_path):
+    effects = {"grade_lag": {"lag_s": lag_s}} if lag_s else {}
+    files = synthetic_log(seed=5, trips=20, rows_per_trip=80, effects=effects, noise_level=0.02).write(tmp_path)
+    problem = prepare(read_log([files["log"]]), read_sheet(files["sheet"]))
+    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
+    loop = looks.Loop(rows, problem.target, clusters, (), 0.05, np.random.default_rng(0), 4)
+    vehicle, table, found = problem.vehicle, problem.table, []
+    for id_, size, value in (("grade_lag", "lag_s", 1.0), ("traction_limit", "power_w", 1e5)):
+        effect = LIBRARY[id_](**{p.name: jnp.asarray(value) for p in LIBRARY[id_].parameters})
+        vehicle, table = vehicle.plus(effect), table.plus(*effect_coefficients(effect, (size,), shapes=False))
+        candidate = Candidate(LIBRARY[id_], (size,), (None,), ((size, value),), "limit", (0,))
+        score = Score(candidate, np.ones(1), 9.0, 1e-6, 1e-6, 9.0, 1.0)
+        found.append(looks.Found(id_, score, 1e-6, 1.0, (), 9.0))
+    fit = calibrate(vehicle, table, rows, problem.target, clusters)
+    state = looks.Search(fit.vehicle, fit.table, fit, found=found)
+    left = prune(loop, state, silent, newest=True)
+    assert [f.id for f in left.found] == ["grade_lag"] * stays + ["traction_limit"]

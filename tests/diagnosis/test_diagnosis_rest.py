@@ -124,7 +124,7 @@ def test_what_takes_more_than_a_cycle_could_is_no_stand_in_for_it(target, unit, 
 @pytest.mark.parametrize(("kept", "gone"), [(["headwind"], ["grade_lag"]), (["headwind", "grade_lag"], []), ([], None)])
 def test_what_only_stood_beside_a_stand_in_goes_with_it(kept, gone, monkeypatch):
     """All that is left is asked once more, the effect found last too, and each that goes is told why."""
-    ids = ["headwind", "traction_limit", "grade_lag"]
+    ids = ["headwind", "auxiliary_power", "grade_lag"]
     gone = ["headwind", "grade_lag"] if gone is None else gone
 
     def state_of(ids) -> Search:
@@ -138,11 +138,11 @@ def test_what_only_stood_beside_a_stand_in_goes_with_it(kept, gone, monkeypatch)
     monkeypatch.setattr(rest, "without", lambda loop, state, k: state_of([f.id for f in state.found if f.id != k]))
     monkeypatch.setattr(rest, "prune", prune)
     monkeypatch.setattr(rest, "replace", lambda state, **new: bare(Search, found=state.found, **new))
-    left = rest._gone(bare(Loop), state_of(ids), "traction_limit", "why", silent)
+    left = rest._gone(bare(Loop), state_of(ids), "auxiliary_power", "why", silent)
     assert [f.id for f in left.found] == kept
-    beside_it = "not told from nothing without traction_limit, which was taken out"
-    why = {"traction_limit": "why", **dict.fromkeys(gone, beside_it)}
-    assert {v.id: v.why_not for v in left.verdicts} == why
+    beside_it = "not told from nothing without auxiliary_power, which was taken out"
+    why = {k: "why" if k == "auxiliary_power" else beside_it for k in ids if k in ("auxiliary_power", *gone)}
+    assert [(v.id, v.why_not) for v in left.verdicts] == list(why.items())
 
 
 @pytest.mark.parametrize(

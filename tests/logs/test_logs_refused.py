@@ -111,14 +111,34 @@ def test_slopes_that_no_road_has(tmp_path):
     """Per cent under the name of radians; a few wild values are missing ones, counted."""
     frame = intervals()
     frame["grade_rad"] *= 100.0
-    refused(lambda: read(tmp_path, frame), "grade_rad", "0.5 rad (55%)", "grade_pct", "row ")
+    refused(lambda: read(tmp_path, frame), "slope", "0.8 rad (103%)", "grade_pct", "row ")
+    few = frame.grade_rad.where(np.arange(len(frame)) % 50 == 0)  # most rows have none: of those that have, many
+    refused(lambda: read(tmp_path, frame.assign(grade_rad=few)), "slope", "of 6 rows")
     frame = intervals()
     frame.loc[[7, 8], "grade_rad"] = [0.9, -3.0]
-    frame.loc[9, "grade_rad"] = -0.49
+    frame.loc[9, "grade_rad"] = -0.54  # a test track's
     log = read(tmp_path, frame)
     grade = log.segments.channels["grade_rad"]
     np.testing.assert_allclose(grade[7:10], np.interp([7, 8, 9], [6, 9], frame.grade_rad[[6, 9]]), atol=0.01)
     assert [(e.kind, e.count) for e in log.ledger if e.column == "grade_rad"] == [("noted", 2), ("filled", 2)]
+
+
+def test_slopes_at_rest_are_noise_and_no_other_unit(tmp_path):
+    frame = samples()
+    frame["grade_rad"] = 0.01
+    frame.loc[20:79, ["speed_mps", "grade_rad"]] = [0.01, 1.3]
+    log = read(tmp_path, frame)
+    np.testing.assert_allclose(log.segments.channels["grade_rad"], 0.01)
+    assert log.ledger.count("noted", "grade_rad") == 60
+
+
+def test_an_altitude_that_jumps_is_no_cliff(tmp_path):
+    frame = samples()
+    frame["altitude_m"] = 400.0 + 0.01 * np.cumsum(frame.speed_mps)
+    frame.loc[150:, "altitude_m"] += 1000.0
+    log = read(tmp_path, frame)
+    assert np.abs(log.segments.channels["grade_rad"]).max() < 0.8
+    assert any("altitude_m jumps" in e.reason and e.count for e in log.ledger)
 
 
 def test_cumulative_distance(tmp_path):
