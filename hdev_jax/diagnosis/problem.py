@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.facts import GROUPS
-from hdev_jax.diagnosis.metrics import sum_weight
+from hdev_jax.diagnosis.metrics import PER_KWH, sum_weight
 from hdev_jax.inference import Fit, ParameterTable, padded, predict
 from hdev_jax.inference.sheet import BATTERY_TARGETS, Sheet, choose_entry, traction_force_from_torque
 from hdev_jax.logs import Log
@@ -99,8 +99,9 @@ def _consumption(log: Log, target: str, measured: np.ndarray) -> str | None:
     """A remark on a consumption that no road vehicle has; None where it may be one."""
     if target not in BATTERY_TARGETS:
         return None
-    wh = measured if target == "energy_wh" else measured * log.segments.duration_s / 3.6
-    km, kwh = (float(np.sum(np.abs(x))) / 1e3 for x in (log.segments.distance_m, wh))
+    meters, seconds = np.asarray(log.segments.distance_m), np.asarray(log.segments.duration_s)
+    km, weight = float(np.sum(meters)) / 1e3, sum_weight(target, seconds, meters)
+    kwh = float(np.sum(np.abs(measured) * weight)) / PER_KWH[target]
     least, most = PLAUSIBLE_KWH_PER_KM
     if km < LEAST_KM or least * km <= kwh <= most * km:
         return None

@@ -7,6 +7,7 @@ from typing import Any
 
 from hdev_jax.diagnosis.significance import least_clusters
 from hdev_jax.diagnosis.split import LAST_THIRD
+from hdev_jax.diagnosis.unexplained import LEAST_SHARE
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
 
@@ -31,7 +32,6 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _DASH = "–"
 MOST_SUSPECTS = 3
-WORTH_TELLING = 0.02  # of the remaining variance, from which on a learner's share is worth a word
 LEANING = 1.5  # one side of an interval over the other
 
 
@@ -127,7 +127,7 @@ def percent(x: Any, *, signed: bool = True, decimals: int = 1) -> str:
 def doubt(unexplained: Mapping[str, Any]) -> str:
     """What to say behind a flexible learner's share that training trips do not bear out; nothing where they do."""
     share = unexplained.get("share_of_test_variance")
-    if unexplained.get("share_borne_out", True) or share is None or not share >= WORTH_TELLING:
+    if unexplained.get("share_borne_out", True) or share is None or not share >= LEAST_SHARE:
         return ""
     return ", which training trips do not bear out"
 
