@@ -59,7 +59,7 @@ LEGEND = {  # of each table that is there; the first of every page
         "most three that holds it); with nothing planted, that name nothing; of a cause outside the library, that name "
         "nothing false; of what a coefficient absorbs, that say so; of what only trips tell, that more trips would. "
         "Its interval is Wilson's. Met: what was asked is at least what is wanted, and so are, where wanted, the share "
-        "without a class (of logs that are separable) and the share called unexplained. Met by interval: the lower "
+        "without a class (of all logs) and the share called unexplained. Met by interval: the lower "
         "ends of their intervals are, too",
         "Something false: logs that name an effect which was not planted. Called unexplained: logs in which structure "
         "is left, which levels of trips are too, though they are noise there",
@@ -71,7 +71,7 @@ LEGEND = {  # of each table that is there; the first of every page
     ),
     "planted_names": (
         "Named first: classes set aside, what each entry is called. No class: each entry is one name. Separable: logs "
-        "in which no other effect of the library fits as well, by the truth itself; no class is asked of these. "
+        "in which no other effect of the library fits as well, by the truth itself; in others a class is the answer. "
         "Redrawn: logs drawn anew since the effect acted in one training trip only",
     ),
     "planted_rivals": (
@@ -227,7 +227,7 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     unexplained = sum(r["unexplained"] for _, r in group)
     wanted = [
         (least, hits, count)
-        for least, hits, count in ((case.wanted, as_asked, n), (case.wanted_alone, sum(alone_apart), len(apart)),
+        for least, hits, count in ((case.wanted, as_asked, n), (case.wanted_alone, alone, n),
                                    (case.wanted_unexplained, unexplained, n))
         if least is not None
     ]  # fmt: skip

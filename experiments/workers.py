@@ -24,7 +24,8 @@ from hdev_jax import progress
 
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
-FORGET_EVERY = 40  # tasks: a process that compiles for ever runs out of memory maps
+MOST_MAPS = 30_000  # memory maps of a process: Linux gives it 65,530, and each compiled program takes some
+FORGET_EVERY = 40  # tasks, where nobody says how many maps there are
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PATIENCE = 30  # seconds for a scheduler to answer
 
@@ -46,8 +47,8 @@ def call(job: Job) -> tuple[list[Any], float]:
 
     # only where JAX is in use: an experiment may do without
     def run(task: dict[str, Any]) -> Any:
-        if next(_calls) % FORGET_EVERY == 0 and (jax := sys.modules.get("jax")) is not None:
-            jax.clear_caches()
+        if _crowded(next(_calls)) and (jax := sys.modules.get("jax")) is not None:
+            jax.clear_caches()  # a process that compiles for ever runs out of memory maps
         return module.run(task)
 
     started = time.perf_counter()
@@ -56,6 +57,15 @@ def call(job: Job) -> tuple[list[Any], float]:
     if len(results) != len(tasks):
         raise ValueError(f"{job[0]}.run_together gave {len(results)} results for {len(tasks)} tasks")
     return results, time.perf_counter() - started
+
+
+def _crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:
+    """Whether it is time to forget what was compiled."""
+    try:
+        with maps.open("rb") as lines:
+            return sum(1 for _ in lines) > MOST_MAPS
+    except OSError:
+        return calls % FORGET_EVERY == 0
 
 
 def in_turn(jobs: Sequence[Job]) -> Iterator[tuple[int, Outcome]]:
@@ -110,7 +120,7 @@ def _outcome(future: Any) -> Outcome:
 
 
 def _prepare_worker(compiled: str, threads: int) -> None:
-    """Double precision, a share of the cores, and a cache of compiled programs that outlives `FORGET_EVERY`.
+    """Double precision, a share of the cores, and a cache of compiled programs that outlives `jax.clear_caches`.
 
     A cache for each worker: JAX does not write an entry in one step.
     """

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from toy_studies import squares
 
-from experiments import store
+from experiments import store, workers
 from experiments.__main__ import main
 from experiments.compare import check, comparison
 from experiments.engine import run_config
@@ -55,6 +55,17 @@ def test_a_runs_folder_holds_everything_and_is_not_made_again(tmp_path, config):
     assert again["rows"] == first["rows"], "what a run resolved is a config"
     with pytest.raises(InputError, match="another configuration"):
         run_config(config, ["by=2.0"], out=out)
+
+
+def test_a_process_forgets_what_it_compiled_before_its_memory_maps_run_out(tmp_path, monkeypatch):
+    few, many = tmp_path / "few", tmp_path / "many"
+    few.write_text("map\n" * 10)
+    many.write_text("map\n" * 11)
+    monkeypatch.setattr(workers, "MOST_MAPS", 10)
+    assert [workers._crowded(calls, few) for calls in (1, workers.FORGET_EVERY)] == [False, False]
+    assert workers._crowded(1, many)
+    nowhere = tmp_path / "no" / "maps"
+    assert [workers._crowded(calls, nowhere) for calls in (1, workers.FORGET_EVERY)] == [False, True]
 
 
 def test_what_was_killed_resumes(tmp_path, config, monkeypatch):

@@ -84,6 +84,18 @@ class Evidence(NormalEquations):
         spread = self._jackknife(at, v)[:, self.base :] - beta
         return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
 
+    def bearing(self, candidate: Candidate) -> Float[np.ndarray, " k"]:
+        """How many clusters as telling as each other a candidate's coefficients rest on (Carter, Schnepel and
+        Steigerwald, Review of Economics and Statistics 99, 2017): what two trips show is known by two, however many
+        others there are."""
+        at = self.base + np.asarray(candidate.columns)
+        v = int(np.argmax(self._fit(self.totals(), at)[0]))
+        index = self._with_base(at)
+        own = np.eye(len(index))[:, self.base :]
+        weights = np.stack([solved(self._normal(self.totals()[v], at)[0], e) for e in own.T])
+        told = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
+        return np.sum(told, axis=1) ** 2 / np.maximum(np.sum(told**2, axis=1), 1e-300)
+
     def traded(self, own: Sequence[int], other: int) -> Float[np.ndarray, " k"]:
         """What a unit of another column adds to the coefficients of a candidate's own."""
         at, totals = self.base + np.asarray(own, dtype=int), self.totals()

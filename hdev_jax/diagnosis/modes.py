@@ -4,6 +4,7 @@ Trips are sorted by the size that each asks for alone, and split in two where th
 two values are enough: levels that differ from trip to trip at random are not two, and stay levels.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,12 +19,13 @@ from hdev_jax.diagnosis.refit import joined
 from hdev_jax.diagnosis.significance import wald
 from hdev_jax.diagnosis.sums import evidence_of
 from hdev_jax.inference import Clusters
-from hdev_jax.physics.battery import ModeChange
+from hdev_jax.physics.battery import ModeChange, StepChange
 from hdev_jax.segments import trip_slices
 
 __all__ = ["add_mode"]
 
 ID = ModeChange.id
+LASTING = {name for sizes in StepChange.variants for name in sizes}  # coefficients whose change may stay
 LEAST_TRIPS = 8  # with fewer, any trips fall into two groups
 LEAST_SIDE = 2  # trips of either mode
 ENOUGH = 0.01  # p from which on two values leave trips that differ still
@@ -57,13 +59,14 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     places = [np.r_[base, evidence.base + c.columns[0], last] for c in plan.candidates]
     every = np.stack([evidence.grams[:, at[:, None], at[None, :]] for at in places])
     prior, level = (np.diag(evidence.precision), evidence.pull), problem.fdr / len(problem.effects)
+    lasting = [set(c.sizes) <= LASTING for c in plan.candidates]
     best = _best(every, *prior)
     if best is None:
         return None, Verdict(ID, None, 1.0, "no trip tells of it")
     k, (gain, z, size, *_) = best
     c, p = plan.candidates[k], _p(gain, len(slices), len(every))
     q = min(1.0, p * len(problem.effects))
-    if (why := _against(best[1], len(every), level)) is not None:
+    if (why := _against(best[1], lasting[k], len(every), level)) is not None:
         return None, Verdict(ID, gain, q, why)
     left_out, p_cluster = _left_out(every[k], *prior, z)
     if left_out <= LEFT_OUT or p_cluster > problem.fdr:
@@ -79,7 +82,7 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     if new is None or before - float(np.mean((problem.measured - new.fit.predicted) ** 2)) < LEAST_SHARE * before:
         return None, Verdict(ID, gain, q, "in the joint refit it is out of range or not told from nothing")
     # told, not asked for: two trips of eight are both in a resampled set in four of ten
-    stability = _stability(every, *prior, level, problem.rng.spawn(1)[0])
+    stability = _stability(every, lasting, *prior, level, problem.rng.spawn(1)[0])
     found = Found(ID, score, q, stability, (), gain)
     return replace(new, found=[*state.found, found]), None
 
@@ -103,14 +106,18 @@ def _best(every: Every, precision: np.ndarray, pull: np.ndarray) -> tuple[int, S
     return max(splits, key=lambda s: s[1][0], default=None)
 
 
-def _against(split: Split, coefficients: int, level: float) -> str | None:
-    """Why a split is no mode, its p to be no larger than `level`; or None."""
+def _against(split: Split, lasting: bool, coefficients: int, level: float) -> str | None:
+    """Why a split is no mode, its p to be no larger than `level`; or None.
+
+    `lasting`: whether the coefficient may also change for good, which an effect of its own says, as long as there is
+    one: of what the library knows no lasting change of, trips that happen to follow each other are a mode all the same.
+    """
     gain, z, _, left, over_levels = split
     if (p := _p(gain, len(z), coefficients)) > level:
         return f"trips do not fall into two groups (p = {p:.2g})"
     if stats.chi2.sf(2.0 * left, len(z) - 2) < ENOUGH or over_levels < BEATS:
         return "trips differ, but two values are not enough for them"
-    return "a change that stays from one trip on says as much" if _ordered(z) else None
+    return "a change that stays from one trip on says as much" if lasting and _ordered(z) else None
 
 
 def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray) -> Split | None:
@@ -190,14 +197,17 @@ def _left_out(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarr
     return gain, float(wald(fitted(np.ones(n))[1][-1:], np.array(sizes)))
 
 
-def _stability(every: Every, precision: np.ndarray, pull: np.ndarray, level: float, rng: np.random.Generator) -> float:
+def _stability(
+    every: Every, lasting: Sequence[bool], precision: np.ndarray, pull: np.ndarray, level: float,
+    rng: np.random.Generator,
+) -> float:  # fmt: skip
     """Share of resampled sets of trips that fall into two modes again, whichever trips they are then."""
     n = every.shape[1]
     draws, hits = int(np.clip(MOST_SPLITS // n, 10, RESAMPLES)), 0
     for _ in range(draws):
         drawn = np.sort(rng.integers(0, n, n))
         best = _best(every[:, drawn], precision, pull)
-        if best is not None and _against(best[1], len(every), level) is None:
+        if best is not None and _against(best[1], lasting[best[0]], len(every), level) is None:
             in_mode = best[1][1] > 0
             hits += min(len(np.unique(drawn[in_mode])), len(np.unique(drawn[~in_mode]))) >= LEAST_SIDE
     return hits / draws

@@ -40,7 +40,8 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
         return None
     borne_out = bool(np.any(np.abs(plain) > BORNE_OUT * plain_sd))
     grouped = any(g is not None for g in c.groups)
-    apart = float(stats.t.ppf(AGREES, max(view.evidence.count - 1, 1)))
+    # clusters that show nothing of a size say nothing of its error either
+    apart = stats.t.ppf(AGREES, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
     lends = c.kind == "size" and not (s.plain or grouped) and bool(np.all(np.abs(plain - white) <= apart * plain_sd))
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move

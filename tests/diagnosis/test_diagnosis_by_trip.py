@@ -11,7 +11,7 @@ from planted import run
 from scipy import stats
 
 from hdev_jax.diagnosis.cycles import COST, _fitted, _profile, _Rows
-from hdev_jax.diagnosis.modes import BEATS, _left_out, _p, _split, _stability
+from hdev_jax.diagnosis.modes import BEATS, _against, _left_out, _p, _split, _stability
 from hdev_jax.diagnosis.ranking import LEFT_OUT
 from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.physics.loads import PeriodicLoad
@@ -89,6 +89,9 @@ def test_the_trips_of_a_mode_are_told():
     assert np.all(found[known] == true[: len(found)][known])
 
 
+NOTHING = np.zeros((1, 1)), np.zeros(1)
+
+
 def _grams(rng, sizes, rows=400):
     """Normal equations by trip of [common column | mode's column | residual], white noise of variance 1."""
     out = []
@@ -109,6 +112,25 @@ def test_trips_are_split_where_their_sizes_differ():
     assert size == pytest.approx(0.5, abs=0.1)
     assert gain > 50 > 20 > left
     assert over_levels > BEATS
+
+
+def test_trips_that_follow_each_other_are_a_mode_where_nothing_else_says_it():
+    """From one trip on: a change that stays, of what may change for good; of what may not, a mode like any other."""
+    rng = np.random.default_rng(0)
+    last, mixed = np.r_[np.zeros(7), 1.0, 1.0, 1.0], np.array([0, 1, 0, 0, 1, 0, 0, 1, 0, 0.0])
+    for truth, lasting, why in ((last, True, "stays"), (last, False, None), (mixed, True, None), (mixed, False, None)):
+        split = _split(_grams(rng, 0.5 * truth), *NOTHING)
+        assert split is not None
+        said = _against(split, lasting, 3, 0.01)
+        assert said is None if why is None else why in str(said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2474, 2478])
+def test_weak_regeneration_of_the_last_trips_is_a_mode(seed):
+    """No lasting change of the library's is one of regeneration; beside it, what stood in for it goes."""
+    summary = run(seed, effects={"mode_change": {}}, ratio=0.5, trips=12, ar_coefficient=0.97)[1].summary
+    assert [e["id"] for e in summary["effects"]] == ["mode_change"]
 
 
 @pytest.mark.parametrize("trips", [8, 16, 40])
@@ -171,9 +193,6 @@ def test_the_gain_of_a_cycle_on_a_trip_left_out_is_that_of_the_others_size():
     assert one.left_out_gain() == pytest.approx(total)
 
 
-NOTHING = np.zeros((1, 1)), np.zeros(1)
-
-
 def test_trips_left_out_bear_a_mode_out():
     rng = np.random.default_rng(0)
     truth = np.array([0, 1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1.0])
@@ -183,7 +202,7 @@ def test_trips_left_out_bear_a_mode_out():
     gain, p_cluster = _left_out(grams, *NOTHING, truth)
     assert 20.0 < gain < split[0]
     assert p_cluster < 1e-4
-    assert 0.8 < _stability(grams[None], *NOTHING, 0.05, np.random.default_rng(0)) <= 1.0
+    assert 0.8 < _stability(grams[None], [True], *NOTHING, 0.05, np.random.default_rng(0)) <= 1.0
 
 
 def test_noise_has_a_split_that_gains_and_none_that_holds():
@@ -196,7 +215,7 @@ def test_noise_has_a_split_that_gains_and_none_that_holds():
         assert split is not None
         inside.append(split[0])
         outside.append(_left_out(grams, *NOTHING, split[1])[0])
-        again.append(_stability(grams[None], *NOTHING, 0.05 / 30, np.random.default_rng(0)))
+        again.append(_stability(grams[None], [True], *NOTHING, 0.05 / 30, np.random.default_rng(0)))
     assert np.median(inside) > LEFT_OUT > max(outside)
     assert np.mean(again) < 0.1
 
@@ -204,4 +223,4 @@ def test_noise_has_a_split_that_gains_and_none_that_holds():
 def test_one_odd_trip_is_no_mode_of_resampled_trips():
     """Drawn twice it is still one trip: a mode has two of them at least."""
     grams = _grams(np.random.default_rng(3), np.r_[2.0, np.zeros(11)])
-    assert _stability(grams[None], *NOTHING, 0.05, np.random.default_rng(0)) < 0.1
+    assert _stability(grams[None], [True], *NOTHING, 0.05, np.random.default_rng(0)) < 0.1

@@ -308,3 +308,25 @@ def test_wald_holds_its_level(k):
 
 def test_wald_of_few_clusters_says_nothing():
     assert wald(np.ones(2), np.ones((3, 2))) == 1.0
+
+
+@pytest.mark.parametrize("bearing", [1, 2, 5, 9])
+def test_a_size_rests_on_the_clusters_that_show_it(bearing):
+    rows = Rows(rows=400, level=0.0)
+    rows.columns[rows.ids >= bearing, 0] = 0.0
+    evidence = rows.evidence()
+    assert evidence.bearing(candidate(0)) == pytest.approx([bearing], rel=0.03)
+    assert np.all(evidence.bearing(candidate(0, 2)) == pytest.approx([bearing, 9.0], rel=0.05))
+
+
+def test_clusters_that_a_size_rests_on_are_those_of_its_variance():
+    """Each cluster's share of the variance of least squares, from the rows themselves."""
+    rows = Rows(level=0.0)
+    rows.columns *= rows.ids[:, None] + 1.0
+    x = np.c_[rows.jacobian, rows.columns[:, [0, 2]]]
+    normal = x.T @ x + np.diag([*(1 / PRIOR_SD**2), 0.0, 0.0])
+    weights = np.linalg.inv(normal)[BASE:] @ x.T
+    share = np.stack([np.sum(weights[:, rows.ids == g] ** 2, axis=1) for g in range(rows.clusters.count)])
+    expected = np.sum(share, axis=0) ** 2 / np.sum(share**2, axis=0)
+    np.testing.assert_allclose(rows.evidence().bearing(candidate(0, 2)), expected, rtol=1e-8)
+    assert np.all(expected < 0.8 * rows.clusters.count)

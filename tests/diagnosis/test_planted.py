@@ -126,3 +126,12 @@ def test_a_weak_cause_outside_the_library_is_called_unexplained_by_its_channel(s
     left = result.summary["unexplained"]
     assert left["significant"]
     assert "humidity_pct" in left["depends_on"], left["signature"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "effect"), [(2326, "wet_road"), (2218, "hvac_power")])
+def test_what_two_trips_show_is_not_turned_down_for_what_the_others_do_not(seed, effect):
+    """Rain in two trips of eight, heat in one beside cold in four: six or seven trips that show nothing of a size make
+    it look far surer than rows of equal weight know it."""
+    _, result = run(seed, effects={effect: {}}, ratio=0.5, trips=12, ar_coefficient=0.97)
+    assert [e["id"] for e in result.summary["effects"]] == [effect]

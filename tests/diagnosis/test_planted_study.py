@@ -175,11 +175,13 @@ def test_classes_are_not_what_was_asked_without_them(tmp_path):
     assert (row["named_exactly"], row["named_first"], row["named_exactly_no_class"]) == (1.0, 1.0, 0.7)
     assert (row["wanted"], row["no_class_wanted"], row["met"]) == (0.88, 0.85, False)
     assert (row["separable"], row["no_class_of_separable"]) == (1.0, 0.7)
-    # where nobody could tell them apart, the class is the answer
+    # where nobody could tell them apart the class is the answer, and all the same no name without one
     alike = [(t, {**r, "alike": {"headwind": ["crosswind"] if k < 3 else []}}) for k, (t, r) in enumerate(logs)]
     row = told(tmp_path / "a", alike)["one effect, size 0.5, 12 trips, ar1"]
     assert (row["named_exactly_no_class"], row["separable"], row["no_class_of_separable"]) == (0.7, 0.7, 1.0)
-    assert row["met"] is True
+    assert row["met"] is False
+    nine = [(t, result(["headwind", "crosswind"] if k < 1 else ["headwind"])) for k, t in enumerate(ten)]
+    assert told(tmp_path / "c", nine)["one effect, size 0.5, 12 trips, ar1"]["met"] is True
     big = [(t, {**r, "named": [{**r["named"][0], "class_size": 8}]}) for t, r in logs]
     row = told(tmp_path / "b", big)["one effect, size 0.5, 12 trips, ar1"]
     assert (row["named_exactly"], row["mean_class"]) == (0.0, 8.0)
