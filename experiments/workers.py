@@ -24,7 +24,7 @@ from hdev_jax import progress
 
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
-MOST_MAPS = 30_000  # memory maps of a process: Linux gives it 65,530, and each compiled program takes some
+MOST_MAPS = 15_000  # memory maps of a process: Linux gives it 65,530; so many are some 2 GB of compiled programs
 FORGET_EVERY = 40  # tasks, where nobody says how many maps there are
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PATIENCE = 30  # seconds for a scheduler to answer

@@ -85,16 +85,18 @@ class Evidence(NormalEquations):
         return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
 
     def bearing(self, candidate: Candidate) -> Float[np.ndarray, " k"]:
-        """How many clusters as telling as each other a candidate's coefficients rest on (Carter, Schnepel and
-        Steigerwald, Review of Economics and Statistics 99, 2017): what two trips show is known by two, however many
-        others there are."""
-        at = self.base + np.asarray(candidate.columns)
-        v = int(np.argmax(self._fit(self.totals(), at)[0]))
+        """How many clusters each of a candidate's coefficients rests on: (Σγ)²/Σγ², γ each cluster's share of its
+        variance w'X'Xw (Carter, Schnepel and Steigerwald, Review of Economics and Statistics 99, 2017; rows of a
+        cluster taken as independent). What two trips show is known by two, however many others there are.
+        """
+        at, totals = self.base + np.asarray(candidate.columns), self.totals()
+        v = int(np.argmax(self._fit(totals, at)[0]))
         index = self._with_base(at)
-        own = np.eye(len(index))[:, self.base :]
-        weights = np.stack([solved(self._normal(self.totals()[v], at)[0], e) for e in own.T])
+        normal = self._normal(totals[v], at)[0]
+        weights = np.stack([solved(normal, e) for e in np.eye(len(index))[self.base :]])
         told = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
-        return np.sum(told, axis=1) ** 2 / np.maximum(np.sum(told**2, axis=1), 1e-300)
+        share = told / np.maximum(np.sum(told, axis=1, keepdims=True), 1e-300)
+        return 1.0 / np.maximum(np.sum(share**2, axis=1), 1e-300)
 
     def traded(self, own: Sequence[int], other: int) -> Float[np.ndarray, " k"]:
         """What a unit of another column adds to the coefficients of a candidate's own."""

@@ -1,7 +1,9 @@
 """A coefficient with a second value in some trips: which trips is sought by how each of them differs from the rest.
 
 Trips are sorted by the size that each asks for alone, and split in two where that explains most. It is a mode where
-two values are enough: levels that differ from trip to trip at random are not two, and stay levels.
+two values are enough: levels that differ from trip to trip at random are not two, and stay levels. And it is a
+mode of that coefficient where its second value says more than the whole power times a number in the same trips: a gain
+of the power's sensor or another mass, in those trips, makes every coefficient look as if it had a second value.
 """
 
 from collections.abc import Sequence
@@ -12,25 +14,26 @@ from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate, plan_of
+from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.look import Found, Loop, Search, Verdict, barred
 from hdev_jax.diagnosis.ranking import LEFT_OUT
 from hdev_jax.diagnosis.refit import joined
 from hdev_jax.diagnosis.significance import wald
 from hdev_jax.diagnosis.sums import evidence_of
-from hdev_jax.inference import Clusters
+from hdev_jax.inference import Clusters, predict
 from hdev_jax.physics.battery import ModeChange, StepChange
 from hdev_jax.segments import trip_slices
 
 __all__ = ["add_mode"]
 
 ID = ModeChange.id
-LASTING = {name for sizes in StepChange.variants for name in sizes}  # coefficients whose change may stay
+LASTING = {name for sizes in StepChange.variants for name in sizes}  # what a change for good is sought of
 LEAST_TRIPS = 8  # with fewer, any trips fall into two groups
 LEAST_SIDE = 2  # trips of either mode
 ENOUGH = 0.01  # p from which on two values leave trips that differ still
 RANDOM = (0.0, 0.03, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)  # variances of random levels, over the sizes' own
-BEATS = 3.0  # in log-likelihood, that two values are better than levels that differ at random
+BEATS = 3.0  # in log-likelihood, that two values are better than levels at random, or than the power as a whole
 LEAST_SHARE = 0.02  # of the residual's variance
 RESAMPLES, MOST_SPLITS = 100, 4000  # resampled sets of trips; fewer of them where many trips have many splits each
 
@@ -54,10 +57,17 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     )
     on = {"in_mode": (1.0,), "share": (0.5,)}
     plan = plan_of(state.fit.vehicle, [ModeChange], problem.facts, problem.target, on, searched=True)
-    evidence = evidence_of(ground, plan.width, lambda out, chunk: plan.write(out, chunk.segments))
+
+    def write(out: np.ndarray, chunk: Chunk) -> None:
+        plan.write(out[:, :-1], chunk.segments)
+        out[:, -1] = np.nan_to_num(np.asarray(predict(state.fit.vehicle, chunk.segments, problem.target)))
+
+    evidence = evidence_of(ground, plan.width + 1, write)
     base, last = np.arange(evidence.base), evidence.grams.shape[-1] - 1
-    places = [np.r_[base, evidence.base + c.columns[0], last] for c in plan.candidates]
-    every = np.stack([evidence.grams[:, at[:, None], at[None, :]] for at in places])
+    columns = [*(c.columns[0] for c in plan.candidates), plan.width]
+    places = [np.r_[base, evidence.base + k, last] for k in columns]
+    *each, power = (evidence.grams[:, at[:, None], at[None, :]] for at in places)
+    every = np.stack(each)
     prior, level = (np.diag(evidence.precision), evidence.pull), problem.fdr / len(problem.effects)
     lasting = [set(c.sizes) <= LASTING for c in plan.candidates]
     best = _best(every, *prior)
@@ -68,6 +78,10 @@ def add_mode(problem: Loop, state: Search) -> tuple[Search | None, Verdict | Non
     q = min(1.0, p * len(problem.effects))
     if (why := _against(best[1], lasting[k], len(every), level)) is not None:
         return None, Verdict(ID, gain, q, why)
+    if _gain(power, *prior, z) > gain - BEATS:
+        return None, Verdict(
+            ID, gain, q, "in those trips the power as a whole says as much, not this coefficient alone"
+        )
     left_out, p_cluster = _left_out(every[k], *prior, z)
     if left_out <= LEFT_OUT or p_cluster > problem.fdr:
         return None, Verdict(ID, gain, q, "does not lower the error on trips left out of the fit")
@@ -94,6 +108,21 @@ def _solved(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     return 0.5 * float(b @ x), x
 
 
+def _with_mode(
+    a: np.ndarray, b: np.ndarray, cross: np.ndarray, square: float, told: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the common coefficients and one more column."""
+    return np.block([[a, cross[:, None]], [cross[None], np.array([[square]])]]), np.r_[b, told]
+
+
+def _gain(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarray) -> float:
+    """Gain in log-likelihood of the column in the trips `z`, beside the common coefficients."""
+    base, total = len(pull), grams.sum(axis=0)
+    a, b = total[:base, :base] + precision, total[:base, base + 1] - pull
+    mode = z @ grams[:, :base, base], float(z @ grams[:, base, base]), float(z @ grams[:, base, base + 1])
+    return _solved(*_with_mode(a, b, *mode))[0] - _solved(a, b)[0]
+
+
 def _p(gain: float, trips: int, coefficients: int) -> float:
     """p of a split: every way to split the trips in two counts, and every coefficient that may have a second value."""
     ways = (trips - 1) * np.log(2.0) + np.log(coefficients)
@@ -109,8 +138,8 @@ def _best(every: Every, precision: np.ndarray, pull: np.ndarray) -> tuple[int, S
 def _against(split: Split, lasting: bool, coefficients: int, level: float) -> str | None:
     """Why a split is no mode, its p to be no larger than `level`; or None.
 
-    `lasting`: whether the coefficient may also change for good, which an effect of its own says, as long as there is
-    one: of what the library knows no lasting change of, trips that happen to follow each other are a mode all the same.
+    `lasting`: whether a change of the coefficient for good is an effect of its own. One of its trips that follow each
+    other is left to that; of what has no such effect they are a mode like any other.
     """
     gain, z, _, left, over_levels = split
     if (p := _p(gain, len(z), coefficients)) > level:
@@ -138,8 +167,7 @@ def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray) -> Split | Non
     for k in range(LEAST_SIDE, n - LEAST_SIDE + 1):
         z = np.zeros(n)
         z[order[k:] if n - k <= k else order[:k]] = 1.0  # the rarer mode is the second
-        column = z @ cross
-        gain, y = _solved(np.block([[a, column[:, None]], [column[None], z @ square]]), np.r_[b, z @ told])
+        gain, y = _solved(*_with_mode(a, b, z @ cross, z @ square, z @ told))
         if best is None or gain > best[0]:
             best = gain, z, float(y[-1])
     assert best is not None
@@ -178,9 +206,7 @@ def _left_out(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarr
     def fitted(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         a, b = np.tensordot(times, inner, axes=1) + precision, times @ right - pull
         on = times * z
-        column = on @ cross
-        both = np.block([[a, column[:, None]], [column[None], on @ square]])
-        return _solved(a, b)[1], _solved(both, np.r_[b, on @ told])[1]
+        return _solved(a, b)[1], _solved(*_with_mode(a, b, on @ cross, on @ square, on @ told))[1]
 
     def likelihood(t: int, x: np.ndarray, size: float) -> float:
         quadratic = x @ inner[t] @ x + 2.0 * size * float(x @ cross[t]) + size**2 * square[t]

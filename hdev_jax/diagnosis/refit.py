@@ -38,11 +38,15 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     white, white_sd = view.evidence.estimate(c)
     if s.plain and _contradicted(plain, white, white_sd):
         return None
-    borne_out = bool(np.any(np.abs(plain) > BORNE_OUT * plain_sd))
+    clear = np.abs(plain) > BORNE_OUT * plain_sd
+    borne_out = bool(np.any(clear))
     grouped = any(g is not None for g in c.groups)
-    # clusters that show nothing of a size say nothing of its error either
-    apart = stats.t.ppf(AGREES, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
-    lends = c.kind == "size" and not (s.plain or grouped) and bool(np.all(np.abs(plain - white) <= apart * plain_sd))
+    lends = c.kind == "size" and not (s.plain or grouped)
+    if lends:
+        # clusters that show nothing of a size say nothing of its error either; of its sign those that do may
+        apart = stats.t.ppf(AGREES, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
+        turned = clear & (np.sign(plain) != np.sign(white))
+        lends = bool(np.all((np.abs(plain - white) <= apart * plain_sd) & ~turned))
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"

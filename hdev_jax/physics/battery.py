@@ -171,7 +171,7 @@ class StepChange(Effect):
         Parameter("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
         Parameter("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
         Parameter("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
-        Parameter("at_trip", "1", 0.0, 1.0, kind="choice", grid=()),  # every trip with two before and two after
+        Parameter("at_trip", "1", 0.0, 1.0, kind="choice", grid=()),  # every trip with three on either side
     )
     variants: ClassVar = (("power_w",), ("c_rr",), ("loss",))
     mistaken_for: ClassVar = ("rolling_temperature", "mass_scale")
