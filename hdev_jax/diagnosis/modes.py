@@ -167,7 +167,7 @@ def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray) -> Split | Non
     for k in range(LEAST_SIDE, n - LEAST_SIDE + 1):
         z = np.zeros(n)
         z[order[k:] if n - k <= k else order[:k]] = 1.0  # the rarer mode is the second
-        gain, y = _solved(*_with_mode(a, b, z @ cross, z @ square, z @ told))
+        gain, y = _solved(*_with_mode(a, b, z @ cross, z @ square, z @ told))  # pyright: ignore[reportArgumentType]
         if best is None or gain > best[0]:
             best = gain, z, float(y[-1])
     assert best is not None
@@ -206,7 +206,7 @@ def _left_out(grams: Grams, precision: np.ndarray, pull: np.ndarray, z: np.ndarr
     def fitted(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         a, b = np.tensordot(times, inner, axes=1) + precision, times @ right - pull
         on = times * z
-        return _solved(a, b)[1], _solved(*_with_mode(a, b, on @ cross, on @ square, on @ told))[1]
+        return _solved(a, b)[1], _solved(*_with_mode(a, b, on @ cross, on @ square, on @ told))[1]  # pyright: ignore[reportArgumentType]
 
     def likelihood(t: int, x: np.ndarray, size: float) -> float:
         quadratic = x @ inner[t] @ x + 2.0 * size * float(x @ cross[t]) + size**2 * square[t]
