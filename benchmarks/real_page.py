@@ -151,7 +151,8 @@ def _agreement(runs: Runs, caution: str) -> list[str]:
     apart = sorted((row for row in rows if row.furthest() > AGREE), key=lambda row: -row.furthest())
     bound = [row for row in size_rows(runs) if row.at_bound]
     text = f"Of {len(rows)} sizes found more than once{', none at a bound,' if bound else ','} "
-    text += f"{len(rows) - len(apart)} agree within {AGREE:.0f} sd."
+    close = len(rows) - len(apart)
+    text += f"{close} {'agrees' if close == 1 else 'agree'} within {AGREE:.0f} sd."
     if apart:
         said = names.verbose_join([f"{' or '.join(f'`{p}`' for p in r.paths)} ({r.furthest():.1f} sd)" for r in apart])
         text += f" Further apart: {said}."
