@@ -50,7 +50,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
     """
     done = _compared(done, rivals)
     single = [(t, r) for t, r in done if len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
-    if not single:
+    if len({t["size"] for t, _ in single}) < 2:  # one size is a row of a table
         return
     fig = figure(6.4, 3.8)
     axes = fig.add_subplot()

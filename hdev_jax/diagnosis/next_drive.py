@@ -222,6 +222,7 @@ def _relative_sd(information: np.ndarray, size: np.ndarray, at: np.ndarray) -> f
     """Standard error over size of the found effect's best known size, everything else free beside it."""
     d = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(d, d) + 1e-9 * np.eye(len(d))
-    covariance = np.linalg.inv(scaled) / np.outer(d, d)
-    sd = np.sqrt(np.maximum(np.diag(covariance)[at], 0.0))
+    with np.errstate(over="ignore"):  # of a size that no row tells anything of: infinite
+        variance = np.diag(np.linalg.inv(scaled))[at] / d[at] ** 2
+    sd = np.sqrt(np.maximum(variance, 0.0))
     return float(np.min(np.divide(sd, np.abs(size), out=np.full(len(sd), np.inf), where=size != 0)))

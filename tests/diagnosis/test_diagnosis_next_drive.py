@@ -67,3 +67,10 @@ def test_what_no_drive_tells_is_said_to_be(known):
     (only,) = advise(problem, state, rows, [("auxiliary_power", LIBRARY["power_gain"])])
     assert only.drive == ""  # an offset of the power sensor is a constant load in every drive
     assert only.sd_now > 10
+
+
+def test_a_size_that_no_row_tells_anything_of_is_infinitely_badly_known():
+    blind = np.diag([4.0, 0.0])
+    size, at = np.array([2.0]), np.array([1])
+    assert _relative_sd(blind, size, at) == np.inf
+    assert _relative_sd(blind, size, np.array([0])) == pytest.approx(0.25), "0.5, the root of 1/4, over a size of 2"
