@@ -59,6 +59,11 @@ class SizeRow:
         pairs = itertools.combinations(self.cells.values(), 2)
         return max((abs(a[1] - b[1]) / math.hypot(a[2], b[2]) for a, b in pairs), default=math.nan)
 
+    def agrees(self) -> bool:
+        """Whether equal sizes, each as well known as the others, are that far apart in 95 % of cases (Tukey's
+        studentized range of so many, over √2: it is of one size's sd, not of a difference's)."""
+        return self.furthest() <= stats.studentized_range.ppf(0.95, len(self.cells), math.inf) / math.sqrt(2)
+
 
 def _bounded(path: str, value: float) -> bool:
     id_, _, name = path.partition(".")
@@ -197,7 +202,7 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
              words.number(u["noise_floor_rmse"]), share, on, signature(u), nearest(r)]
         )  # fmt: skip
     return table(
-        [head, "verdict", f"test RMSE after [{unit}]", "left beside the flexible learner",
+        [head, "verdict", f"test RMSE after [{unit}]", "left beside the learner or the formula",
          "a flexible learner still predicts", "depends on", "what it looks like", "nearest candidate turned down"],
         rows,
     )  # fmt: skip

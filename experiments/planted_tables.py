@@ -46,6 +46,10 @@ TABLES = {
          "clusters_needed"),
     ),
 }  # fmt: skip
+SIZED = (
+    "Planted effects: sizes of what was named itself (n sizes) and errors after the loop (n logs), of every log with "
+    "an effect to be named; met where the share is in the wanted range"
+)
 LEGEND = {  # of each table that is there; the first of every page
     "": (
         "Size: RMS of the planted effect's column, after the declared model's own columns are projected off it, over "
@@ -60,7 +64,7 @@ LEGEND = {  # of each table that is there; the first of every page
         "nothing false; of what a coefficient absorbs, that say so; of what only trips tell, that more trips would. "
         "Its interval is Wilson's. Met: what was asked is at least what is wanted, and so are, where wanted, the share "
         "without a class (of all logs) and the share called unexplained. Met by interval: the lower "
-        "ends of their intervals are, too",
+        "ends of their intervals are, too; not asked where so few logs could not show it",
         "Something false: logs that name an effect which was not planted. Called unexplained: logs in which structure "
         "is left, which levels of trips are too, though they are noise there",
     ),
@@ -71,7 +75,8 @@ LEGEND = {  # of each table that is there; the first of every page
     ),
     "planted_names": (
         "Named first: classes set aside, what each entry is called. No class: each entry is one name. Separable: logs "
-        "in which no other effect of the library fits as well, by the truth itself; in others a class is the answer. "
+        "in which no other effect of the library fits as well, by the truth itself; in others a class is the answer, "
+        "so that of all logs hardly more than these can have one name each. "
         "Redrawn: logs drawn anew since the effect acted in one training trip only",
     ),
     "planted_rivals": (
@@ -95,20 +100,18 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
         if case.wanted_pooled is not None and group:
             row = _row(config, f"{case.name}, all together", group)
             least = case.wanted_pooled
-            told = {"met": row["as_asked"] >= least, "met_by_interval": row["interval_95"][0] >= least}
+            told = _met([(least, sum(_as_asked(case.asked, t, r) for t, r in group), len(group))])
             rows.append({**row, "wanted": least, **told})
-    shown = [""]
+    shown, drawn = [""], f"synthetic logs, seed {config.seed} on, --fdr {config.fdr}"
     for table, (caption, columns) in TABLES.items():
         part = [{k: r[k] for k in ("name", "n", *columns)} for r in rows if r[columns[0]] is not None]
         if part:
-            write_tables(run, table, part, f"{caption}; synthetic logs, seed {config.seed} on, --fdr {config.fdr}")
+            write_tables(run, table, part, f"{caption}; {drawn}")
             shown.append(table)
     able = [(t, r) for t, r in done if config.cases[t["case"]].asked == "named"]
     sized = [*_covered(able), *_near_oracle(able)]
     if sized:
-        write_tables(
-            run, "planted_sizes", sized, "Sizes and errors after the loop, every log with an effect to be named"
-        )
+        write_tables(run, "planted_sizes", sized, f"{SIZED}; {drawn}")
     against = rival_rows(groups, config.rivals)
     if against:
         write_tables(run, "planted_rivals", against, f"Rivals on the same logs, synthetic{_not_compared(groups)}")
@@ -117,7 +120,7 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
     power_figure(run, on_road, config.rivals)
     false_figure(run, [(t, r) for t, r in able if not t["effects"]], config.rivals)
     confusion_figure(run, [(t, r) for t, r in able if t["effects"]])
-    missed = [r["name"] for r in (*rows, *sized) if r["met"] is False]
+    missed = [f"{r['name']} ({_short_of(r)})" for r in (*rows, *sized) if r["met"] is False]
     return {
         "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "logs": len(done),
         "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k not in ("name", "paper")}}
@@ -133,7 +136,33 @@ def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
     to choose."""
     left = [t["effects"] for _, group in groups for t, r in group if r["rivals"] == {} and not comparable(t["effects"])]
     what = sorted({k for effects in left for k in effects if not comparable([k])})
-    return f"; without {len(left)} logs of {' or '.join(what)}, sought by trip, not by column" if left else ""
+    if not left:
+        return ""
+    out = f"; without {len(left)} logs of {' or '.join(what)}, sought by trip, not by column"
+    return f"{out}; ours of all logs is in the first table"
+
+
+def _met(wanted: Sequence[tuple[float, int, int]]) -> dict[str, Any]:
+    """Whether each share (least wanted, hits, logs) is what is wanted; by its interval, where all hits would be."""
+    tellable = all(wilson(n, n)[0] >= least for least, _, n in wanted)
+    return {
+        "met": all(n and hits / n >= least for least, hits, n in wanted),
+        "met_by_interval": all(wilson(hits, n)[0] >= least for least, hits, n in wanted) if tellable else None,
+    }
+
+
+def _short_of(row: dict[str, Any]) -> str:
+    """What a row that is short has, and what is wanted of it."""
+    if "wanted_range" in row:
+        low, high = row["wanted_range"]
+        return f"{row['share']:.3g}, {low:g} to {high:g} wanted"
+    asked = (("as asked", "as_asked", "wanted"), ("with no class", "named_exactly_no_class", "no_class_wanted"),
+             ("called unexplained", "called_unexplained", "unexplained_wanted"))  # fmt: skip
+    short = [
+        f"{words} {row[share]:.3g}, {row[least]:g} wanted"
+        for words, share, least in asked if row[least] is not None and row[share] < row[least]
+    ]  # fmt: skip
+    return "; ".join(short)
 
 
 def _share(name: str, hits: int, n: int, wanted: tuple[float, float] | None) -> dict[str, Any]:
@@ -246,8 +275,7 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "interval_95": list(wilson(as_asked, n)),
         "wanted": case.wanted,
         "asked": _asked(case.asked, bool(group[0][0]["effects"])) if case.asked != "named" else None,
-        "met": all(m and k / m >= least for least, k, m in wanted) if decided else None,
-        "met_by_interval": all(m and wilson(k, m)[0] >= least for least, k, m in wanted) if decided else None,
+        **(_met(wanted) if decided else {"met": None, "met_by_interval": None}),
         "named_exactly": len(hits) / n if named else None,
         "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,
