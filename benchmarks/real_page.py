@@ -11,6 +11,7 @@ import numpy as np
 import real_figures as figures
 from real_tables import (
     Runs,
+    by_chance,
     found_ids,
     found_table,
     left_table,
@@ -50,8 +51,8 @@ READING = """- **before** is the declared sheet, calibrated; **after** is the sh
   the share in which it, or its class, comes first of its kind when its turn comes.
 - Sizes are as in diagnosis.json with their standard deviation. *furthest apart*: the largest difference between two
   training sets, in standard deviations of that difference as if the two were independent. Sizes *agree* where that is
-  no more than equal ones differ by in 95 % of cases: 1.96 for two training sets, 2.34 for three, 2.57 for four
-  (Tukey's studentized range)."""
+  no more than equal ones differ by in 95 % of cases, by the number of sets {chance} (Tukey's
+  studentized range)."""
 
 
 def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]) -> tuple[str, dict[str, bytes]]:
@@ -145,7 +146,8 @@ def _reading(runs: Runs) -> list[str]:
     count = {f"{r['clusters']['count']}" for r in runs.values()}
     kind = {"trip": "trips"}.get(next(iter(runs.values()))["clusters"]["kind"], "stretches of at least 5 minutes")
     clusters = f"{names.verbose_join(sorted(count, key=int), 'or')} {kind}"
-    return READING.format(draws=RESAMPLES, clusters=clusters).splitlines()
+    chance = names.verbose_join([f"{by_chance(k):.2f} for {k}" for k in range(2, max(2, len(runs)) + 1)])
+    return READING.format(draws=RESAMPLES, clusters=clusters, chance=chance).splitlines()
 
 
 def _agreement(runs: Runs, caution: str) -> list[str]:

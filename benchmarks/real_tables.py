@@ -16,6 +16,7 @@ from hdev_jax.report import names, words
 __all__ = [
     "SizeRow",
     "all_found",
+    "by_chance",
     "found_ids",
     "found_table",
     "left_table",
@@ -60,9 +61,14 @@ class SizeRow:
         return max((abs(a[1] - b[1]) / math.hypot(a[2], b[2]) for a, b in pairs), default=math.nan)
 
     def agrees(self) -> bool:
-        """Whether equal sizes, each as well known as the others, are that far apart in 95 % of cases (Tukey's
-        studentized range of so many, over √2: it is of one size's sd, not of a difference's)."""
-        return self.furthest() <= stats.studentized_range.ppf(0.95, len(self.cells), math.inf) / math.sqrt(2)
+        """Whether the training sets are no further apart than `by_chance`."""
+        return self.furthest() <= by_chance(len(self.cells))
+
+
+def by_chance(sets: int) -> float:
+    """How far the furthest two of so many equal sizes, known equally well, are apart at most in 95 % of cases, in
+    standard deviations of a difference: Tukey's studentized range, which is in those of one size, over √2."""
+    return float(stats.studentized_range.ppf(0.95, sets, math.inf)) / math.sqrt(2)
 
 
 def _bounded(path: str, value: float) -> bool:

@@ -46,6 +46,11 @@ TABLES = {
          "clusters_needed"),
     ),
 }  # fmt: skip
+WANTED = {  # what may be wanted of a setting: column with the share, in words, column with the least
+    "as_asked": ("as asked", "wanted"),
+    "named_exactly_no_class": ("with no class", "no_class_wanted"),
+    "called_unexplained": ("called unexplained", "unexplained_wanted"),
+}
 SIZED = (
     "Planted effects: sizes of what was named itself (n sizes) and errors after the loop (n logs), of every log with "
     "an effect to be named; met where the share is in the wanted range"
@@ -99,9 +104,7 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
         group = [(t, r) for t, r in done if t["case"] == key]
         if case.wanted_pooled is not None and group:
             row = _row(config, f"{case.name}, all together", group)
-            least = case.wanted_pooled
-            told = _met([(least, sum(_as_asked(case.asked, t, r) for t, r in group), len(group))])
-            rows.append({**row, "wanted": least, **told})
+            rows.append(_met({**row, "wanted": case.wanted_pooled}))
     shown, drawn = [""], f"synthetic logs, seed {config.seed} on, --fdr {config.fdr}"
     for table, (caption, columns) in TABLES.items():
         part = [{k: r[k] for k in ("name", "n", *columns)} for r in rows if r[columns[0]] is not None]
@@ -142,12 +145,18 @@ def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
     return f"{out}; ours of all logs is in the first table"
 
 
-def _met(wanted: Sequence[tuple[float, int, int]]) -> dict[str, Any]:
-    """Whether each share (least wanted, hits, logs) is what is wanted; by its interval, where all hits would be."""
-    tellable = all(wilson(n, n)[0] >= least for least, _, n in wanted)
+def _met(row: dict[str, Any]) -> dict[str, Any]:
+    """The row with whether each share is what is wanted, and by its interval, where all hits would show it."""
+    asked = [(row[share], row[least]) for share, (_, least) in WANTED.items() if row[least] is not None]
+    if row["wanted"] is None:
+        return {**row, "met": None, "met_by_interval": None}
+    n = row["n"]
+    shown = all(wilson(round(share * n), n)[0] >= least for share, least in asked)
+    tellable = all(wilson(n, n)[0] >= least for _, least in asked)
     return {
-        "met": all(n and hits / n >= least for least, hits, n in wanted),
-        "met_by_interval": all(wilson(hits, n)[0] >= least for least, hits, n in wanted) if tellable else None,
+        **row,
+        "met": all(share >= least for share, least in asked),
+        "met_by_interval": shown if tellable else None,
     }
 
 
@@ -156,13 +165,10 @@ def _short_of(row: dict[str, Any]) -> str:
     if "wanted_range" in row:
         low, high = row["wanted_range"]
         return f"{row['share']:.3g}, {low:g} to {high:g} wanted"
-    asked = (("as asked", "as_asked", "wanted"), ("with no class", "named_exactly_no_class", "no_class_wanted"),
-             ("called unexplained", "called_unexplained", "unexplained_wanted"))  # fmt: skip
-    short = [
+    return "; ".join(
         f"{words} {row[share]:.3g}, {row[least]:g} wanted"
-        for words, share, least in asked if row[least] is not None and row[share] < row[least]
-    ]  # fmt: skip
-    return "; ".join(short)
+        for share, (words, least) in WANTED.items() if row[least] is not None and row[share] < row[least]
+    )  # fmt: skip
 
 
 def _share(name: str, hits: int, n: int, wanted: tuple[float, float] | None) -> dict[str, Any]:
@@ -254,13 +260,6 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     apart = [(t, r) for t, r in group if r["alike"] and not any(r["alike"].values())]
     alone_apart = [scores.exact(t["effects"], r["named"]) and _alone(r) for t, r in apart]
     unexplained = sum(r["unexplained"] for _, r in group)
-    wanted = [
-        (least, hits, count)
-        for least, hits, count in ((case.wanted, as_asked, n), (case.wanted_alone, alone, n),
-                                   (case.wanted_unexplained, unexplained, n))
-        if least is not None
-    ]  # fmt: skip
-    decided = case.wanted is not None
     pairs = [s for _, r in group for s in r["sizes"]] if case.asked == "named" else []
     z = np.array([abs(s["found"] - s["true"]) / s["sd"] for s in pairs])
     after = np.array([r["test_rmse"]["after"] for _, r in group])
@@ -269,13 +268,12 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     needed = [
         c["clusters_needed"] for t, r in group for c in r["not_decidable"] if c["id"] in scores.names(t["effects"])
     ]
-    return {
+    return _met({
         "name": setting, "n": n, "paper": None,
         "as_asked": as_asked / n,
         "interval_95": list(wilson(as_asked, n)),
         "wanted": case.wanted,
         "asked": _asked(case.asked, bool(group[0][0]["effects"])) if case.asked != "named" else None,
-        **(_met(wanted) if decided else {"met": None, "met_by_interval": None}),
         "named_exactly": len(hits) / n if named else None,
         "named_first": first / n if named else None,  # classes set aside: what each entry is called
         "named_exactly_no_class": alone / n if named else None,
@@ -299,4 +297,4 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "within_5_percent_of_oracle": float(np.mean(ratio < NEAR_ORACLE)),
         "after_over_noise": float(np.median(after / np.array([r["noise_rmse"] for _, r in group]))),
         "seconds": float(np.median([r["seconds"] for _, r in group])),
-    }  # fmt: skip
+    })  # fmt: skip

@@ -157,7 +157,7 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
     import real_page
     from real_tables import size_rows
 
-    def drag(*values: float):
+    def offsets(*values: float):
         sized = enumerate(values)
         return {str(k): result([effect("torque_offset", "offset_nm", v, 1.0, "Nm")]) for k, v in sized}
 
@@ -166,10 +166,12 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
     for apart, sets in ((two, 2), (four, 4)):
         bound = float(np.quantile(apart, 0.95)) * np.sqrt(2)
         for factor, close in ((0.97, True), (1.03, False)):
-            (row,) = size_rows(drag(5.0, 5.0 + factor * bound, *[5.0 + 0.5 * bound] * (sets - 2)))
+            (row,) = size_rows(offsets(5.0, 5.0 + factor * bound, *[5.0 + 0.5 * bound] * (sets - 2)))
             assert row.agrees() == close
-    assert "Of 1 sizes found more than once, 1 agrees." in real_page._agreement(drag(5.0, 5.5), "")[0]
-    assert "0 agree. Further apart: `torque_offset.offset_nm` (2.1 sd)." in real_page._agreement(drag(5.0, 8.0), "")[0]
+    assert "Of 1 sizes found more than once, 1 agrees." in real_page._agreement(offsets(5.0, 5.5), "")[0]
+    assert (
+        "0 agree. Further apart: `torque_offset.offset_nm` (2.1 sd)." in real_page._agreement(offsets(5.0, 8.0), "")[0]
+    )
 
 
 def test_an_effect_whose_sign_turns_is_told_first(results):
