@@ -7,7 +7,7 @@ coefficients, over the noise's. *Exactly it* is one entry: the planted id, or a 
 
 An effect is planted where the log can separate it: a log in which it acts in one training trip only (rain, a limit that
 is met once) is drawn anew, and the table counts how many were. What no test could tell from it is kept beside
-(`oracle.confusable`).
+(`oracle.confusable`). Four effects have a twin in every log (`planted_scores.TWINS`); they are asked for as a class.
 """
 
 import tempfile
@@ -63,7 +63,7 @@ class Case(Strict):
     # that a declared coefficient took them (with none planted: none is far off); that more trips would tell
     asked: Literal["named", "absorbed", "not_decidable"] = "named"
     wanted: float | None = None  # least share of logs that do as asked
-    # least share that name exactly what was planted, with no class; of all logs, also where a class is the answer
+    # least share that name exactly what was planted, with no class: of what has no twin (`planted_scores.TWINS`)
     wanted_alone: float | None = None
     wanted_unexplained: float | None = None  # least share in which something is called unexplained
     wanted_pooled: float | None = None  # least share as asked over all settings of the case together

@@ -8,10 +8,18 @@ from hdev_jax.diagnosis.summary import FAR
 from hdev_jax.fleet import PLANTABLE
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["absorbed", "alike", "exact", "false", "nameable", "names", "not_decidable", "rival_exact",
-           "rival_false", "untouched"]  # fmt: skip
+__all__ = ["TWINS", "absorbed", "alike", "exact", "false", "has_twin", "nameable", "names", "not_decidable",
+           "rival_exact", "rival_false", "untouched"]  # fmt: skip
 
 MOST = 3  # names of a class that still is an answer
+# What no log of road segments can separate, however long or free of noise: the two have the same column there, beside
+# what rolling resistance and drag area take up. A class is the only right answer.
+TWINS = {
+    "auxiliary_power": "power_gain",  # its offset
+    "driveline_drag": "iron_loss",  # both by the motor's speed, behind the one efficiency from wheel to battery
+    "mass_scale": "power_gain",  # its gain: rolling resistance and drag area give back what the mass does not touch
+    "power_gain": "mass_scale",
+}
 
 Entry = Mapping[str, Any]  # `id`, `class` (as it is printed) and `class_size` (before it was cut)
 
@@ -24,6 +32,11 @@ def names(planted: Sequence[str]) -> list[str]:
 def nameable(planted: Sequence[str]) -> bool:
     """Whether something was planted and the library has a name for all of it."""
     return bool(planted) and all(k in LIBRARY for k in names(planted))
+
+
+def has_twin(planted: Sequence[str]) -> bool:
+    """Whether something was planted that no log of its kind can separate from another effect."""
+    return any(k in TWINS for k in planted)
 
 
 def exact(planted: Sequence[str], named: Sequence[Entry]) -> bool:

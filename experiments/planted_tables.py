@@ -8,9 +8,10 @@ import numpy as np
 from experiments import planted_scores as scores
 from experiments.planted_figures import confusion_figure, false_figure, power_figure
 from experiments.planted_rivals import rival_rows
+from experiments.planted_sizes import CAPTION as SIZED
+from experiments.planted_sizes import NEAR_ORACLE, sized_rows
 from experiments.rivals import comparable
 from experiments.tables import wilson, write_tables
-from hdev_jax.physics import LIBRARY
 from hdev_jax.rundir import Run
 
 if TYPE_CHECKING:
@@ -20,9 +21,6 @@ __all__ = ["collect"]
 
 Group = list[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their results
 
-COVERED = (0.85, 0.95)  # of 90 % intervals, after selection
-ORACLE = 0.90  # of the logs within NEAR_ORACLE of the error of an oracle that knows the cause
-NEAR_ORACLE = 1.05
 # What a row of a setting holds, by table: caption and columns, beside its name and its number of logs. Settings that
 # a table's first column says nothing of are not in it.
 TABLES = {
@@ -38,7 +36,7 @@ TABLES = {
     "planted_names": (
         "Planted effects: names with classes and without",
         ("named_exactly", "named_first", "mean_class", "named_exactly_no_class", "separable", "no_class_of_separable",
-         "no_class_wanted", "redrawn"),
+         "redrawn"),
     ),
     "planted_undecided": (
         "Planted effects: what is absorbed, and what more trips would tell",
@@ -51,10 +49,7 @@ WANTED = {  # what may be wanted of a setting: column with the share, in words, 
     "named_exactly_no_class": ("with no class", "no_class_wanted"),
     "called_unexplained": ("called unexplained", "unexplained_wanted"),
 }
-SIZED = (
-    "Planted effects: sizes of what was named itself (n sizes) and errors after the loop (n logs), of every log with "
-    "an effect to be named; met where the share is in the wanted range"
-)
+BY_TWIN = "Planted effects: one name where the log can separate what was planted, a class where it has a twin"
 LEGEND = {  # of each table that is there; the first of every page
     "": (
         "Size: RMS of the planted effect's column, after the declared model's own columns are projected off it, over "
@@ -67,9 +62,9 @@ LEGEND = {  # of each table that is there; the first of every page
         "As asked: the share of logs that name all and only what was planted (one entry each: the id, or a class of at "
         "most three that holds it); with nothing planted, that name nothing; of a cause outside the library, that name "
         "nothing false; of what a coefficient absorbs, that say so; of what only trips tell, that more trips would. "
-        "Its interval is Wilson's. Met: what was asked is at least what is wanted, and so are, where wanted, the share "
-        "without a class (of all logs) and the share called unexplained. Met by interval: the lower "
-        "ends of their intervals are, too; not asked where so few logs could not show it",
+        "Its interval is Wilson's. Met: what was asked is at least what is wanted, and so is, where wanted, the share "
+        "called unexplained. Met by interval: the lower ends of their intervals are, too; not asked where so few logs "
+        "could not show it",
         "Something false: logs that name an effect which was not planted. Called unexplained: logs in which structure "
         "is left, which levels of trips are too, though they are noise there",
     ),
@@ -80,9 +75,14 @@ LEGEND = {  # of each table that is there; the first of every page
     ),
     "planted_names": (
         "Named first: classes set aside, what each entry is called. No class: each entry is one name. Separable: logs "
-        "in which no other effect of the library fits as well, by the truth itself; in others a class is the answer, "
-        "so that of all logs hardly more than these can have one name each. "
+        "in which no other effect of the library fits as well, by the truth itself, at this size in this noise. "
         "Redrawn: logs drawn anew since the effect acted in one training trip only",
+    ),
+    "planted_twins": (
+        "Twins: {twins}. On every log of road segments they have the same column, beside what rolling resistance and "
+        "drag area take up (to a hundredth, as a test shows; of every other planted effect's column the nearest one "
+        "leaves a fifth or more). Of a twin a class is the right answer and the only one, so that one name each is "
+        "wanted of what has none. Each part has to reach what is wanted of all",
     ),
     "planted_rivals": (
         "ours_first: ours with classes set aside, what each entry is called. Exactly and false are credited to all "
@@ -90,8 +90,6 @@ LEGEND = {  # of each table that is there; the first of every page
         "more the fewer logs there are of a kind",
     ),
 }
-# of the noise, from which on an oracle's error is out of reach of a model that found nothing: √(1 + 0.5²) = 1.118
-TELLING = 0.5
 
 
 def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
@@ -111,8 +109,12 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
         if part:
             write_tables(run, table, part, f"{caption}; {drawn}")
             shown.append(table)
+    apart = [row for name, group in groups for row in _by_twin(config, name, group)]
+    if apart:
+        write_tables(run, "planted_twins", apart, f"{BY_TWIN}; {drawn}")
+        shown.append("planted_twins")
     able = [(t, r) for t, r in done if config.cases[t["case"]].asked == "named"]
-    sized = [*_covered(able), *_near_oracle(able)]
+    sized = sized_rows(able)
     if sized:
         write_tables(run, "planted_sizes", sized, f"{SIZED}; {drawn}")
     against = rival_rows(groups, config.rivals)
@@ -123,14 +125,14 @@ def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
     power_figure(run, on_road, config.rivals)
     false_figure(run, [(t, r) for t, r in able if not t["effects"]], config.rivals)
     confusion_figure(run, [(t, r) for t, r in able if t["effects"]])
-    missed = [f"{r['name']} ({_short_of(r)})" for r in (*rows, *sized) if r["met"] is False]
+    missed = [f"{r['name']} ({_short_of(r)})" for r in (*rows, *apart, *sized) if r["met"] is False]
     return {
         "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "logs": len(done),
         "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k not in ("name", "paper")}}
-                 for r in (*rows, *sized, *against)],
+                 for r in (*rows, *apart, *sized, *against)],
         "better_than_paper": 0, "of": 0,
         "skipped": skipped, "missed": missed,
-        "notes": [line.format(ar=config.ar_coefficient) for table in shown for line in LEGEND.get(table, ())],
+        "notes": [line.format(ar=config.ar_coefficient, twins=_twins()) for t in shown for line in LEGEND.get(t, ())],
     }  # fmt: skip
 
 
@@ -147,8 +149,8 @@ def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
 
 def _met(row: dict[str, Any]) -> dict[str, Any]:
     """The row with whether each share is what is wanted, and by its interval, where all hits would show it."""
-    asked = [(row[share], row[least]) for share, (_, least) in WANTED.items() if row[least] is not None]
-    if row["wanted"] is None:
+    asked = [(row[share], row[least]) for share, (_, least) in WANTED.items() if row.get(least) is not None]
+    if not asked:
         return {**row, "met": None, "met_by_interval": None}
     n = row["n"]
     shown = all(wilson(round(share * n), n)[0] >= least for share, least in asked)
@@ -167,53 +169,8 @@ def _short_of(row: dict[str, Any]) -> str:
         return f"{row['share']:.3g}, {low:g} to {high:g} wanted"
     return "; ".join(
         f"{words} {row[share]:.3g}, {row[least]:g} wanted"
-        for share, (words, least) in WANTED.items() if row[least] is not None and row[share] < row[least]
+        for share, (words, least) in WANTED.items() if row.get(least) is not None and row[share] < row[least]
     )  # fmt: skip
-
-
-def _share(name: str, hits: int, n: int, wanted: tuple[float, float] | None) -> dict[str, Any]:
-    return {
-        "name": name, "n": n, "share": hits / n, "interval_95": list(wilson(hits, n)),
-        "wanted_range": list(wanted) if wanted else None, "met": wanted[0] <= hits / n <= wanted[1] if wanted else None,
-    }  # fmt: skip
-
-
-def _covered(able: Group) -> list[dict[str, Any]]:
-    """Do intervals hold what they should, over all logs with an effect of the library and over each kind of log."""
-    name = "90 % intervals that hold the planted size"
-    kinds = list(dict.fromkeys(t["entry"] for t, _ in able))
-    rows = []
-    for words, of in (("", kinds), *((f", logs that enter at the {k}", [k]) for k in kinds if len(kinds) > 1)):
-        covered = [s["covered"] for t, r in able if _in_library(t) and t["entry"] in of for s in r["sizes"]]
-        if covered:
-            rows.append(_share(f"{name}{words}", sum(covered), len(covered), COVERED))
-    return rows
-
-
-def _near_oracle(able: Group) -> list[dict[str, Any]]:
-    """Is the error after the loop that of an oracle: size by size, and where finding nothing would not pass.
-
-    The oracle of what the library holds in another form is the noise itself.
-    """
-    name = "test error after within 5 % of an oracle's"
-    near = [
-        (t["size"], _in_library(t), r["test_rmse"]["after"] < NEAR_ORACLE * r["oracle_rmse"])
-        for t, r in able if t["size"] and scores.nameable(t["effects"])
-    ]  # fmt: skip
-    rows = []
-    for size in sorted({s for s, inside, _ in near if inside}):
-        hits = [ok for s, inside, ok in near if inside and s == size]
-        rows.append(_share(f"{name}, size {size:g}", sum(hits), len(hits), None))
-    for words, inside in ((f"size {TELLING:g} and above", True), ("truths in another form", False)):
-        hits = [ok for s, held, ok in near if held == inside and s >= TELLING]
-        if hits:
-            rows.append(_share(f"{name}, {words}", sum(hits), len(hits), (ORACLE, 1.0)))
-    return rows
-
-
-def _in_library(task: dict[str, Any]) -> bool:
-    """Whether something was planted that the library holds as it is."""
-    return bool(task["effects"]) and all(k in LIBRARY for k in task["effects"])
 
 
 def grouped(config: "Config", done: Group) -> list[tuple[str, Group]]:
@@ -248,6 +205,32 @@ def _alone(result: dict[str, Any]) -> bool:
     return all(x["class_size"] == 1 for x in result["named"])
 
 
+def _twins() -> str:
+    """The pairs in words."""
+    return "; ".join(" and ".join(pair) for pair in sorted({tuple(sorted(pair)) for pair in scores.TWINS.items()}))
+
+
+def _by_twin(config: "Config", setting: str, group: Group) -> list[dict[str, Any]]:
+    """Names of one setting's logs: of all, of what the log can separate, and of what has a twin in every log."""
+    case = config.cases[group[0][0]["case"]]
+    has = [scores.has_twin(t["effects"]) for t, _ in group]
+    if case.asked != "named" or not (any(has) or case.wanted_alone):
+        return []
+    rows = []
+    for words, of in (("all", (False, True)), ("no twin", (False,)), ("a twin", (True,))):
+        part = [x for x, twin in zip(group, has, strict=True) if twin in of]
+        hits = [(t, r) for t, r in part if scores.exact(t["effects"], r["named"])]
+        if part:
+            rows.append(_met({
+                "name": f"{setting}: {words}", "n": len(part),
+                "as_asked": len(hits) / len(part),
+                "wanted": case.wanted,
+                "named_exactly_no_class": sum(_alone(r) for _, r in hits) / len(part),
+                "no_class_wanted": case.wanted_alone if words == "no twin" else None,
+            }))  # fmt: skip
+    return rows
+
+
 def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
     """What the table says of one setting."""
     case = config.cases[group[0][0]["case"]]
@@ -279,7 +262,6 @@ def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
         "named_exactly_no_class": alone / n if named else None,
         "separable": len(apart) / n if named else None,  # no other effect could be told from it by any test
         "no_class_of_separable": float(np.mean(alone_apart)) if named and apart else None,
-        "no_class_wanted": case.wanted_alone,
         "redrawn": sum(r["redrawn"] for _, r in group),
         "something_false": sum(scores.false(t["effects"], r["named"]) for t, r in group) / n,
         "furthest_coefficient_sd": float(np.median(far)) if case.asked == "absorbed" else None,

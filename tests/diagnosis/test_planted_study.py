@@ -13,12 +13,14 @@ from experiments.planted import Config, acts_in, run, tasks
 from experiments.planted_rivals import outcome, rival_rows
 from experiments.planted_tables import collect
 from experiments.rivals import comparable
+from hdev_jax.diagnosis.candidates import columns
 from hdev_jax.diagnosis.problem import prepare
 from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
-from hdev_jax.inference import calibrate, cluster_rows, padded
+from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
 from hdev_jax.rundir import open_run
 
 STUDY = Path(__file__).parents[2] / "configs" / "studies" / "planted.toml"
@@ -171,20 +173,67 @@ def test_classes_are_not_what_was_asked_without_them(tmp_path):
     ten = every("single", effects=["headwind"])
     apart = {"headwind": []}
     logs = [(t, result(["headwind", "crosswind"] if k < 3 else ["headwind"], alike=apart)) for k, t in enumerate(ten)]
-    row = told(tmp_path, logs)["one effect, size 0.5, 12 trips, ar1"]
-    assert (row["named_exactly"], row["named_first"], row["named_exactly_no_class"]) == (1.0, 1.0, 0.7)
-    assert (row["wanted"], row["no_class_wanted"], row["met"]) == (0.88, 0.85, False)
-    assert (row["separable"], row["no_class_of_separable"]) == (1.0, 0.7)
-    # where nobody could tell them apart the class is the answer, and all the same no name without one
-    alike = [(t, {**r, "alike": {"headwind": ["crosswind"] if k < 3 else []}}) for k, (t, r) in enumerate(logs)]
-    row = told(tmp_path / "a", alike)["one effect, size 0.5, 12 trips, ar1"]
-    assert (row["named_exactly_no_class"], row["separable"], row["no_class_of_separable"]) == (0.7, 0.7, 1.0)
+    setting = "one effect, size 0.5, 12 trips, ar1"
+    rows = told(tmp_path, logs)
+    assert (rows[setting]["named_exactly"], rows[setting]["named_first"]) == (1.0, 1.0)
+    assert (rows[setting]["separable"], rows[setting]["no_class_of_separable"]) == (1.0, 0.7)
+    row = rows[f"{setting}: no twin"]
+    assert (row["named_exactly_no_class"], row["no_class_wanted"], row["wanted"]) == (0.7, 0.85, 0.88)
     assert row["met"] is False
+    # where so few rows could not tell them apart the class is the answer, and all the same no name without one
+    alike = [(t, {**r, "alike": {"headwind": ["crosswind"] if k < 3 else []}}) for k, (t, r) in enumerate(logs)]
+    rows = told(tmp_path / "a", alike)
+    assert (rows[setting]["separable"], rows[setting]["no_class_of_separable"]) == (0.7, 1.0)
+    assert rows[f"{setting}: no twin"]["met"] is False
     nine = [(t, result(["headwind", "crosswind"] if k < 1 else ["headwind"])) for k, t in enumerate(ten)]
-    assert told(tmp_path / "c", nine)["one effect, size 0.5, 12 trips, ar1"]["met"] is True
+    assert told(tmp_path / "c", nine)[f"{setting}: no twin"]["met"] is True
     big = [(t, {**r, "named": [{**r["named"][0], "class_size": 8}]}) for t, r in logs]
-    row = told(tmp_path / "b", big)["one effect, size 0.5, 12 trips, ar1"]
+    row = told(tmp_path / "b", big)[setting]
     assert (row["named_exactly"], row["mean_class"]) == (0.0, 8.0)
+
+
+def test_of_a_twin_a_class_is_asked_and_of_nothing_else(tmp_path):
+    setting = "one effect, size 0.5, 12 trips, ar1"
+    wind, drag = every("single", effects=["headwind"]), every("single", effects=["driveline_drag"])
+    single, pair = (
+        [(t, result(["headwind"])) for t in wind],
+        [(t, result(["iron_loss", "driveline_drag"])) for t in drag],
+    )
+    rows = told(tmp_path, single + pair)
+    of_all, apart, twin = (rows[f"{setting}: {words}"] for words in ("all", "no twin", "a twin"))
+    assert (of_all["n"], of_all["named_exactly_no_class"], of_all["no_class_wanted"]) == (20, 0.5, None)
+    assert (apart["n"], apart["named_exactly_no_class"], apart["met"]) == (10, 1.0, True)
+    assert (twin["n"], twin["as_asked"], twin["named_exactly_no_class"], twin["met"]) == (10, 1.0, 0.0, True)
+    rows = told(tmp_path / "other", single + [(t, result(["iron_loss"])) for t in drag])
+    assert rows[f"{setting}: a twin"]["met"] is False, "its twin by itself is a wrong name"
+    assert rows[f"{setting}: no twin"]["met"] is True
+
+
+def left_of(column: np.ndarray, by: np.ndarray) -> float:
+    """RMS of what is left of a column by least squares on others."""
+    size = np.linalg.norm(by, axis=0)
+    by = by[:, size > 0] / size[size > 0]
+    return float(np.sqrt(np.mean((column - by @ np.linalg.lstsq(by, column, rcond=None)[0]) ** 2)))
+
+
+def test_twins_have_the_same_column_and_nothing_else_that_is_planted_has(tmp_path):
+    """The generator's column without noise, beside what the declared coefficients take up, against the kernel's."""
+    for (effect,) in config().sets["road"]:
+        synthetic, problem, _ = opened(tmp_path / effect, seed=11, trips=12, effects={effect: {}}, ratio=0.5)
+        declared = np.asarray(jacobian(problem.vehicle, problem.table, problem.segments, problem.target))
+        tried, made, _ = columns(
+            problem.vehicle, tuple(LIBRARY.values()), problem.segments, len(problem.measured), problem.target
+        )
+        planted = synthetic.truth[f"effect:{effect}"].to_numpy()
+        left: dict[str, float] = {}
+        for c in tried:
+            share = left_of(planted, np.c_[declared, made[:, c.columns]]) / left_of(planted, declared)
+            left[c.id] = min(share, left.get(c.id, 1.0))
+        others = {k: share for k, share in left.items() if k != effect}
+        if effect in scores.TWINS:
+            assert others[scores.TWINS[effect]] < 0.01, effect
+        else:
+            assert min(others.values()) > 0.2, (effect, min(others, key=others.__getitem__))
 
 
 def test_a_page_explains_the_tables_that_it_has(tmp_path):
