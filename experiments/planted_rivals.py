@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 
 from experiments import planted_scores as scores
+from experiments.planted_scores import Group
 from experiments.rivals import comparable
 
 __all__ = ["outcome", "rival_rows"]
-
-Group = list[tuple[dict[str, Any], dict[str, Any]]]
 
 
 def outcome(planted: Sequence[str], result: dict[str, Any], method: str) -> tuple[bool, bool]:

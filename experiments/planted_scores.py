@@ -8,19 +8,20 @@ from hdev_jax.diagnosis.summary import FAR
 from hdev_jax.fleet import PLANTABLE
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["TWINS", "absorbed", "alike", "exact", "false", "has_twin", "nameable", "names", "not_decidable",
-           "rival_exact", "rival_false", "untouched"]  # fmt: skip
+__all__ = ["TWINS", "Group", "absorbed", "alike", "exact", "false", "has_twin", "nameable", "names", "not_decidable",
+           "rival_exact", "rival_false", "untouched", "with_twins"]  # fmt: skip
 
 MOST = 3  # names of a class that still is an answer
-# What no log of road segments can separate, however long or free of noise: the two have the same column there, beside
-# what rolling resistance and drag area take up. A class is the only right answer.
+# Planted in road segments under the study's sheet (drag area open, no declared load): an effect of the library with the
+# same column in every such log, however long and free of noise. Nothing can separate them; a class is the right answer.
 TWINS = {
     "auxiliary_power": "power_gain",  # its offset
     "driveline_drag": "iron_loss",  # both by the motor's speed, behind the one efficiency from wheel to battery
-    "mass_scale": "power_gain",  # its gain: rolling resistance and drag area give back what the mass does not touch
+    "mass_scale": "power_gain",  # its gain: the drag area gives back the one force that the mass does not touch
     "power_gain": "mass_scale",
 }
 
+Group = list[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their results
 Entry = Mapping[str, Any]  # `id`, `class` (as it is printed) and `class_size` (before it was cut)
 
 
@@ -35,8 +36,13 @@ def nameable(planted: Sequence[str]) -> bool:
 
 
 def has_twin(planted: Sequence[str]) -> bool:
-    """Whether something was planted that no log of its kind can separate from another effect."""
+    """Whether something that was planted has a twin."""
     return any(k in TWINS for k in planted)
+
+
+def with_twins(planted: Sequence[str], named: Sequence[Entry]) -> bool:
+    """Whether the entry of each planted effect that has a twin holds both: one name by itself is a guess."""
+    return all(any({k, TWINS[k]} <= set(entry["class"]) for entry in named) for k in planted if k in TWINS)
 
 
 def exact(planted: Sequence[str], named: Sequence[Entry]) -> bool:
@@ -73,12 +79,12 @@ def not_decidable(planted: Sequence[str], result: Mapping[str, Any]) -> bool:
 
 
 def alike(planted: Sequence[str], result: Mapping[str, Any]) -> list[set[str]]:
-    """For each planted effect the names that are right: itself, what its columns cannot be told from on this log by
-    the loop's own rule, and the class in which the loop names it."""
+    """For each planted effect the names that are right: itself, its twin, what its columns cannot be told from on this
+    log by the loop's own rule, and the class in which the loop names it."""
     out = []
     for k in planted:
         entry = next((set(n["class"]) for n in result["named"] if k in n["class"]), set())
-        out.append({k, *result["alike"].get(k, ()), *entry})
+        out.append({k, TWINS.get(k, k), *result["alike"].get(k, ()), *entry})
     return out
 
 

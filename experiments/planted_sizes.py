@@ -3,12 +3,11 @@
 from typing import Any
 
 from experiments import planted_scores as scores
+from experiments.planted_scores import Group
 from experiments.tables import wilson
 from hdev_jax.physics import LIBRARY
 
 __all__ = ["CAPTION", "NEAR_ORACLE", "sized_rows"]
-
-Group = list[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their results
 
 COVERED = (0.85, 0.95)  # of 90 % intervals, after selection
 ORACLE = 0.90  # of the logs within NEAR_ORACLE of the error of an oracle that knows the cause

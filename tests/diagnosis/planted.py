@@ -7,14 +7,14 @@ from pathlib import Path
 import jax
 
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.split import split_trips
+from hdev_jax.diagnosis.problem import Problem, prepare
+from hdev_jax.diagnosis.split import Split, split_trips
 from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["ROAD_SIDE", "breaches", "run"]
+__all__ = ["ROAD_SIDE", "breaches", "opened", "run"]
 
 # what a sheet of a log that enters at the shaft needs besides, to be asked from the road
 ROAD_SIDE = """
@@ -43,6 +43,15 @@ def run(seed: int, **options) -> tuple[SyntheticLog, Diagnosis]:
         log, sheet = read_log([files["log"]]), read_sheet(files["sheet"])
         problem = prepare(log, sheet)
         return synthetic, diagnose(problem, split_trips(log), LIBRARY, seed=0)
+
+
+def opened(folder: Path, **options) -> tuple[SyntheticLog, Problem, Split]:
+    """A short log written and read back, as the study does it, before anything is sought."""
+    synthetic = synthetic_log(**{"trips": 8, "rows_per_trip": 120, "ar_coefficient": 0.97} | options)
+    files = synthetic.write(folder, truth=False)
+    log = read_log([files["log"]])
+    split = split_trips(log)
+    return synthetic, prepare(split.log, read_sheet(files["sheet"])), split
 
 
 def breaches(diagnosis: Diagnosis, shared: Path) -> list[str]:
