@@ -52,8 +52,8 @@ def confusable(planted: Sequence[str], synthetic: SyntheticLog, problem: Problem
     What was measured without its noise, by the noise's own colour: an effect that in the planted one's place leaves
     less log-likelihood than `TELLS` would pass a test that knows both, in too many of the noises that might have been.
     All that is planted beside it is known. Other effects come in the best of the ways that the loop tries, linearly
-    about a fit that lacks the planted one, which is itself refitted: of large effects this tells apart even what has
-    the same column (`planted_scores.TWINS`).
+    about a fit without the planted one, while the planted one is refitted; for large effects that difference counts as
+    evidence, even between identical columns (`planted_scores.TWINS`).
     """
     if not planted or any(_in_library(k, synthetic, split) is None for k in planted):
         return {}

@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from itertools import cycle
-from typing import Any
 
 import numpy as np
 
 from experiments.figures import save_figure, styled
 from experiments.planted_rivals import outcome
-from experiments.planted_scores import names
+from experiments.planted_scores import Group, names
 from experiments.rivals import comparable
 from experiments.tables import wilson
 from hdev_jax.physics import LIBRARY
@@ -17,7 +16,6 @@ from hdev_jax.rundir import Run
 
 __all__ = ["confusion_figure", "false_figure", "power_figure"]
 
-Done = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 COLOURS = {
     "ours": "#1b4f8a",
     "ours_first": "#7fb3d9",
@@ -37,13 +35,13 @@ def _methods(rivals: Sequence[str]) -> list[str]:
     return ["ours", *(["ours_first"] if known else []), *known]
 
 
-def _compared(done: Done, rivals: Sequence[str]) -> Done:
+def _compared(done: Group, rivals: Sequence[str]) -> Group:
     """All logs; those that rivals could name too, where there are any."""
     return [(t, r) for t, r in done if not rivals or (r["rivals"] and comparable(t["effects"]))]
 
 
 @styled
-def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
+def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     """Share named exactly, against the size of what was planted; single effects that the library holds.
 
     Its caller leaves out what is planted to be called something else than by its name.
@@ -86,7 +84,7 @@ def power_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
 
 
 @styled
-def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
+def false_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     """Share of logs with nothing planted in which something was named, by colour of the noise."""
     empty = [(t, r) for t, r in _compared(done, rivals) if not t["effects"]]
     if not empty:
@@ -113,7 +111,7 @@ def false_figure(run: Run, done: Done, rivals: Sequence[str]) -> None:
 
 
 @styled
-def confusion_figure(run: Run, done: Done) -> None:
+def confusion_figure(run: Run, done: Group) -> None:
     """What was named (columns) where one effect was planted (rows), in per cent of its logs. A class that holds what
     was planted counts as that."""
     single = [(t, r) for t, r in done if len(t["effects"]) == 1]

@@ -12,8 +12,9 @@ __all__ = ["TWINS", "Group", "absorbed", "alike", "exact", "false", "has_twin", 
            "rival_exact", "rival_false", "untouched", "with_twins"]  # fmt: skip
 
 MOST = 3  # names of a class that still is an answer
-# Planted in road segments under the study's sheet (drag area open, no declared load): an effect of the library with the
-# same column in every such log, however long and free of noise. Nothing can separate them; a class is the right answer.
+# Planted in road segments under the study's sheet (drag area open, no declared load): an effect of the library that
+# leaves nothing of the column, beside the declared coefficients, in every such log, however long and free of noise.
+# Nothing in the log can separate them; a class is the right answer.
 TWINS = {
     "auxiliary_power": "power_gain",  # its offset
     "driveline_drag": "iron_loss",  # both by the motor's speed, behind the one efficiency from wheel to battery

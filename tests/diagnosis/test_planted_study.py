@@ -200,13 +200,37 @@ def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
     right = parts("class", "iron_loss", "driveline_drag")
     assert [right[k]["n"] for k in right] == [20, 10, 10]
     assert [right[k]["as_asked"] for k in right] == [1.0, 1.0, 1.0]
-    assert [right[k]["named_exactly_no_class"] for k in right] == [0.5, 1.0, 0.0]
-    assert [right[k]["could_be_one_name"] for k in right] == [0.5, 1.0, 0.0]
+    assert [right[k]["named_exactly_no_class"] for k in right] == [0.5, 1.0, None]
+    assert [right[k]["wanted"] for k in right] == [None, 0.88, 0.88]
+    assert [right[k]["no_class_wanted"] for k in right] == [None, 0.85, None]
     assert [right[k]["met"] for k in right] == [None, True, True]
     for guess in ("driveline_drag", "iron_loss"):
         rows = parts(guess, guess)
         assert (rows["a twin"]["as_asked"], rows["a twin"]["met"]) == (0.0, False)
+        assert (rows["all"]["as_asked"], rows["all"]["named_exactly_no_class"]) == (0.5, 0.5)
         assert rows["no twin"]["met"] is True
+
+
+def test_settings_that_ask_no_single_names_show_their_twins_and_those_that_ask_no_names_none(tmp_path):
+    quarter = [(t, result(["headwind"])) for t in every("single_quarter", effects=["headwind"])]
+    assert not any(": " in name for name in told(tmp_path / "none", quarter)), "nothing to tell apart"
+    drags = [(t, result(["iron_loss", "driveline_drag"])) for t in every("single_quarter", effects=["driveline_drag"])]
+    rows = told(tmp_path / "some", quarter + drags)
+    row = rows["one effect, size 0.25, 12 trips, ar1: no twin"]
+    assert (row["wanted"], row["no_class_wanted"], row["met"]) == (0.7, None, True)
+    absorbed = [(t, result()) for t in every("absorbed_shaft")]
+    assert not any(": " in name for name in told(tmp_path / "absorbed", absorbed))
+
+
+def test_a_twin_is_never_separable_whatever_the_oracle_says(tmp_path):
+    drags = [
+        (t, result(["iron_loss", "driveline_drag"], alike={"driveline_drag": []}))
+        for t in every("single", effects=["driveline_drag"])
+    ]
+    assert told(tmp_path, drags)["one effect, size 0.5, 12 trips, ar1"]["separable"] == 0.0
+    other = [(t, result(["hvac_power"])) for t in every("approximated", effects=["squared_hvac_power"])]
+    row = told(tmp_path / "b", other)["a truth that the library holds in another form, size 1, 24 trips, ar1"]
+    assert row["separable"] is None, "the oracle was never asked"
 
 
 def test_a_page_explains_the_tables_that_it_has(tmp_path):
@@ -217,9 +241,12 @@ def test_a_page_explains_the_tables_that_it_has(tmp_path):
     single = notes([(t, result(["headwind"])) for t in every("single", effects=["headwind"])], "single")
     assert "one before by 0.97" in single
     assert "Named first" in single
+    twins = single[single.index("Twins:") :]
+    assert all(k in twins for pair in scores.TWINS.items() for k in pair)
     undecided = notes([(t, result()) for t in every("undecidable")], "undecided")
     assert "Called unexplained" in undecided
     assert "Named first" not in undecided, "what cannot be decided is not asked for its name"
+    assert "Twins:" not in undecided
     assert "ours_first" not in single + undecided
 
 
