@@ -64,7 +64,7 @@ class Case(Strict):
     # that a declared coefficient took them (with none planted: none is far off); that more trips would tell
     asked: Literal["named", "absorbed", "not_decidable"] = "named"
     wanted: float | None = None  # least share of logs that do as asked
-    # least share that name exactly what was planted, with no class: of what has no twin (`planted_scores.TWINS`)
+    # least share that name exactly what was planted, with no class; of all logs, and of what has no twin by itself
     wanted_alone: float | None = None
     wanted_unexplained: float | None = None  # least share in which something is called unexplained
     wanted_pooled: float | None = None  # least share as asked over all settings of the case together

@@ -84,9 +84,9 @@ LEGEND = {  # of each table that is there; the first of every page
         "offset, and from inverter_loss with its standby), driveline_drag (from iron_loss), mass_scale (from "
         "power_gain's gain) and power_gain (from mass_scale). The right answer is a class of at most three that holds "
         "both, and is asked here: in the first table a name by itself counts, which is a guess there. A share with one "
-        "name is wanted of what has no twin; that of all logs stands beside it, not asked. Each part has to reach what "
-        "is wanted of all. Met: as asked is at least what is wanted, and so is, where wanted, the share with no class; "
-        "by interval: so are the lower ends of both intervals",
+        "name is wanted of all logs, of which only a guess could name more than those without a twin, and of these by "
+        "themselves. Each part has to reach what is wanted of all. Met: as asked is at least what is wanted, and so "
+        "is, where wanted, the share with no class; by interval: so are the lower ends of both intervals",
     ),
     "planted_rivals": (
         "Ours needs an entry that holds the planted effect, ours_first (classes set aside, what each entry is called) "
@@ -235,7 +235,7 @@ def _by_twin(config: "Config", setting: str, group: Group) -> list[dict[str, Any
                 "wanted": case.wanted if words != "all" else None,
                 "named_exactly_no_class": alone / n if lone else None,
                 "no_class_interval_95": list(wilson(alone, n)) if lone else None,
-                "no_class_wanted": case.wanted_alone if words == "no twin" else None,
+                "no_class_wanted": case.wanted_alone if lone else None,
             }))  # fmt: skip
     return rows
 

@@ -202,8 +202,8 @@ def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
     assert [right[k]["as_asked"] for k in right] == [1.0, 1.0, 1.0]
     assert [right[k]["named_exactly_no_class"] for k in right] == [0.5, 1.0, None]
     assert [right[k]["wanted"] for k in right] == [None, 0.88, 0.88]
-    assert [right[k]["no_class_wanted"] for k in right] == [None, 0.85, None]
-    assert [right[k]["met"] for k in right] == [None, True, True]
+    assert [right[k]["no_class_wanted"] for k in right] == [0.85, 0.85, None]
+    assert [right[k]["met"] for k in right] == [False, True, True], "of all logs one name is asked, twins or not"
     for guess in ("driveline_drag", "iron_loss"):
         rows = parts(guess, guess)
         assert (rows["a twin"]["as_asked"], rows["a twin"]["met"]) == (0.0, False)
