@@ -21,6 +21,7 @@ from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.sums import distance_from_table, evidence_of
 from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.fleet import SyntheticLog
+from hdev_jax.fleet.driving import GEAR_RATIOS
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.physics import LIBRARY, Grouped, Vehicle, at_null, most_group
 
@@ -115,7 +116,9 @@ def _with(
     leaves |= {k: v if isinstance(v, Grouped) else np.asarray(float(v)) for k, v in values.items()}
     effect = kind(**leaves)
     sized = [p.name for p in kind.parameters if p.kind in ("size", "limit") and values.get(p.name)]
-    return vehicle.plus(effect), table.plus(*effect_coefficients(effect, sized, shapes=False))
+    by_gear = [v.values for v in values.values() if isinstance(v, Grouped) and v.by == "gear"]
+    groups = [str(g) for v in by_gear for g in np.flatnonzero(np.asarray(v))]
+    return vehicle.plus(effect), table.plus(*effect_coefficients(effect, sized, shapes=False, groups=groups))
 
 
 def _in_library(id_: str, synthetic: SyntheticLog, split: Split) -> dict[str, Any] | None:
@@ -127,6 +130,9 @@ def _in_library(id_: str, synthetic: SyntheticLog, split: Split) -> dict[str, An
     values: dict[str, Any] = dict(truth.effects[id_])
     if id_ == "friction_blending":
         values["above_pa"] = 0.0
+    if id_ == "driveline_drag":
+        by_gear = [values.get(f"torque_nm[{n}]", 0.0) for n in range(1, len(GEAR_RATIOS) + 1)]
+        values = {"torque_nm": Grouped(jnp.asarray([0.0, *by_gear]) + values.get("torque_nm", 0.0), "gear")}
     if id_ == "voltage_dependence":
         values["at_v"] = float(synthetic.drive.columns["voltage_v"].mean())
     if id_ == "periodic_load":  # the truth's load comes on at its phase, the library's is centred there

@@ -17,7 +17,6 @@ MOST = 3  # names of a class that still is an answer
 # Nothing in the log can separate them; a class is the right answer.
 TWINS = {
     "auxiliary_power": "power_gain",  # its offset
-    "driveline_drag": "iron_loss",  # both by the motor's speed, behind the one efficiency from wheel to battery
     "mass_scale": "power_gain",  # its gain: the drag area gives back the one force that the mass does not touch
     "power_gain": "mass_scale",
 }

@@ -120,9 +120,11 @@ def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tup
                 for g in _grid(first, facts, grids):
                     yield variant, (None,), (*at, (first.name, g)), "limit"
             elif first.by:
-                # the commonest is the reference: it is declared already
-                if groups := tuple(sorted(facts.seen(first.by)[1:])):
+                # the commonest is the reference where it is declared already
+                if groups := tuple(sorted(facts.seen(first.by)[0 if first.whole else 1 :])):
                     yield variant * len(groups), groups, at, "size"
+                elif first.whole:
+                    yield variant, (None,) * len(variant), at, "size"
             else:
                 yield variant, (None,) * len(variant), at, "size"
 
@@ -221,7 +223,7 @@ def plan_of(
         if why := unavailable(c, facts.sample, vehicle.entry):
             left_out[c.id] = why
         else:
-            nulls.append(at_null(c, gears=facts.gears))
+            nulls.append(_as_seen(at_null(c, gears=facts.gears), facts))
     shared = [e for e in nulls if _row_level(e)]
     groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
     groups += [(shared[k : k + TOGETHER], None) for k in range(0, len(shared), TOGETHER)]
@@ -270,6 +272,12 @@ def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
     """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
     idle = {p.name for p in effect.parameters if p.kind == "limit" and p.name not in sizes}
     return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
+
+
+def _as_seen(effect: Effect, facts: Facts) -> Effect:
+    """The effect with one number for all rows in place of groups that the log does not tell."""
+    one = {p.name: np.asarray(p.null, dtype=float) for p in effect.parameters if p.whole and not facts.seen(p.by)}
+    return type(effect)(**({p.name: getattr(effect, p.name) for p in effect.parameters} | one)) if one else effect
 
 
 def _grouped(by_trip: Mapping[int, float]) -> Grouped:

@@ -40,8 +40,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
         return None
     clear = np.abs(plain) > BORNE_OUT * plain_sd
     borne_out = bool(np.any(clear))
-    grouped = any(g is not None for g in c.groups)
-    lends = c.kind == "size" and not (s.plain or grouped)
+    lends = c.kind == "size" and not s.plain
     if lends:
         # clusters that show nothing of a size say nothing of its error either; of its sign those that do may
         apart = stats.t.ppf(AGREES, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
@@ -110,7 +109,7 @@ def as_known(problem: Loop, state: Search) -> Calibration:
     """
     fit, found = state.fit, [f.score for f in state.found]
     declared = np.array([not c.path.startswith("effects.") for c in fit.table.free], dtype=bool)
-    if not declared.any() or any(s.plain or any(g is not None for g in s.candidate.groups) for s in found):
+    if not declared.any() or any(s.plain for s in found):
         return fit
     settled, covariance = settle(problem.ground(fit, problem.noise(fit)))
     error = np.sqrt(np.diag(covariance))

@@ -54,7 +54,12 @@ PLANTABLE: dict[str, Plant] = {
     "rotating_mass": Plant({"factor": 0.08}, ("factor",), _ROAD),
     "speed_scale": Plant({"scale": 0.02}, ("scale",), _ROAD),
     "cornering": Plant({"coefficient": 0.02}, ("coefficient",), _ROAD, match="noise"),
-    "driveline_drag": Plant({"torque_nm": 15.0}, ("torque_nm",), _ROAD),
+    # a clutch whose plates drag while it stands open, in the middle gears; the same torque in all is iron loss
+    "driveline_drag": Plant(
+        {"torque_nm[1]": 10.0, "torque_nm[2]": 25.0, "torque_nm[3]": 25.0, "torque_nm[4]": 10.0},
+        ("torque_nm", "torque_nm[1]", "torque_nm[2]", "torque_nm[3]", "torque_nm[4]"),
+        _ROAD,
+    ),
     "brake_drag": Plant({"force_n": 1500.0, "tau_s": 30.0}, ("force_n",), _ROAD),
     "friction_blending": Plant({"share": 0.35}, ("share",)),
     "regen_limit": Plant({"power_w": 90e3}, ("power_w",), null=np.inf),

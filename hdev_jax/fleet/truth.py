@@ -145,6 +145,12 @@ def _shaft_speed_radps(c: Columns) -> np.ndarray:
     return c["distance_m"] / c["duration_s"] * ratio / WHEEL_RADIUS_M
 
 
+def _driveline_drag_nm(c: Columns, p: Mapping[str, float]) -> np.ndarray:
+    """Torque of the driveline's drag [Nm], in all gears and in this one."""
+    by_gear = np.array([p.get(f"torque_nm[{n}]", 0.0) for n in range(1, len(GEAR_RATIOS) + 1)])
+    return p.get("torque_nm", 0.0) + by_gear[c["gear"].astype(int) - 1]
+
+
 def shaft_channels(drive: Drive, truth: Truth) -> dict[str, np.ndarray]:
     """Motor torque [Nm] and speed [rad/s] and traction force [N] of the drive without planted effects; the driveline
     between shaft and wheels loses 4 %."""
@@ -168,7 +174,7 @@ def _electric_w(drive: Drive, truth: Truth, fx: Effects, entry: str) -> np.ndarr
         if "regenerating_efficiency" in second:
             weak = np.array(truth.lottery)[c["trip"]] < second["share"]
             back = np.where(weak, second["regenerating_efficiency"], back)
-        drag = fx.get("driveline_drag", {}).get("torque_nm", 0.0) * _shaft_speed_radps(c)
+        drag = _driveline_drag_nm(c, fx.get("driveline_drag", {})) * _shaft_speed_radps(c)
         return _through(wheel, truth.efficiency * one, back) + drag
     back = _coefficient(truth, "regenerating_efficiency", c["trip"], fx)
     if entry == "wheel":

@@ -46,6 +46,7 @@ class Parameter:
     grid: tuple[float, ...] = ()
     least: float = 0.0
     by: Literal["", "gear", "road_surface"] = ""
+    whole: bool = False  # sought in the commonest group too (nothing declared stands for it), and without groups in all
     smooth: bool = False  # a limit whose difference grows about in proportion: a fraction of a grid step is as good
     of: str = ""  # a shape's: the only size that it acts on
     in_rows: bool = False  # `grid` and `scale` count rows of the log; multiplied by its median duration
@@ -67,9 +68,13 @@ class Grouped(eqx.Module):
     by: str = eqx.field(static=True)
 
     def at(self, row: Segments) -> Real:
-        """The value that holds for this row; ids below 0 take the first, ids past the end the last."""
-        key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.channels[self.by]
-        return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, self.values.shape[0] - 1)]
+        """The value that holds for this row; ids below 0 take the first, ids past the end the last.
+
+        A log without the channel is in the last group, as its ratio is the last gear's (`Driveline.ratio_radpm`).
+        """
+        last = self.values.shape[0] - 1
+        key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.get(self.by, float(last))
+        return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, last)]
 
 
 def resolve(tree: Any, row: Segments) -> Any:

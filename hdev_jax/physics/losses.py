@@ -10,14 +10,17 @@ __all__ = ["CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "Iro
 
 
 class DrivelineDrag(Effect):
-    """Drag torque at the motor shaft while it turns: τ₀ as a force τ₀·i/r at the wheel."""
+    """Drag torque at the motor shaft while it turns, by gear: τ₀[n] as a force τ₀[n]·i/r at the wheel.
+
+    The same torque in all gears is iron loss by the motor's speed under another name.
+    """
 
     id: ClassVar = "driveline_drag"
     stage: ClassVar = "driveline"
-    equation: ClassVar = "τ₀·i/r"
+    equation: ClassVar = "τ₀[n]·i/r"
     source: ClassVar = "Naunheimer, Fahrzeuggetriebe (no-load losses)"
     entries: ClassVar = ("road",)
-    parameters: ClassVar = (Parameter("torque_nm", "Nm", 0.0, 5.0, 0.0, 200.0, least=0.05),)
+    parameters: ClassVar = (Parameter("torque_nm", "Nm", 0.0, 5.0, 0.0, 200.0, by="gear", whole=True, least=0.05),)
     mistaken_for: ClassVar = ("iron_loss", "constant_headwind")
     separated_by: ClassVar = "coasting in several gears"
     torque_nm: Any

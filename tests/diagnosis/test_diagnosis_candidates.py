@@ -165,6 +165,36 @@ def test_finer_grids(effect_id, problem, gathered):
                 assert grids[name] == (at,)
 
 
+def test_drag_of_the_driveline_is_sought_in_every_gear(problem, rows):
+    """Nothing declared stands for the commonest gear, as an efficiency does for `gear_efficiency`."""
+    (c,), made, _ = columns(problem.vehicle, [LIBRARY["driveline_drag"]], rows.segments, rows.rows, problem.target)
+    assert (c.sizes, c.groups) == (("torque_nm",) * 4, (1, 2, 3, 4))
+    car, segments = problem.vehicle, problem.segments
+    ratio = np.array([9.16, 5.27, 3.33, 2.16])[np.asarray(segments.channels["gear"], dtype=int) - 1] * 4.5 / 0.5
+    turns = ratio * np.asarray(segments.distance_m) / (2 * np.pi)
+    for gear, k in zip(c.groups, c.columns, strict=True):  # a newton metre over a turn is 2π joules
+        expected = np.where(segments.channels["gear"] == gear, 2 * np.pi * turns / 3600, 0.0)
+        np.testing.assert_allclose(made[:, k], expected, rtol=1e-9, atol=1e-12)
+    back = realised(c, np.array([1.0, 2.0, 3.0, 4.0]), gears=4)
+    added = predicted(problem, rows, car.plus(back)) - predicted(problem, rows, car)
+    np.testing.assert_allclose(added, made[:, list(c.columns)] @ [1.0, 2.0, 3.0, 4.0], rtol=1e-6, atol=1e-9)
+
+
+def test_without_a_gear_drag_of_the_driveline_is_one_number(problem):
+    segments = replace(problem.segments, channels={k: v for k, v in problem.segments.channels.items() if k != "gear"})
+    rows = padded(segments, problem.measured)
+    effects = [LIBRARY[k] for k in ("driveline_drag", "gear_efficiency")]
+    (c,), made, left_out = columns(problem.vehicle, effects, rows.segments, rows.rows, problem.target)
+    assert (c.id, c.sizes, c.groups) == ("driveline_drag", ("torque_nm",), (None,))
+    assert set(left_out) == {"gear_efficiency"}
+    car = problem.vehicle.plus(realised(c, np.array([7.0])))
+    added = predicted(problem, rows, car) - predicted(problem, rows, problem.vehicle)
+    np.testing.assert_allclose(added, 7.0 * made[:, c.columns[0]], rtol=1e-6, atol=1e-9)
+    # by gear, from a sheet, it is the last gear's, as the ratio is
+    by_gear = LIBRARY["driveline_drag"](torque_nm=Grouped(jnp.asarray([0.0, 1.0, 2.0, 3.0, 7.0]), "gear"))
+    np.testing.assert_allclose(predicted(problem, rows, problem.vehicle.plus(by_gear)), predicted(problem, rows, car))
+
+
 # --- a step as plain values ------------------------------------------------------------------------------------------
 
 

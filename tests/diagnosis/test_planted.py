@@ -38,7 +38,7 @@ PLANTED = {
     "friction_blending": ("share", {}),
     "regen_limit": ("power_w", {}),
     "regen_cutoff": ("speed_mps", {}),
-    "driveline_drag": ("torque_nm", {}),
+    "driveline_drag": ("torque_nm[3]", {}),
     "copper_loss": ("w_per_nm2", {"entry": "shaft", "mode": "samples", "rows_per_trip": 600, "trips": 12}),
     "time_skew": ("skew_s", {"entry": "shaft", "mode": "samples", "rows_per_trip": 600, "trips": 12}),
 }

@@ -192,19 +192,19 @@ def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
     setting = "one effect, size 0.5, 12 trips, ar1"
     winds = [(t, result(["headwind"])) for t in every("single", effects=["headwind"])]
 
-    def parts(folder: str, *of_drag: str) -> dict[str, dict]:
-        drags = [(t, result(list(of_drag))) for t in every("single", effects=["driveline_drag"])]
-        rows = told(tmp_path / folder, winds + drags)
+    def parts(folder: str, *of_gain: str) -> dict[str, dict]:
+        gains = [(t, result(list(of_gain))) for t in every("single", effects=["power_gain"])]
+        rows = told(tmp_path / folder, winds + gains)
         return {words: rows[f"{setting}: {words}"] for words in ("all", "no twin", "a twin")}
 
-    right = parts("class", "iron_loss", "driveline_drag")
+    right = parts("class", "mass_scale", "power_gain")
     assert [right[k]["n"] for k in right] == [20, 10, 10]
     assert [right[k]["as_asked"] for k in right] == [1.0, 1.0, 1.0]
     assert [right[k]["named_exactly_no_class"] for k in right] == [0.5, 1.0, None]
     assert [right[k]["wanted"] for k in right] == [None, 0.88, 0.88]
     assert [right[k]["no_class_wanted"] for k in right] == [0.85, 0.85, None]
     assert [right[k]["met"] for k in right] == [False, True, True], "of all logs one name is asked, twins or not"
-    for guess in ("driveline_drag", "iron_loss"):
+    for guess in ("power_gain", "mass_scale"):
         rows = parts(guess, guess)
         assert (rows["a twin"]["as_asked"], rows["a twin"]["met"]) == (0.0, False)
         assert (rows["all"]["as_asked"], rows["all"]["named_exactly_no_class"]) == (0.5, 0.5)
@@ -214,8 +214,8 @@ def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
 def test_settings_that_ask_no_single_names_show_their_twins_and_those_that_ask_no_names_none(tmp_path):
     quarter = [(t, result(["headwind"])) for t in every("single_quarter", effects=["headwind"])]
     assert not any(": " in name for name in told(tmp_path / "none", quarter)), "nothing to tell apart"
-    drags = [(t, result(["iron_loss", "driveline_drag"])) for t in every("single_quarter", effects=["driveline_drag"])]
-    rows = told(tmp_path / "some", quarter + drags)
+    gains = [(t, result(["mass_scale", "power_gain"])) for t in every("single_quarter", effects=["power_gain"])]
+    rows = told(tmp_path / "some", quarter + gains)
     row = rows["one effect, size 0.25, 12 trips, ar1: no twin"]
     assert (row["wanted"], row["no_class_wanted"], row["met"]) == (0.7, None, True)
     absorbed = [(t, result()) for t in every("absorbed_shaft")]
@@ -223,11 +223,11 @@ def test_settings_that_ask_no_single_names_show_their_twins_and_those_that_ask_n
 
 
 def test_a_twin_is_never_separable_whatever_the_oracle_says(tmp_path):
-    drags = [
-        (t, result(["iron_loss", "driveline_drag"], alike={"driveline_drag": []}))
-        for t in every("single", effects=["driveline_drag"])
+    gains = [
+        (t, result(["mass_scale", "power_gain"], alike={"power_gain": []}))
+        for t in every("single", effects=["power_gain"])
     ]
-    assert told(tmp_path, drags)["one effect, size 0.5, 12 trips, ar1"]["separable"] == 0.0
+    assert told(tmp_path, gains)["one effect, size 0.5, 12 trips, ar1"]["separable"] == 0.0
     other = [(t, result(["hvac_power"])) for t in every("approximated", effects=["squared_hvac_power"])]
     row = told(tmp_path / "b", other)["a truth that the library holds in another form, size 1, 24 trips, ar1"]
     assert row["separable"] is None, "the oracle was never asked"

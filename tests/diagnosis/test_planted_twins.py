@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from planted import opened
@@ -14,7 +15,7 @@ from hdev_jax.diagnosis.candidates import columns
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.truth import power_w
 from hdev_jax.inference import jacobian
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import LIBRARY, Grouped
 
 STUDY = Path(__file__).parents[2] / "configs" / "studies" / "planted.toml"
 ROAD = [effect for (effect,) in typed(Config, resolve(STUDY), STUDY).sets["road"]]
@@ -46,9 +47,11 @@ def test_another_mass_is_a_gain_of_the_power_and_another_drag_area(scale):
     np.testing.assert_allclose(gain, mass, rtol=1e-9, atol=1e-6)
 
 
-def test_drag_of_the_driveline_is_iron_loss_by_the_speed(tmp_path):
+def test_the_same_drag_in_all_gears_is_iron_loss_by_the_speed(tmp_path):
+    """Planted so, it is a class of both; planted by gear as the study has it, it has no twin."""
     _, problem, _ = opened(tmp_path, seed=3)
-    drag = problem.predict(problem.vehicle.plus(LIBRARY["driveline_drag"](torque_nm=np.asarray(15.0))))
+    by_gear = Grouped(jnp.full(5, 15.0), "gear")
+    drag = problem.predict(problem.vehicle.plus(LIBRARY["driveline_drag"](torque_nm=by_gear)))
     loss = LIBRARY["iron_loss"](w_per_radps=np.asarray(15.0), w_per_radps2=np.asarray(0.0))
     np.testing.assert_allclose(problem.predict(problem.vehicle.plus(loss)), drag, rtol=1e-9, atol=1e-9)
 

@@ -43,7 +43,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "tyre_warmup": {"excess": 0.4, "distance_m": 300.0},
     "wet_road": {"excess": 0.3, "spray": 0.2},
     "brake_drag": {"force_n": 300.0, "tau_s": 20.0},
-    "driveline_drag": {"torque_nm": 4.0},
+    "driveline_drag": {"torque_nm": (0.0, 2.0, 4.5, 7.0, 3.0)},
     "gear_efficiency": {"delta": (0.0, 0.01, -0.02, 0.03, 0.015)},
     "copper_loss": {"w_per_nm2": 0.02},
     "inverter_loss": {"standby_w": 150.0, "per_nm_w": 2.0},

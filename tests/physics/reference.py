@@ -114,7 +114,7 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
     force = force / car["efficiency"] if force > 0 else force * car["efficiency"]
     ratio = car["gear_ratios"][int(r["gear"]) - 1] * car["final_drive"] / car["wheel_radius_m"]
     if p := effects.get("driveline_drag"):
-        force += p["torque_nm"] * ratio
+        force += p["torque_nm"][int(r["gear"])] * ratio
     if p := effects.get("gear_efficiency"):
         force += p["delta"][int(r["gear"])] * abs(force)
     torque, omega, power = force / ratio, v * ratio, force * v
