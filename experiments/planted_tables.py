@@ -81,9 +81,10 @@ LEGEND = {  # of each table that is there; the first of every page
     "planted_names_by_twin": (
         "Twins: three effects cannot be told from another one by any log of road segments under this sheet (drag area "
         "open, no declared load), once rolling resistance and drag area are fitted: auxiliary_power (from power_gain's "
-        "offset, and from inverter_loss with its standby), mass_scale (from power_gain's gain) and power_gain (from mass_scale). The right answer is a class of at most three that holds "
-        "both, and is asked here: in the first table a name by itself counts, which is a guess there. A share with one "
-        "name is wanted of all logs, of which only a guess could name more than those without a twin, and of these by "
+        "offset, and from inverter_loss with its standby), mass_scale (from power_gain's gain) and power_gain (from "
+        "mass_scale). The right answer is a class of at most three that holds both, and is asked here: in the first "
+        "table a name by itself counts, which is a guess there. A share with one name is wanted of all logs, of which "
+        "only a guess could name more than those without a twin, and of these by "
         "themselves. Each part has to reach what is wanted of all. Met: as asked is at least what is wanted, and so "
         "is, where wanted, the share with no class; by interval: so are the lower ends of both intervals",
     ),
