@@ -131,8 +131,9 @@ def _in_library(id_: str, synthetic: SyntheticLog, split: Split) -> dict[str, An
     if id_ == "friction_blending":
         values["above_pa"] = 0.0
     if id_ == "driveline_drag":
-        by_gear = [values.get(f"torque_nm[{n}]", 0.0) for n in range(1, len(GEAR_RATIOS) + 1)]
-        values = {"torque_nm": Grouped(jnp.asarray([0.0, *by_gear]) + values.get("torque_nm", 0.0), "gear")}
+        every = values.get("torque_nm", 0.0)
+        by_gear = [every + values.get(f"torque_nm[{n}]", 0.0) for n in range(1, len(GEAR_RATIOS) + 1)]
+        values = {"torque_nm": Grouped(jnp.asarray([0.0, *by_gear]), "gear")}
     if id_ == "voltage_dependence":
         values["at_v"] = float(synthetic.drive.columns["voltage_v"].mean())
     if id_ == "periodic_load":  # the truth's load comes on at its phase, the library's is centred there

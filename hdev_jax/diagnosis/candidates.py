@@ -1,7 +1,7 @@
 """Candidates: what each effect that the vehicle lacks would add to every row, without refitting anything."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Protocol, runtime_checkable
 
@@ -58,6 +58,16 @@ class Candidate:
         """How many numbers it fits, those chosen on a grid included."""
         chosen = sum(len(p.grid) > 1 for p in self.effect.parameters if p.kind in FIXED and _matters(p, self.sizes))
         return len(self.columns) + chosen
+
+    def only(self, kept: Sequence[bool] | np.ndarray) -> "Candidate | None":
+        """With these of its columns: those of a group (a gear) may go by themselves, others all or none."""
+        if all(kept):
+            return self
+        if None in self.groups or not any(kept):
+            return None
+        at = np.flatnonzero(np.asarray(kept))
+        sizes, groups, columns = (tuple(x[k] for k in at) for x in (self.sizes, self.groups, self.columns))
+        return replace(self, sizes=sizes, groups=groups, columns=columns)
 
     @property
     def by_trip(self) -> dict[str, dict[int, float]]:

@@ -1,6 +1,6 @@
 """The best way to have each effect: what is plausible, what it is worth, and how many ways were tried."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -24,8 +24,27 @@ def plausible(s: Score) -> bool:
         size = abs(dict(c.shapes)[first.name] * s.beta[0])
         return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5 and size >= first.least)
     parameters = [c.parameter(n) for n in c.sizes]
-    within = all(p.lower <= p.null + b <= p.upper for p, b in zip(parameters, s.beta, strict=True))
-    return within and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
+    return not any(_outside(s)) and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
+
+
+def _outside(s: Score) -> list[float]:
+    """How far each size is beyond its range."""
+    each = [(s.candidate.parameter(n), b) for n, b in zip(s.candidate.sizes, s.beta, strict=True)]
+    return [max(p.lower - p.null - b, p.null + b - p.upper, 0.0) for p, b in each]
+
+
+def _inside(s: Score, scores: Callable[[Sequence[Candidate]], list[Score]]) -> Score:
+    """The score without the groups whose sizes come out beyond their range: a gear in which nothing drags.
+
+    One after the other, the furthest first. What the others explain is χ² of their own number, given that these went
+    (the conditional form of the chi-bar-square test: Wollan and Dykstra, 1986).
+    """
+    while s.candidate.kind == "size" and any(outside := _outside(s)):
+        kept = s.candidate.only(np.arange(len(outside)) != int(np.argmax(outside)))
+        if kept is None:
+            break
+        (s,) = scores([kept])
+    return s
 
 
 def worth(gain: float, c: Candidate) -> float:
@@ -43,7 +62,7 @@ def best_of(
     totals = evidence.totals()
     squares = np.diag(totals[0])[evidence.base : -1]
     there = np.isfinite(squares) & (squares > 1e-20)
-    every = [c for c in candidates if there[list(c.columns)].all()]
+    every = [k for c in candidates if (k := c.only(there[list(c.columns)])) is not None]
     ranked: dict[str, list[tuple[float, Candidate]]] = {}
     for c, gain in zip(every, evidence.gains(totals, [c.columns for c in every]), strict=True):
         ranked.setdefault(c.id, []).append((worth(float(gain), c), c))
@@ -54,6 +73,8 @@ def best_of(
     }
     scored = _by_id(leading, evidence.scores([c for cs in leading.values() for c in cs]))
     scored_plain = _by_id(steady, plain.plain_scores([c for cs in steady.values() for c in cs]))
+    scored = {id_: [_inside(s, evidence.scores) for s in scores] for id_, scores in scored.items()}
+    scored_plain = {id_: [_inside(s, plain.plain_scores) for s in scores] for id_, scores in scored_plain.items()}
     best, ways = {}, {}
     for id_, entries in ranked.items():
         apart = evidence.projected(np.unique([k for _, c in entries for k in c.columns]))

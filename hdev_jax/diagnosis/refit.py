@@ -43,7 +43,8 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     lends = c.kind == "size" and not s.plain
     if lends:
         # clusters that show nothing of a size say nothing of its error either; of its sign those that do may
-        apart = stats.t.ppf(AGREES, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
+        one = (1.0 - AGREES) / (len(c.groups) if None not in c.groups else 1)
+        apart = stats.t.isf(one, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
         turned = clear & (np.sign(plain) != np.sign(white))
         lends = bool(np.all((np.abs(plain - white) <= apart * plain_sd) & ~turned))
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
@@ -57,9 +58,19 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     tries = (joined(problem, state, refined, way) for way in ways)
     new = next((t for t in tries if t is not None), None)
     if new is None:
-        return None
+        fewer = _without_weakest(c, white, white_sd)
+        return None if fewer is None else refit(problem, state, view.evidence.score(fewer), view)
     started = replace(s, candidate=replace(c, shapes=refined.candidate.shapes), beta=refined.beta)
     return new, _gain(problem, state, new.fit, view), started
+
+
+def _without_weakest(c: Candidate, white: np.ndarray, sd: np.ndarray) -> Candidate | None:
+    """Without the group whose size is least clear of its bound, which the joint refit may put beyond it; None where
+    all are clear."""
+    lower = np.array([c.parameter(n).lower - c.parameter(n).null for n in c.sizes])
+    clear = (white - lower) / sd
+    weakest = int(np.argmin(clear))
+    return c.only(np.arange(len(clear)) != weakest) if c.kind == "size" and clear[weakest] < 2.0 else None
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:

@@ -158,6 +158,13 @@ class Builder:
             last = _LAST_STAGE.get(self.target, "battery")
             if reason is None and STAGES.index(cls.stage) > STAGES.index(last):
                 reason = f"acts behind the target {self.target}"
+            grouped = [
+                p
+                for p in cls.parameters
+                if p.by and (d := sheet.declared.get(f"effects.{cls.id}.{p.name}")) and d.groups
+            ]
+            if reason is None and (lost := [p for p in grouped if not self.segments.has(p.by)]):
+                reason = f"{lost[0].name} is by {lost[0].by}, and the log has no column '{lost[0].by}'"
             if reason:
                 self.notes.append(f"effect {effect_id} of the sheet is skipped: {reason}")
             else:

@@ -68,13 +68,9 @@ class Grouped(eqx.Module):
     by: str = eqx.field(static=True)
 
     def at(self, row: Segments) -> Real:
-        """The value that holds for this row; ids below 0 take the first, ids past the end the last.
-
-        A log without the channel is in the last group, as its ratio is the last gear's (`Driveline.ratio_radpm`).
-        """
-        last = self.values.shape[0] - 1
-        key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.get(self.by, float(last))
-        return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, last)]
+        """The value that holds for this row; ids below 0 take the first, ids past the end the last."""
+        key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.channels[self.by]
+        return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, self.values.shape[0] - 1)]
 
 
 def resolve(tree: Any, row: Segments) -> Any:

@@ -190,9 +190,6 @@ def test_without_a_gear_drag_of_the_driveline_is_one_number(problem):
     car = problem.vehicle.plus(realised(c, np.array([7.0])))
     added = predicted(problem, rows, car) - predicted(problem, rows, problem.vehicle)
     np.testing.assert_allclose(added, 7.0 * made[:, c.columns[0]], rtol=1e-6, atol=1e-9)
-    # by gear, from a sheet, it is the last gear's, as the ratio is
-    by_gear = LIBRARY["driveline_drag"](torque_nm=Grouped(jnp.asarray([0.0, 1.0, 2.0, 3.0, 7.0]), "gear"))
-    np.testing.assert_allclose(predicted(problem, rows, problem.vehicle.plus(by_gear)), predicted(problem, rows, car))
 
 
 # --- a step as plain values ------------------------------------------------------------------------------------------
