@@ -456,6 +456,18 @@ def test_an_effect_by_gear(sheet):
     np.testing.assert_allclose(ratio, delta * np.sign(plain), atol=1e-12)
 
 
+def test_an_effect_by_gear_is_skipped_where_the_log_tells_none_and_one_number_holds_in_all(sheet):
+    by_gear, one = "torque_nm = { 1 = 5.0, 2 = 9.0 }", "torque_nm = { value = 9.0, sd = 1.0 }"
+    log = a_log()
+    built = sheet(FULL + f"[effects.driveline_drag]\n{by_gear}\n").build(log, "road", "energy_wh")
+    assert not built.vehicle.has("driveline_drag")
+    assert any("driveline_drag" in n and "no column 'gear'" in n for n in built.notes)
+    built = sheet(FULL + f"[effects.driveline_drag]\n{one}\n").build(log, "road", "energy_wh")
+    assert [(c.name, c.free) for c in built.table.rows if c.path.startswith("effects.")] == [
+        ("effects.driveline_drag.torque_nm", True)
+    ]
+
+
 def test_effects_of_the_users_own(tmp_path):
     class Mine(LIBRARY["auxiliary_power"]):
         id = "mine"

@@ -1,0 +1,76 @@
+"""Sizes by gear: a gear in which an effect does nothing leaves with its column, the effect stays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import opened
+
+from hdev_jax.diagnosis.candidates import columns
+from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
+from hdev_jax.diagnosis.problem import Problem
+from hdev_jax.diagnosis.refit import _without_weakest
+from hdev_jax.diagnosis.split import Split
+from hdev_jax.physics import LIBRARY
+
+FEW = ("driveline_drag", "iron_loss", "gear_efficiency", "constant_headwind", "auxiliary_power", "rolling_speed")
+
+
+def diagnosed(problem: Problem, split: Split) -> Diagnosis:
+    return diagnose(problem, split, {k: LIBRARY[k] for k in FEW}, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("seed", "torque"),
+    [(3, {2: 25.0, 3: 25.0}), (4, {2: 25.0, 3: 25.0}), (1, {1: 40.0})],
+    ids=["middle gears", "middle gears again", "first gear"],
+)
+def test_a_drag_of_some_gears_is_found_though_others_have_none(seed, torque, tmp_path):
+    """An estimate of nothing is negative in half of the logs: that refuses its gear, not the drag of the others."""
+    planted = {"driveline_drag": {f"torque_nm[{n}]": x for n, x in torque.items()}}
+    synthetic, problem, split = opened(
+        tmp_path, seed=seed, trips=12, rows_per_trip=200, effects=planted, ratio=1.0, ar_coefficient=0.9
+    )
+    summary = diagnosed(problem, split).summary
+    assert [(e["id"], e["indistinguishable_from"]) for e in summary["effects"]] == [("driveline_drag", [])]
+    sizes = summary["effects"][0]["parameters"]
+    truth = synthetic.vehicle.effects["driveline_drag"]
+    assert all(abs(p["value"] - truth.get(name, 0.0)) <= 3.0 * p["sd"] for name, p in sizes.items())
+    assert {f"torque_nm[{n}]" for n in torque} <= set(sizes)
+    assert all(p["value"] >= 0.0 for p in sizes.values())
+
+
+def test_neutral_at_standstill_takes_no_effect_away(tmp_path):
+    """Its column is nothing but zeros: there is no such gear to have a torque in."""
+    _, problem, split = opened(tmp_path, seed=1, trips=12, rows_per_trip=200, effects={"driveline_drag": {}}, ratio=1.0)
+    before = diagnosed(problem, split).summary["effects"]
+    stands = np.asarray(problem.segments.distance_m) == 0
+    assert stands.mean() > 0.02
+    gear = np.where(stands, 0.0, problem.segments.channels["gear"])
+    neutral = replace(problem, segments=problem.segments.with_channels(gear=gear))
+    after = diagnosed(neutral, split).summary["effects"]
+    assert [e["id"] for e in after] == [e["id"] for e in before] == ["driveline_drag"]
+    assert set(after[0]["parameters"]) == {f"torque_nm[{n}]" for n in (1, 2, 3, 4)}
+    for name, p in after[0]["parameters"].items():
+        np.testing.assert_allclose(p["value"], before[0]["parameters"][name]["value"], rtol=1e-6)
+
+
+def test_groups_may_go_one_by_one_and_other_sizes_all_together(tmp_path):
+    _, problem, _ = opened(tmp_path, seed=1, trips=3)
+    effects = [LIBRARY[k] for k in ("driveline_drag", "hvac_power")]
+    every, _, _ = columns(problem.vehicle, effects, problem.segments, len(problem.measured), problem.target)
+    drag = next(c for c in every if c.id == "driveline_drag")
+    two = drag.only([False, True, True, False])
+    assert two is not None
+    assert (two.sizes, two.groups, two.columns) == (("torque_nm",) * 2, (2, 3), drag.columns[1:3])
+    assert drag.only([True] * 4) is drag
+    assert drag.only([False] * 4) is None
+    both = next(c for c in every if len(c.sizes) == 2 and c.id == "hvac_power")
+    assert both.only([True, True]) is both
+    assert both.only([True, False]) is None, "heating without cooling is a way of its own, with its own shapes"
+    # what the joint refit may put below nothing goes; where each is clear of it, none does
+    fewer = _without_weakest(drag, np.array([9.0, 0.5, 7.0, 8.0]), np.ones(4))
+    assert fewer is not None
+    assert fewer.groups == (1, 3, 4)
+    assert _without_weakest(drag, np.array([9.0, 2.5, 7.0, 8.0]), np.ones(4)) is None
+    assert _without_weakest(both, np.array([9.0, 0.5]), np.ones(2)) is None
