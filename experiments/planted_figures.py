@@ -47,7 +47,7 @@ def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     Its caller leaves out what is planted to be called something else than by its name.
     """
     done = _compared(done, rivals)
-    single = [(t, r) for t, r in done if len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
+    single = [(t, r) for t, r in done if t["size"] and len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
     if len({t["size"] for t, _ in single}) < 2:  # one size is a row of a table
         return
     fig = figure(6.4, 3.8)

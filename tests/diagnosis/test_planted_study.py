@@ -222,6 +222,15 @@ def test_settings_that_ask_no_single_names_show_their_twins_and_those_that_ask_n
     assert not any(": " in name for name in told(tmp_path / "absorbed", absorbed))
 
 
+def test_what_is_planted_as_it_is_has_no_place_on_the_axis_of_sizes(tmp_path):
+    sized = [
+        (t, result(["headwind"])) for case in ("single", "single_quarter") for t in every(case, effects=["headwind"])
+    ]
+    same = [(t, result(["iron_loss", "driveline_drag"])) for t in every("same_drag")]
+    rows = told(tmp_path, sized + same)
+    assert rows["the same drag in all gears, a class with iron loss, 12 trips, ar1"]["as_asked"] == 1.0
+
+
 def test_a_twin_is_never_separable_whatever_the_oracle_says(tmp_path):
     gains = [
         (t, result(["mass_scale", "power_gain"], alike={"power_gain": []}))
