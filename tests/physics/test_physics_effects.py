@@ -96,16 +96,24 @@ def test_needs_are_what_it_reads(effect_id: str) -> None:
 
 
 def test_reads_nothing_else(effect_id: str) -> None:
-    """The effect runs on a log of its own channels and those of the chain's entry alone, each alternative in turn."""
+    """The effect runs on a log of its own channels and those of the chain's entry alone, each alternative in turn.
+
+    What may be by gear reads the gear where it is, and needs none where it is one number.
+    """
     effect = LIBRARY[effect_id]
     log = made.log_for(effect_id)
     entry = {"road": (), "wheel": ("traction_force_n",), "shaft": ("motor_torque_nm", "motor_speed_radps")}
-    car = made.without_effect(effect_id).plus(made.typical(effect_id))
+    typical = made.typical(effect_id)
+    groups = {p.name: p.by for p in effect.parameters if p.whole}
+    one = effect(**{p.name: getattr(typical, p.name) for p in effect.parameters} | {k: np.asarray(1.0) for k in groups})
+    forms = [(one, set())] + [(typical, set(groups.values()))] * bool(groups)
     longest = max((len(need.split("|")) for need in effect.needs), default=1)
     for k in range(longest):
         names = {need.split("|")[min(k, need.count("|"))] for need in effect.needs}
         names |= set(entry[made.entry_of(effect_id)])
-        assert np.all(np.isfinite(car.energy(log.without(*set(log.channels) - names))))
+        for form, by in forms:
+            car = made.without_effect(effect_id).plus(form)
+            assert np.all(np.isfinite(car.energy(log.without(*set(log.channels) - names - by))))
 
 
 def test_a_users_effect_must_have_a_name_of_its_own(effect_id: str) -> None:
