@@ -84,9 +84,9 @@ LEGEND = {  # of each table that is there; the first of every page
         "offset, and from inverter_loss with its standby), mass_scale (from power_gain's gain) and power_gain (from "
         "mass_scale). The right answer is a class of at most three that holds both, and is asked here: in the first "
         "table a name by itself counts, which is a guess there. A share with one name is wanted of all logs, of which "
-        "only a guess could name more than those without a twin, and of these by "
-        "themselves. Each part has to reach what is wanted of all. Met: as asked is at least what is wanted, and so "
-        "is, where wanted, the share with no class; by interval: so are the lower ends of both intervals",
+        "only a guess could name more than those without a twin, and of these by themselves. Each part has to reach "
+        "what is wanted of all. Met: as asked is at least what is wanted, and so is, where wanted, the share with no "
+        "class; by interval: so are the lower ends of both intervals",
     ),
     "planted_rivals": (
         "Ours needs an entry that holds the planted effect, ours_first (classes set aside, what each entry is called) "

@@ -36,8 +36,9 @@ def _outside(s: Score) -> list[float]:
 def _inside(s: Score, scores: Callable[[Sequence[Candidate]], list[Score]]) -> Score:
     """The score without the groups whose sizes come out beyond their range: a gear in which nothing drags.
 
-    One after the other, the furthest first. What the others explain is χ² of their own number, given that these went
-    (the conditional form of the chi-bar-square test: Wollan and Dykstra, 1986).
+    One after the other, the furthest first; none comes back. What the others explain is χ² of their own number, given
+    that these went (the conditional form of the chi-bar-square test: Wollan and Dykstra, 1986). That is so where the
+    bound is the null, as a drag's is; a group beyond another bound goes too, and is then taken to be null.
     """
     while s.candidate.kind == "size" and any(outside := _outside(s)):
         kept = s.candidate.only(np.arange(len(outside)) != int(np.argmax(outside)))
