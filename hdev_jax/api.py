@@ -18,7 +18,7 @@ from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.inference.sheet_text import augmented_sheet
 from hdev_jax.logs import read_log, write_adapter_skeleton
 from hdev_jax.opening import Paths, chosen_effects, command_line, known_effects, opened
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import LIBRARY, Parameter
 from hdev_jax.posterior import calibrate
 from hdev_jax.prediction import predict, write_predictive
 from hdev_jax.report.build import answer_text, of_diagnosis
@@ -154,12 +154,16 @@ def effects() -> list[dict[str, str]]:
             "id": c.id,
             "stage": c.stage,
             "equation": c.equation,
-            "parameters": ", ".join(f"{p.name} [{p.unit}]" for p in c.parameters),
+            "parameters": ", ".join(f"{p.name} [{p.unit}]{_by(p)}" for p in c.parameters),
             "needs": ", ".join(n.replace("|", " or ") for n in c.needs) or "-",
             "source": c.source,
         }
         for c in LIBRARY.values()
     ]
+
+
+def _by(p: Parameter) -> str:
+    return f" by {p.by.replace('_', ' ')}" if p.by else ""
 
 
 def _augmented(result: Diagnosis, sheet: Sheet) -> str:

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from hdev_jax import progress
-from hdev_jax.diagnosis.candidates import FIXED, plan_of
-from hdev_jax.diagnosis.facts import GROUPS, facts_of
+from hdev_jax.diagnosis.candidates import FIXED, as_seen, plan_of
+from hdev_jax.diagnosis.facts import GROUPS, Facts, facts_of
 from hdev_jax.diagnosis.problem import Problem, prepare
 from hdev_jax.diagnosis.programs import computed
 from hdev_jax.diagnosis.split import Split, split_trips
@@ -162,7 +162,7 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
             plan = plan_of(car, [c], facts, problem.target, searched=True)
             for column in computed(plan.recipes, rows.segments, problem.target):
                 bad |= ~np.isfinite(column[: rows.rows])
-            null = plain if c.id in plan.left_out else problem.predict(car.plus(_idle(c, facts.gears)))
+            null = plain if c.id in plan.left_out else problem.predict(car.plus(_idle(c, facts)))
         except Exception as e:
             hint = "; every channel that it reads belongs in its needs" if isinstance(e, KeyError) else ""
             raise InputError(f"{where}: fails on this log: {type(e).__name__}: {e}{hint}") from e
@@ -180,9 +180,9 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
             )
 
 
-def _idle(effect: type[Effect], gears: int) -> Effect:
+def _idle(effect: type[Effect], facts: Facts) -> Effect:
     """With its sizes null and each shape at a value that is tried."""
-    null = at_null(effect, gears=gears)
+    null = as_seen(at_null(effect, gears=facts.gears), facts)
     values = {p.name: getattr(null, p.name) for p in effect.parameters}
     tried = {p.name: np.asarray(float(p.grid[0])) for p in effect.parameters if p.kind in FIXED and len(p.grid)}
     return effect(**(values | tried))

@@ -22,6 +22,7 @@ __all__ = [
     "Grids",
     "Plan",
     "Source",
+    "as_seen",
     "beyond",
     "columns",
     "finer",
@@ -233,7 +234,7 @@ def plan_of(
         if why := unavailable(c, facts.sample, vehicle.entry):
             left_out[c.id] = why
         else:
-            nulls.append(_as_seen(at_null(c, gears=facts.gears), facts))
+            nulls.append(as_seen(at_null(c, gears=facts.gears), facts))
     shared = [e for e in nulls if _row_level(e)]
     groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
     groups += [(shared[k : k + TOGETHER], None) for k in range(0, len(shared), TOGETHER)]
@@ -284,7 +285,7 @@ def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
     return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
 
 
-def _as_seen(effect: Effect, facts: Facts) -> Effect:
+def as_seen(effect: Effect, facts: Facts) -> Effect:
     """The effect with one number for all rows in place of groups that the log does not tell."""
     one = {p.name: np.asarray(p.null, dtype=float) for p in effect.parameters if p.whole and not facts.seen(p.by)}
     return type(effect)(**({p.name: getattr(effect, p.name) for p in effect.parameters} | one)) if one else effect

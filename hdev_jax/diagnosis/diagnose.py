@@ -62,7 +62,7 @@ def diagnose(
     train = problem.rows(split.train)
     rows = padded(problem.segments.take(train), problem.measured[train])
     real = problem.segments.take(train)
-    gears = most_group(real)
+    gears = most_group(problem.segments)  # one that no training trip has is left without a size, as in the sheet
 
     def remember(step: int, compute: Callable[[], Search]) -> Search:
         plain = checkpoint(f"step-{step}", lambda: to_plain(compute()))
@@ -75,7 +75,7 @@ def diagnose(
     effects = list(library.values())
     state = search(
         problem.vehicle, problem.table, rows, problem.target, effects,
-        fdr=fdr, seed=seed, tell=tell, remember=remember,
+        fdr=fdr, seed=seed, gears=gears, tell=tell, remember=remember,
     )  # fmt: skip
     tell("error before and after on test trips")
     loop = Loop(rows, problem.target, cluster_rows(real), effects, fdr, np.random.default_rng([seed, 999]), gears)

@@ -163,6 +163,11 @@ class View:
         every = [1.0 if k in self.absorbed_by else min(1.0, s.p * self.ways[k]) for k, s in self.best.items()]
         self.q = dict(zip(self.best, map(float, stats.false_discovery_control(every)), strict=True))
 
+    def retaken(self, s: Score) -> None:
+        """Have an effect in another way than the one that looked best, and correct every p anew."""
+        self.best[s.candidate.id] = s
+        self._correct()
+
     def counted(self, id_: str, ways: float) -> None:
         """Count so many times the ways in which an effect was tried, and correct every p anew."""
         self.ways[id_] *= ways
@@ -236,7 +241,7 @@ def scored(ground: Ground, source: Source) -> View:
     evidence, plain, slow = both_looks(ground, source)
     best, ways = best_of(evidence, plain, source.candidates, slow)
     left_out = dict(source.left_out)
-    for id_ in {c.id for c in source.candidates} - set(best):
+    for id_ in sorted({c.id for c in source.candidates} - set(best)):
         left_out[id_] = "does nothing on this log"
     absorbs, absorbed_by = _absorption(evidence, ground.fit.table, best, source.candidates)
     return View(evidence, plain, ground, source, slow, best, ways, left_out, absorbs, absorbed_by)

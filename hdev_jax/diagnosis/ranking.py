@@ -1,14 +1,16 @@
 """The best way to have each effect: what is plausible, what it is worth, and how many ways were tried."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import ABSORBED, Evidence, Score
 from hdev_jax.diagnosis.significance import effective_number
+from hdev_jax.physics import Parameter
 
-__all__ = ["CLOSE", "LEFT_OUT", "STABLE", "best_of", "plausible", "worth"]
+__all__ = ["CLOSE", "LEFT_OUT", "STABLE", "best_of", "inside", "plausible", "without_idle", "worth"]
 
 CERTAIN = 1e-6  # p below which it does not matter how small it is
 CLOSE = 0.85  # of what the best is worth, for a candidate to be about as good
@@ -23,28 +25,33 @@ def plausible(s: Score) -> bool:
         first = c.parameter(c.sizes[0])
         size = abs(dict(c.shapes)[first.name] * s.beta[0])
         return bool((0.02 if first.smooth else 0.4) <= s.beta[0] <= 2.5 and size >= first.least)
-    parameters = [c.parameter(n) for n in c.sizes]
-    return not any(_outside(s)) and any(abs(b) >= p.least for p, b in zip(parameters, s.beta, strict=True))
+    each = [(c.parameter(n), b) for n, b in zip(c.sizes, s.beta, strict=True)]
+    return all(p.lower <= p.null + b <= p.upper for p, b in each) and any(abs(b) >= p.least for p, b in each)
 
 
-def _outside(s: Score) -> list[float]:
-    """How far each size is beyond its range."""
-    each = [(s.candidate.parameter(n), b) for n, b in zip(s.candidate.sizes, s.beta, strict=True)]
-    return [max(p.lower - p.null - b, p.null + b - p.upper, 0.0) for p, b in each]
+def without_idle(c: Candidate, beta: Float[np.ndarray, " k"]) -> Candidate | None:
+    """Without the group whose size is furthest beyond a null that bounds its range: a gear in which nothing drags.
+
+    None where no size is, or where it cannot go by itself. A size beyond another bound stays, and is not plausible.
+    """
+    past = [_past_null(c.parameter(n), b) for n, b in zip(c.sizes, beta, strict=True)]
+    return c.only(np.arange(len(past)) != int(np.argmax(past))) if c.kind == "size" and max(past) > 0.0 else None
 
 
-def _inside(s: Score, scores: Callable[[Sequence[Candidate]], list[Score]]) -> Score:
-    """The score without the groups whose sizes come out beyond their range: a gear in which nothing drags.
+def _past_null(p: Parameter, b: float) -> float:
+    if p.null not in (p.lower, p.upper):
+        return 0.0
+    return max(-b if p.null == p.lower else b, 0.0)
+
+
+def inside(s: Score, scores: Callable[[Sequence[Candidate]], list[Score]]) -> Score:
+    """The score without the groups whose sizes come out beyond a null that bounds their range.
 
     One after the other, the furthest first; none comes back. What the others explain is χ² of their own number, given
-    that these went (the conditional form of the chi-bar-square test: Wollan and Dykstra, 1986). That is so where the
-    bound is the null, as a drag's is; a group beyond another bound goes too, and is then taken to be null.
+    that these went (the conditional form of the chi-bar-square test: Wollan and Dykstra, 1986).
     """
-    while s.candidate.kind == "size" and any(outside := _outside(s)):
-        kept = s.candidate.only(np.arange(len(outside)) != int(np.argmax(outside)))
-        if kept is None:
-            break
-        (s,) = scores([kept])
+    while (fewer := without_idle(s.candidate, s.beta)) is not None:
+        (s,) = scores([fewer])
     return s
 
 
@@ -74,15 +81,17 @@ def best_of(
     }
     scored = _by_id(leading, evidence.scores([c for cs in leading.values() for c in cs]))
     scored_plain = _by_id(steady, plain.plain_scores([c for cs in steady.values() for c in cs]))
-    scored = {id_: [_inside(s, evidence.scores) for s in scores] for id_, scores in scored.items()}
-    scored_plain = {id_: [_inside(s, plain.plain_scores) for s in scores] for id_, scores in scored_plain.items()}
+    scored = {id_: _in_order(inside(s, evidence.scores) for s in scores) for id_, scores in scored.items()}
+    scored_plain = {
+        id_: _in_order(inside(s, plain.plain_scores) for s in scores) for id_, scores in scored_plain.items()
+    }
     best, ways = {}, {}
     for id_, entries in ranked.items():
         apart = evidence.projected(np.unique([k for _, c in entries for k in c.columns]))
         ways[id_] = min(float(len(entries)), effective_number(apart))
         looks = [_clearest(scored[id_])]
         if scores := scored_plain[id_]:
-            looks.append(_clearest(sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))))
+            looks.append(_clearest(scores))
         # what both looks see is told by the whitened rows, which see it better
         able = [s for s in looks if plausible(s) and s.left_out_gain > LEFT_OUT] or looks[:1]
         best[id_] = min(able, key=lambda s: (s.p > CERTAIN, s.p if s.p > CERTAIN else 0.0))
@@ -97,6 +106,10 @@ def _by_id(groups: Mapping[str, Sequence[Candidate]], scores: Sequence[Score]) -
 
 def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
     return sorted(entries, key=lambda e: _falling(e[0]))[:6]
+
+
+def _in_order(scores: Iterable[Score]) -> list[Score]:
+    return sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))
 
 
 def _falling(worth: float) -> float:

@@ -7,31 +7,35 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates import FIXED, Candidate, finer, plan_of, realised
+from hdev_jax.diagnosis.candidates import FIXED, Candidate, realised
 from hdev_jax.diagnosis.evidence import ABSORBED, Score
 from hdev_jax.diagnosis.look import Found, Loop, Search, View
-from hdev_jax.diagnosis.ranking import best_of, plausible
+from hdev_jax.diagnosis.ranking import without_idle
 from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.sums import both_looks, distance_from_table, evidence_of
+from hdev_jax.diagnosis.sharpen import refined
+from hdev_jax.diagnosis.sums import distance_from_table, evidence_of
 from hdev_jax.diagnosis.whiten import Noise
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_coefficients, jacobian, predict
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
-__all__ = ["as_known", "grow", "is_size", "joined", "refit", "refitted", "sharpened", "without"]
+__all__ = ["Refitted", "as_known", "grow", "is_size", "joined", "refit", "refitted", "without"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
 AGREES = 0.9878  # of Student's distribution between what plain rows say of a size and what whitened ones do: 2.25 sd
 KNOWN = 2.0  # times as well, from which on whitened rows are asked for a size rather than plain ones
 DROWNED = 0.25  # least share of a slow cause's size that weights which suit the noise inside trips leave of it
-LOUD = 1e-12  # p of the working model alone
-MOST_SHARPENED = 3
 GROWN = 1e-3  # p of a size that joins an effect found without it
 
+Refitted = tuple[Search, float, Score]
 
-def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, float, Score] | None:
+
+def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Candidate | None:
     """The joint refit with a candidate, its gain in whitened log-likelihood, and the score with the shapes that it
-    started from (what is held stays there); None where it fails."""
+    started from (what is held stays there).
+
+    None where it fails; the candidate with a group less (a gear) where it puts that one beyond nothing.
+    """
     c = s.candidate
     shaped = any(c.parameter(n).kind != "choice" for n, _ in c.shapes)
     plain, plain_sd = view.plain.estimate(c)
@@ -50,27 +54,20 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> tuple[Search, f
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
-    refined = _refined(problem, s, view)[0] if shaped or try_plain else s
+    start = refined(problem, s, view)[0] if shaped or try_plain else s
     # What rows of equal weight bear out is the luckier half of what they may say of a size; whitened rows that know it
     # better are asked first. Where those cannot tell it apart, they come after, as far as plain rows leave room.
     noise = view.ground.noise
     ways = [noise] * better + [None] * try_plain + [noise] * (lends and not better)
-    tries = (joined(problem, state, refined, way) for way in ways)
-    new = next((t for t in tries if t is not None), None)
-    if new is None:
-        fewer = _without_weakest(c, white, white_sd)
-        return None if fewer is None else refit(problem, state, view.evidence.score(fewer), view)
-    started = replace(s, candidate=replace(c, shapes=refined.candidate.shapes), beta=refined.beta)
-    return new, _gain(problem, state, new.fit, view), started
-
-
-def _without_weakest(c: Candidate, white: np.ndarray, sd: np.ndarray) -> Candidate | None:
-    """Without the group whose size is least clear of its bound, which the joint refit may put beyond it; None where
-    all are clear."""
-    lower = np.array([c.parameter(n).lower - c.parameter(n).null for n in c.sizes])
-    clear = (white - lower) / sd
-    weakest = int(np.argmin(clear))
-    return c.only(np.arange(len(clear)) != weakest) if c.kind == "size" and clear[weakest] < 2.0 else None
+    fewer = None
+    for way in ways:
+        new = _with(problem, state, start, way)
+        if new is not None and _stands(new.fit, c):
+            started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
+            return new, _gain(problem, state, new.fit, view), started
+        if new is not None and fewer is None and c.kind == "size":
+            fewer = without_idle(c, _sizes(new.fit, c))
+    return fewer
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:
@@ -82,8 +79,14 @@ def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) ->
 
 
 def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -> Search | None:
-    """The state with the candidate in a joint fit; None where it fails. With `noise`, its sizes are borrowed from rows
-    whitened by it, and its shapes with them unless these rows do not settle them."""
+    """The state with the candidate in a joint fit; None where it fails or does not stand there. With `noise`, its sizes
+    are borrowed from rows whitened by it, and its shapes with them unless these rows do not settle them."""
+    new = _with(problem, state, s, noise)
+    return new if new is not None and _stands(new.fit, s.candidate) else None
+
+
+def _with(problem: Loop, state: Search, s: Score, noise: Noise | None) -> Search | None:
+    """The state with the candidate in a joint fit, whether it stands there or not; None where there is no such fit."""
     c = s.candidate
     effect = realised(c, s.beta, gears=problem.gears)
     vehicle = state.fit.vehicle.plus(effect)
@@ -102,7 +105,7 @@ def joined(problem: Loop, state: Search, s: Score, noise: Noise | None = None) -
     table = told or table
     assert table is not None
     fit = calibrate(vehicle, table, problem.rows, problem.target, problem.clusters)
-    if (not fit.converged and fit.steps < 5) or not _in_range(fit, c) or not _present(fit, c):
+    if not fit.converged and fit.steps < 5:
         return None
     return replace(state, vehicle=fit.vehicle, table=table, fit=fit)
 
@@ -135,7 +138,7 @@ def as_known(problem: Loop, state: Search) -> Calibration:
         settled, table=table, sd=error, covariance=covariance, predicted=predicted,
         sigma=float(np.sqrt(np.mean((problem.measured - predicted) ** 2))),
     )  # fmt: skip
-    return known if all(_in_range(known, s.candidate) and _present(known, s.candidate) for s in found) else fit
+    return known if all(_stands(known, s.candidate) for s in found) else fit
 
 
 def _lent(
@@ -191,54 +194,15 @@ def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) 
     return tuple(replace(r, free=False) if _idle(candidate, r.path) else r for r in rows)
 
 
-def _refined(problem: Loop, s: Score, view: View) -> tuple[Score, float]:
-    """The same way to have the effect with its shapes on a finer grid, and how many ways that grid tries.
-
-    Switches have many small optima.
-
-    Where trips alone tell it, the grid reaches a whole step to either side and least squares chooses on it: thresholds
-    of a few trips have many small optima for the joint refit to end in.
-    """
-    facts = problem.facts
-    grids = finer(s.candidate, facts.row_s, reach=1.0 if s.plain else 0.5)
-    if "at_trip" in grids:
-        grids["at_trip"] = facts.steps_near(dict(s.candidate.shapes)["at_trip"])
-    if all(len(g) == 1 for g in grids.values()):
-        return s, 1.0
-    plan = plan_of(view.ground.fit.vehicle, [s.candidate.effect], facts, problem.target, grids)
-    same = [c for c in plan.candidates if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
-    evidence, plain, slow = both_looks(view.ground, plan)
-    if s.plain:
-        totals = plain.totals()
-        fits = [(*plain.gain(totals, c.columns), c) for c in same]
-        inside = [(gain, beta, c) for gain, beta, c in fits if plausible(replace(s, candidate=c, beta=beta))]
-        if not inside:
-            return s, 1.0
-        _, beta, c = max(inside, key=lambda f: f[0])
-        return replace(s, candidate=c, beta=beta), 1.0  # its p stays that of the way it started from
-    best, ways = best_of(evidence, plain, same, slow)
-    finest = best.get(s.candidate.id)
-    return (finest, ways[s.candidate.id]) if finest and finest.gain > s.gain and not finest.plain else (s, 1.0)
+def _stands(fit: Calibration, candidate: Candidate) -> bool:
+    return _in_range(fit, candidate) and _present(fit, candidate)
 
 
-def sharpened(problem: Loop, view: View) -> View:
-    """The view with a second, finer look at what rows speak for loudly and clusters do not.
-
-    A threshold that lies between two points of its grid does too much in some trips and too little in others.
-    """
-    doubted = [
-        s for id_, s in view.best.items()
-        if view.q[id_] > problem.fdr and s.p_model < LOUD and not s.plain and s.candidate.shapes
-        and id_ not in view.absorbed_by
-    ]  # fmt: skip
-    for s in sorted(doubted, key=lambda s: -s.gain)[:MOST_SHARPENED]:
-        finer_one, ways = _refined(problem, s, view)
-        if finer_one is not s and finer_one.p * ways < s.p:
-            # places among the view's columns stay those of its own grid; a refit looks for finer shapes again
-            tests = {k: getattr(finer_one, k) for k in ("p_model", "p_cluster", "left_out_gain")}
-            view.best[s.candidate.id] = replace(s, **tests)
-            view.counted(s.candidate.id, ways)
-    return view
+def _sizes(fit: Calibration, c: Candidate) -> Float[np.ndarray, " k"]:
+    """A candidate's sizes in a fit, against their null."""
+    by = {(row.path, row.group): float(v) for row, v in zip(fit.table.free, fit.values, strict=True)}
+    each = zip(c.sizes, c.groups, strict=True)
+    return np.array([by[f"effects.{c.id}.{n}", g] - c.parameter(n).null for n, g in each])
 
 
 def _present(fit: Calibration, candidate: Candidate) -> bool:

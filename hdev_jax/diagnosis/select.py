@@ -6,17 +6,19 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.forms import another_form
 from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
 from hdev_jax.diagnosis.modes import add_mode
-from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, STABLE, plausible, worth
-from hdev_jax.diagnosis.refit import grow, is_size, refit, sharpened, without
+from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, STABLE, inside, plausible, worth
+from hdev_jax.diagnosis.refit import Refitted, grow, is_size, refit, without
+from hdev_jax.diagnosis.sharpen import sharpened
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
-from hdev_jax.physics import Effect, Vehicle, most_group
+from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.physics.vehicle import Target
 
 __all__ = ["choose", "prune", "search", "twins_of"]
@@ -38,20 +40,20 @@ def search(
     *,
     fdr: float,
     seed: int,
+    gears: int,
     tell: Callable[[str], None] = lambda _: None,
     remember: Callable[[int, Callable[[], Search]], Search] = lambda _, compute: compute(),
 ) -> Search:
     """Steps 1 to 5 of the loop on training rows alone.
 
     **Arguments:** the declared vehicle with its table, `rows` from `padded`, the candidates' classes, `fdr` the level
-    of false discoveries over the whole library, `seed` for placebos and resampling, `tell` for progress, `remember`
-    what keeps the state of each step for a run that is killed.
+    of false discoveries over the whole library, `seed` for placebos and resampling, `gears` the highest id of a gear
+    or a kind of road that any trip has, `tell` for progress, `remember` what keeps the state of each step for a run
+    that is killed.
 
     **Returns:** the vehicle with every effect that cleared the bar, its fit, and a verdict on every other candidate.
     """
-    real = rows.segments.take(np.arange(rows.rows))
-    gears = most_group(real)
-    clusters = cluster_rows(real)
+    clusters = cluster_rows(rows.segments.take(np.arange(rows.rows)))
 
     def declared() -> Search:
         tell("calibrating the declared model")
@@ -105,15 +107,9 @@ def choose(
     nor what was found before the rest.
     """
     able = [
-        s
-        for id_, s in view.best.items()
-        if id_ not in state.taken_out
-        and id_ not in skip
-        and view.q[id_] <= problem.fdr
-        and s.left_out_gain > LEFT_OUT
-        and plausible(s)
-        and worth(s.gain, s.candidate) > 0
-    ]
+        s for id_, s in view.best.items()
+        if id_ not in state.taken_out and id_ not in skip and _clears(problem, view, s)
+    ]  # fmt: skip
     # what rows tell comes first; what only the clusters tell, when nothing else is left
     able.sort(key=lambda s: (s.plain, -worth(s.gain, s.candidate)))
     for _ in range(tries):
@@ -126,10 +122,10 @@ def choose(
         ]
         fits = []
         for s in close:
-            tell(f"refitting with {s.candidate.id}")
-            if (tried := refit(problem, state, s, view)) is not None:
-                gain = max(tried[1], s.gain) if s.plain else tried[1]
-                fits.append((worth(gain, s.candidate), s, tried, gain))
+            if (tried := _tried(problem, state, s, view, tell)) is not None:
+                taken, fitted = tried
+                gain = max(fitted[1], taken.gain) if taken.plain else fitted[1]
+                fits.append((worth(gain, taken.candidate), taken, fitted, gain))
             else:
                 view.reasons[s.candidate.id] = "in the joint refit it is out of range or not told from nothing"
         able = [s for s in able if s not in close]
@@ -152,6 +148,30 @@ def choose(
             )
             return replace(new, found=[*state.found, found])
     return None
+
+
+def _clears(problem: Loop, view: View, s: Score) -> bool:
+    """Whether a candidate clears what can be asked of it before any refit."""
+    told = view.q[s.candidate.id] <= problem.fdr and s.left_out_gain > LEFT_OUT
+    return told and plausible(s) and worth(s.gain, s.candidate) > 0
+
+
+def _tried(
+    problem: Loop, state: Search, s: Score, view: View, tell: Callable[[str], None]
+) -> tuple[Score, Refitted] | None:
+    """A candidate as it was taken, with its joint refit; None where it fails.
+
+    Without the groups (gears) that the refit puts beyond nothing it is another candidate, which clears every bar anew.
+    """
+    scores = view.plain.plain_scores if s.plain else view.evidence.scores
+    tell(f"refitting with {s.candidate.id}")
+    while isinstance(tried := refit(problem, state, s, view), Candidate):
+        s = inside(scores([tried])[0], scores)
+        view.retaken(s)
+        if not _clears(problem, view, s):
+            return None
+        tell(f"refitting with {s.candidate.id} in fewer gears or kinds of road")
+    return (s, tried) if tried is not None else None
 
 
 def _placebo(problem: Loop, s: Score, view: View, draws: int = 19) -> str | None:

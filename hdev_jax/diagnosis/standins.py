@@ -15,8 +15,9 @@ from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.expression import TERM, Described, describing
 from hdev_jax.diagnosis.look import Found, Loop, Search, look
 from hdev_jax.diagnosis.modes import add_mode
-from hdev_jax.diagnosis.refit import sharpened, without
+from hdev_jax.diagnosis.refit import without
 from hdev_jax.diagnosis.select import choose
+from hdev_jax.diagnosis.sharpen import sharpened
 from hdev_jax.inference import calibrate, effect_coefficients
 
 __all__ = ["beside", "stand_ins"]
@@ -46,7 +47,8 @@ def stand_ins(
     """
     gone = []
     for f in reversed(state.found):
-        if f.id not in asked or {*f.score.candidate.effect.needs} & {*channels}:
+        effect = f.score.candidate.effect
+        if f.id not in asked or {*effect.needs, *(p.by for p in effect.parameters)} & {*channels}:
             continue
         tell(f"is {f.id} found again beside what is left")
         if not _again(problem, state, f, tell):

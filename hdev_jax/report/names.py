@@ -83,6 +83,7 @@ _PARAMETERS = {
     "w_per_radps2": "power per motor speed squared",
     "w_per_passenger": "power per passenger",
 }
+_GROUPED = {"torque_nm": "in gear", "delta": "in gear", "excess": "on road surface"}
 _SUFFIXES = {"w", "s", "m", "mps", "nm", "n", "ohm", "rad", "c", "v", "mps2", "kg", "kw"}
 
 _COEFFICIENTS = {
@@ -176,10 +177,12 @@ def explained(effect_id: str) -> dict[str, Any]:
 
 
 def parameter(name: str) -> str:
-    """`"speed_mps"` -> `"speed"`: the unit stands with the value; what follows a bracket stays."""
+    """`"speed_mps"` -> `"speed"`, `"torque_nm[2]"` -> `"torque in gear 2"`: the unit stands with the value."""
     stem, bracket, group = name.partition("[")
     head, _, tail = stem.rpartition("_")
     word = _PARAMETERS.get(stem) or (head if head and tail in _SUFFIXES else stem).replace("_", " ")
+    if bracket and stem in _GROUPED:
+        return f"{word} {_GROUPED[stem]} {group.removesuffix(']')}"
     return f"{word} [{group}" if bracket else word
 
 
@@ -189,8 +192,8 @@ def coefficient(path: str) -> tuple[str, str]:
     if stem in _COEFFICIENTS:
         words, unit = _COEFFICIENTS[stem]
     elif stem.startswith("effects."):
-        _, effect_id, name = [*stem.split(".", 2), "", ""][:3]
-        words, unit = f"{effect(effect_id)}: {parameter(name)}", ""
+        _, effect_id, name = [*path.split(".", 2), "", ""][:3]
+        return f"{effect(effect_id)}: {parameter(name)}", ""
     else:
         words, unit = stem.rpartition(".")[2].replace("_", " "), ""
     return (f"{words} [{group}" if bracket else words), unit

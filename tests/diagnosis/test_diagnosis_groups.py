@@ -8,11 +8,13 @@ from planted import opened
 
 from hdev_jax.diagnosis.candidates import columns
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
+from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.refit import _without_weakest
+from hdev_jax.diagnosis.ranking import inside, plausible, without_idle
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.physics import LIBRARY
 
+TOLD = (1e-9, 1e-9, 9.0, 0.5)  # p of the model and of clusters, gain on clusters left out, share left of the column
 FEW = ("driveline_drag", "iron_loss", "gear_efficiency", "constant_headwind", "auxiliary_power", "rolling_speed")
 
 
@@ -68,9 +70,25 @@ def test_groups_may_go_one_by_one_and_other_sizes_all_together(tmp_path):
     both = next(c for c in every if len(c.sizes) == 2 and c.id == "hvac_power")
     assert both.only([True, True]) is both
     assert both.only([True, False]) is None, "heating without cooling is a way of its own, with its own shapes"
-    # what the joint refit may put below nothing goes; where each is clear of it, none does
-    fewer = _without_weakest(drag, np.array([9.0, 0.5, 7.0, 8.0]), np.ones(4))
+
+
+def test_only_a_group_beyond_a_null_that_bounds_it_goes(tmp_path):
+    """A torque below nothing is a gear without drag; one of 300 Nm, or a delta of half, says the effect is another."""
+    _, problem, _ = opened(tmp_path, seed=1, trips=3)
+    effects = [LIBRARY[k] for k in ("driveline_drag", "gear_efficiency", "hvac_power")]
+    every, _, _ = columns(problem.vehicle, effects, problem.segments, len(problem.measured), problem.target)
+    drag, efficiency = (next(c for c in every if c.id == k) for k in ("driveline_drag", "gear_efficiency"))
+    both = next(c for c in every if len(c.sizes) == 2 and c.id == "hvac_power")
+    fewer = without_idle(drag, np.array([9.0, -0.5, -2.0, 8.0]))
     assert fewer is not None
-    assert fewer.groups == (1, 3, 4)
-    assert _without_weakest(drag, np.array([9.0, 2.5, 7.0, 8.0]), np.ones(4)) is None
-    assert _without_weakest(both, np.array([9.0, 0.5]), np.ones(2)) is None
+    assert fewer.groups == (1, 2, 4), "the furthest goes first"
+    assert without_idle(drag, np.array([9.0, 2.5, 7.0, 300.0])) is None
+    assert without_idle(efficiency, np.full(len(efficiency.sizes), -0.5)) is None
+    assert without_idle(both, np.array([-9.0, 0.5])) is None, "heating without cooling is a way of its own"
+
+    def scores(candidates):
+        return [Score(c, np.array([9.0, -0.1, 0.0, 300.0])[np.array(c.groups) - 1], 50.0, *TOLD) for c in candidates]
+
+    left = inside(scores([drag])[0], scores)
+    assert left.candidate.groups == (1, 3, 4)
+    assert not plausible(left), "300 Nm are no drag"

@@ -45,7 +45,7 @@ def heating_found(folder, above_w_per_k: float):
     best = max(heating, key=lambda c: view.evidence.gain(total, c.columns)[0])
     score = view.evidence.score(best)
     tried = refit(loop, declared, score, view)
-    assert tried is not None
+    assert isinstance(tried, tuple)
     state, gain, score = tried
     state.found = [looks.Found("hvac_power", score, 1e-9, 1.0, (), gain)]
     return problem, loop, state
