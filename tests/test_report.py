@@ -15,6 +15,7 @@ from hdev_jax import report
 from hdev_jax.diagnosis.metrics import metrics as errors
 from hdev_jax.report import ReportData, answer, statistics, words, write_calibration_report, write_report
 from hdev_jax.report import data as report_data
+from hdev_jax.report import names as shown
 from hdev_jax.report.residuals import panels
 
 VERDICTS = ("effects_found", "nothing_missing", "unexplained_structure", "effects_found_and_unexplained_structure")
@@ -371,6 +372,14 @@ def test_calibration_report(tmp_path):
     assert "Drag area lies far from the table" in text
     assert "7.20 ± 0.08 m²" in text
     assert "by least squares" in text
+
+
+def test_sizes_by_gear_are_shown_with_their_gear():
+    assert shown.parameter("torque_nm[2]") == "torque (gear 2)"
+    assert shown.coefficient("effects.gear_efficiency.delta[3]")[0] == "efficiency by gear: delta (gear 3)"
+    assert shown.coefficient("effects.road_surface.excess[1]")[0].endswith("(road surface 1)")
+    assert shown.coefficient("effects.driveline_drag.torque_nm")[0].endswith(": torque")
+    assert shown.parameter("phase_s[4]").endswith("[4]")
 
 
 def test_trips_of_a_diagnosis_are_those_of_its_json():

@@ -350,6 +350,18 @@ def test_an_effect_of_ones_own(files, given, tmp_path, out):
     assert "Effects that this run left out" in (out / "report.html").read_text()
 
 
+def test_an_effect_of_ones_own_by_gear_is_one_number_where_the_log_tells_no_gear(files, given, tmp_path, out):
+    effect = tmp_path / "mine.py"
+    by_gear = USER_EFFECT.replace("0.0, 100.0)", '0.0, 100.0, by="gear", whole=True)')
+    effect.write_text(by_gear)
+    log = pd.read_csv(files["log"]).drop(columns="gear")
+    log["energy_wh"] += 60.0 * log.time_s * log.duration_s / 3600
+    log.to_csv(tmp_path / "drift.csv", index=False)
+    argv = ["--effects", effect, "--only", "headwind,slow_drift", "--out", out]
+    assert hdev("diagnose", tmp_path / "drift.csv", *given[1:], *argv)[0] == 0
+    assert set(next(e for e in read(out)["effects"] if e["id"] == "slow_drift")["parameters"]) == {"w_per_s"}
+
+
 def test_an_effect_that_fails_can_be_left_out(given, tmp_path, out):
     """It is only worked out where it is asked for."""
     effect = tmp_path / "mine.py"

@@ -1,6 +1,6 @@
 """The best way to have each effect: what is plausible, what it is worth, and how many ways were tried."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -55,6 +55,12 @@ def inside(s: Score, scores: Callable[[Sequence[Candidate]], list[Score]]) -> Sc
     return s
 
 
+def _all_inside(scores: list[Score], again: Callable[[Sequence[Candidate]], list[Score]]) -> list[Score]:
+    """Each of one effect's scores `inside`, by worth again where any of them has changed."""
+    left = [inside(s, again) for s in scores]
+    return left if all(new is old for new, old in zip(left, scores, strict=True)) else _in_order(left)
+
+
 def worth(gain: float, c: Candidate) -> float:
     """Gain less what its numbers cost: as BIC would for 400 independent rows a size, 20 a shape.
 
@@ -81,10 +87,8 @@ def best_of(
     }
     scored = _by_id(leading, evidence.scores([c for cs in leading.values() for c in cs]))
     scored_plain = _by_id(steady, plain.plain_scores([c for cs in steady.values() for c in cs]))
-    scored = {id_: _in_order(inside(s, evidence.scores) for s in scores) for id_, scores in scored.items()}
-    scored_plain = {
-        id_: _in_order(inside(s, plain.plain_scores) for s in scores) for id_, scores in scored_plain.items()
-    }
+    scored = {id_: _all_inside(scores, evidence.scores) for id_, scores in scored.items()}
+    scored_plain = {id_: _in_order(_all_inside(scores, plain.plain_scores)) for id_, scores in scored_plain.items()}
     best, ways = {}, {}
     for id_, entries in ranked.items():
         apart = evidence.projected(np.unique([k for _, c in entries for k in c.columns]))
@@ -108,7 +112,7 @@ def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candid
     return sorted(entries, key=lambda e: _falling(e[0]))[:6]
 
 
-def _in_order(scores: Iterable[Score]) -> list[Score]:
+def _in_order(scores: Sequence[Score]) -> list[Score]:
     return sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate)))
 
 

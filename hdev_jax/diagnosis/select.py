@@ -122,16 +122,20 @@ def choose(
         ]
         fits = []
         for s in close:
-            if (tried := _tried(problem, state, s, view, tell)) is not None:
+            tried = _tried(problem, state, s, view, tell)
+            if isinstance(tried, str):
+                view.reasons[s.candidate.id] = tried
+            else:
                 taken, fitted = tried
                 gain = max(fitted[1], taken.gain) if taken.plain else fitted[1]
                 fits.append((worth(gain, taken.candidate), taken, fitted, gain))
-            else:
-                view.reasons[s.candidate.id] = "in the joint refit it is out of range or not told from nothing"
-        able = [s for s in able if s not in close]
+        # an effect that was taken in fewer groups has another p, and with it all have another q
+        able = [s for s in able if s not in close and _clears(problem, view, s)]
         fits.sort(key=lambda f: -f[0])
         for _, s, (new, _, started), gain in fits:
             c = s.candidate
+            if not _clears(problem, view, s):
+                continue
             if why := _placebo(problem, s, view) or (another_form(problem, state, s, view) if forms else None):
                 view.reasons[c.id] = why
                 tell(f"turned down {c.id}: {why}")
@@ -158,8 +162,8 @@ def _clears(problem: Loop, view: View, s: Score) -> bool:
 
 def _tried(
     problem: Loop, state: Search, s: Score, view: View, tell: Callable[[str], None]
-) -> tuple[Score, Refitted] | None:
-    """A candidate as it was taken, with its joint refit; None where it fails.
+) -> tuple[Score, Refitted] | str:
+    """A candidate as it was taken, with its joint refit, or why it fails.
 
     Without the groups (gears) that the refit puts beyond nothing it is another candidate, which clears every bar anew.
     """
@@ -169,9 +173,9 @@ def _tried(
         s = inside(scores([tried])[0], scores)
         view.retaken(s)
         if not _clears(problem, view, s):
-            return None
+            return "without the gears or kinds of road in which it does nothing it does not clear every bar"
         tell(f"refitting with {s.candidate.id} in fewer gears or kinds of road")
-    return (s, tried) if tried is not None else None
+    return (s, tried) if tried is not None else "in the joint refit it is out of range or not told from nothing"
 
 
 def _placebo(problem: Loop, s: Score, view: View, draws: int = 19) -> str | None:

@@ -29,7 +29,9 @@ def refined(problem: Loop, s: Score, view: View) -> tuple[Score, float]:
     if all(len(g) == 1 for g in grids.values()):
         return s, 1.0
     plan = plan_of(view.ground.fit.vehicle, [s.candidate.effect], facts, problem.target, grids)
-    same = [c for c in plan.candidates if (c.sizes, c.groups) == (s.candidate.sizes, s.candidate.groups)]
+    own = (s.candidate.sizes, s.candidate.groups)
+    only = [c.only([g in s.candidate.groups for g in c.groups]) for c in plan.candidates]
+    same = [c for c in only if c is not None and (c.sizes, c.groups) == own]
     evidence, plain, slow = both_looks(view.ground, plan)
     if s.plain:
         totals = plain.totals()
@@ -41,7 +43,9 @@ def refined(problem: Loop, s: Score, view: View) -> tuple[Score, float]:
         return replace(s, candidate=c, beta=beta), 1.0  # its p stays that of the way it started from
     best, ways = best_of(evidence, plain, same, slow)
     finest = best.get(s.candidate.id)
-    return (finest, ways[s.candidate.id]) if finest and finest.gain > s.gain and not finest.plain else (s, 1.0)
+    if finest is None or finest.plain or finest.gain <= s.gain or finest.candidate.groups != s.candidate.groups:
+        return s, 1.0
+    return finest, ways[s.candidate.id]
 
 
 def sharpened(problem: Loop, view: View) -> View:

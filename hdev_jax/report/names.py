@@ -83,7 +83,7 @@ _PARAMETERS = {
     "w_per_radps2": "power per motor speed squared",
     "w_per_passenger": "power per passenger",
 }
-_GROUPED = {"torque_nm": "in gear", "delta": "in gear", "excess": "on road surface"}
+_GROUPED = {"torque_nm": "gear", "delta": "gear", "excess": "road surface"}
 _SUFFIXES = {"w", "s", "m", "mps", "nm", "n", "ohm", "rad", "c", "v", "mps2", "kg", "kw"}
 
 _COEFFICIENTS = {
@@ -177,12 +177,12 @@ def explained(effect_id: str) -> dict[str, Any]:
 
 
 def parameter(name: str) -> str:
-    """`"speed_mps"` -> `"speed"`, `"torque_nm[2]"` -> `"torque in gear 2"`: the unit stands with the value."""
+    """`"speed_mps"` -> `"speed"`, `"torque_nm[2]"` -> `"torque (gear 2)"`: the unit stands with the value."""
     stem, bracket, group = name.partition("[")
     head, _, tail = stem.rpartition("_")
     word = _PARAMETERS.get(stem) or (head if head and tail in _SUFFIXES else stem).replace("_", " ")
     if bracket and stem in _GROUPED:
-        return f"{word} {_GROUPED[stem]} {group.removesuffix(']')}"
+        return f"{word} ({_GROUPED[stem]} {group.removesuffix(']')})"
     return f"{word} [{group}" if bracket else word
 
 

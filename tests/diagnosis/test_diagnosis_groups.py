@@ -1,18 +1,24 @@
 """Sizes by gear: a gear in which an effect does nothing leaves with its column, the effect stays."""
 
 from dataclasses import replace
+from typing import Any, ClassVar
 
+import jax
 import numpy as np
 import pytest
 from planted import opened
 
-from hdev_jax.diagnosis.candidates import columns
+from hdev_jax.diagnosis.candidates import Candidate, columns
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
 from hdev_jax.diagnosis.evidence import Score
+from hdev_jax.diagnosis.look import Loop, Search, look
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.ranking import inside, plausible, without_idle
+from hdev_jax.diagnosis.refit import refit
+from hdev_jax.diagnosis.select import _tried
 from hdev_jax.diagnosis.split import Split
-from hdev_jax.physics import LIBRARY
+from hdev_jax.inference import calibrate, cluster_rows, padded
+from hdev_jax.physics import LIBRARY, Parameter
 
 TOLD = (1e-9, 1e-9, 9.0, 0.5)  # p of the model and of clusters, gain on clusters left out, share left of the column
 FEW = ("driveline_drag", "iron_loss", "gear_efficiency", "constant_headwind", "auxiliary_power", "rolling_speed")
@@ -92,3 +98,77 @@ def test_only_a_group_beyond_a_null_that_bounds_it_goes(tmp_path):
     left = inside(scores([drag])[0], scores)
     assert left.candidate.groups == (1, 3, 4)
     assert not plausible(left), "300 Nm are no drag"
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["whitened", "by clusters"])
+def test_a_gear_that_the_joint_refit_puts_below_nothing_leaves_and_the_others_are_tested_anew(plain, tmp_path):
+    torque = {"torque_nm[1]": 40.0, "torque_nm[2]": 40.0, "torque_nm[3]": 40.0, "torque_nm[4]": -40.0}
+    _, problem, _ = opened(tmp_path, seed=1, trips=12, effects={"driveline_drag": torque}, ratio=0.5)
+    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
+    loop = Loop(rows, problem.target, clusters, [LIBRARY["driveline_drag"]], 0.05, np.random.default_rng(0), 4)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    state = Search(problem.vehicle, problem.table, fit)
+    view = look(loop, state)
+    assert view.best["driveline_drag"].candidate.groups == (1, 2, 3), "the scores show it already"
+    every = next(c for c in view.source.candidates if len(c.groups) == 4)
+    s = view.plain.plain_score(every) if plain else view.evidence.score(every)
+    tried = refit(loop, state, s, view)
+    assert isinstance(tried, Candidate)
+    assert tried.groups == (1, 2, 3)
+    taken = _tried(loop, state, s, view, lambda _: None)
+    assert not isinstance(taken, str)
+    again, (joint, _, _) = taken
+    assert again.candidate == tried
+    assert again.plain is plain
+    assert again is view.best["driveline_drag"]
+    assert again.gain < s.gain, "what the fourth gear explained is not counted"
+    assert {c.name for c in joint.table.free if c.path.startswith("effects.")} == {
+        f"effects.driveline_drag.torque_nm[{n}]" for n in (1, 2, 3)
+    }
+    hard = replace(loop, fdr=0.0)
+    assert "does not clear" in _tried(hard, state, s, view, lambda _: None)
+
+
+def test_a_gear_of_test_trips_alone_has_no_torque(tmp_path):
+    """As in the sheet that is written, which says nothing of it; not the torque of the gear before it."""
+    _, problem, split = opened(tmp_path, seed=1, trips=12, rows_per_trip=200, effects={"driveline_drag": {}}, ratio=1.0)
+    gear = np.asarray(problem.segments.channels["gear"]).copy()
+    tested = problem.rows(split.test)
+    gear[tested] = np.where(gear[tested] == 4, 5, gear[tested])
+    after = diagnosed(replace(problem, segments=problem.segments.with_channels(gear=gear)), split).after
+    values = np.asarray(after.effect("driveline_drag").torque_nm.values)
+    assert np.all(values[[1, 2, 3, 4]] > 0)
+    assert values[5] == 0
+
+
+class DragAboveSpeed(LIBRARY["driveline_drag"]):
+    """A drag by gear that sets in at a speed: sizes by gear with a shape, which the library has not."""
+
+    id: ClassVar = "drag_above_speed"
+    parameters: ClassVar = (
+        *LIBRARY["driveline_drag"].parameters,
+        Parameter("above_mps", "m/s", 8.0, 4.0, 0.0, 30.0, kind="shape", grid=(2.0, 6.0, 10.0, 14.0)),
+    )
+    above_mps: Any
+
+    def drive(self, row, car, point):
+        return jax.nn.sigmoid(row.speed_mps - self.above_mps) * super().drive(row, car, point)
+
+
+@pytest.mark.parametrize("torque", [{2: 25.0, 3: 25.0}, {2: 40.0, 3: -30.0, 4: 40.0}], ids=["some gears", "one below"])
+def test_a_shape_beside_sizes_by_gear_is_sought_for_the_gears_that_are_left(torque, tmp_path):
+    planted = {"driveline_drag": {f"torque_nm[{n}]": x for n, x in torque.items()}}
+    _, problem, split = opened(tmp_path, seed=3, trips=12, rows_per_trip=200, effects=planted, ratio=1.0)
+    kept = {}
+
+    def checkpoint(name, compute):
+        return kept.setdefault(name, compute())
+
+    library = {DragAboveSpeed.id: DragAboveSpeed}
+    result = diagnose(problem, split, library, seed=0, checkpoint=checkpoint)
+    (found,) = result.summary["effects"]
+    gears = {n.removeprefix("torque_nm[").removesuffix("]") for n in found["parameters"] if n.startswith("torque")}
+    assert {str(n) for n, x in torque.items() if x > 0} <= gears
+    assert gears <= {str(n) for n in range(1, 5) if torque.get(n, 0.0) >= 0}
+    again = diagnose(problem, split, library, seed=0, checkpoint=checkpoint)
+    np.testing.assert_array_equal(again.predicted_after, result.predicted_after)

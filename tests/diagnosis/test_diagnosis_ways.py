@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis import expression, refit
+from hdev_jax.diagnosis import expression, sharpen
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.evidence import Evidence, Score
 from hdev_jax.diagnosis.expression import Described, Factor, find_expression
@@ -43,8 +43,8 @@ def test_a_finer_grid_is_more_ways(monkeypatch, finer_p, q):
     doubted, other = score(LIBRARY["regen_cutoff"], 0.01), score(LIBRARY["headwind"], 0.9, p_model=0.4)
     seen = view({"regen_cutoff": doubted, "headwind": other}, {"regen_cutoff": 3.0, "headwind": 1.0})
     assert seen.q["regen_cutoff"] == pytest.approx(0.06)
-    monkeypatch.setattr(refit, "_refined", lambda *_: (replace(doubted, p_cluster=finer_p / 2.0), 4.0))
-    sharp = refit.sharpened(bare(Loop, fdr=0.05), seen)
+    monkeypatch.setattr(sharpen, "refined", lambda *_: (replace(doubted, p_cluster=finer_p / 2.0), 4.0))
+    sharp = sharpen.sharpened(bare(Loop, fdr=0.05), seen)
     assert sharp.q["regen_cutoff"] == pytest.approx(q)
     assert sharp.q["headwind"] == pytest.approx(0.9)
 
