@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from planted import opened
 
+from hdev_jax.diagnosis import sharpen
 from hdev_jax.diagnosis.candidates import Candidate, columns
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
 from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Loop, Search, look
+from hdev_jax.diagnosis.look import Loop, Search, View, look
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.ranking import inside, plausible, without_idle
 from hdev_jax.diagnosis.refit import refit
 from hdev_jax.diagnosis.select import _tried
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.inference import calibrate, cluster_rows, padded
-from hdev_jax.physics import LIBRARY, Parameter
+from hdev_jax.physics import LIBRARY, Effect, Parameter
 
 TOLD = (1e-9, 1e-9, 9.0, 0.5)  # p of the model and of clusters, gain on clusters left out, share left of the column
 FEW = ("driveline_drag", "iron_loss", "gear_efficiency", "constant_headwind", "auxiliary_power", "rolling_speed")
@@ -100,15 +101,20 @@ def test_only_a_group_beyond_a_null_that_bounds_it_goes(tmp_path):
     assert not plausible(left), "300 Nm are no drag"
 
 
+def looked(problem: Problem, effect: type[Effect]) -> tuple[Loop, Search, View]:
+    """A loop over the whole log with one candidate, at its declared model."""
+    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
+    loop = Loop(rows, problem.target, clusters, [effect], 0.05, np.random.default_rng(0), 4)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    state = Search(problem.vehicle, problem.table, fit)
+    return loop, state, look(loop, state)
+
+
 @pytest.mark.parametrize("plain", [False, True], ids=["whitened", "by clusters"])
 def test_a_gear_that_the_joint_refit_puts_below_nothing_leaves_and_the_others_are_tested_anew(plain, tmp_path):
     torque = {"torque_nm[1]": 40.0, "torque_nm[2]": 40.0, "torque_nm[3]": 40.0, "torque_nm[4]": -40.0}
     _, problem, _ = opened(tmp_path, seed=1, trips=12, effects={"driveline_drag": torque}, ratio=0.5)
-    rows, clusters = padded(problem.segments, problem.measured), cluster_rows(problem.segments)
-    loop = Loop(rows, problem.target, clusters, [LIBRARY["driveline_drag"]], 0.05, np.random.default_rng(0), 4)
-    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
-    state = Search(problem.vehicle, problem.table, fit)
-    view = look(loop, state)
+    loop, state, view = looked(problem, LIBRARY["driveline_drag"])
     assert view.best["driveline_drag"].candidate.groups == (1, 2, 3), "the scores show it already"
     every = next(c for c in view.source.candidates if len(c.groups) == 4)
     s = view.plain.plain_score(every) if plain else view.evidence.score(every)
@@ -172,3 +178,25 @@ def test_a_shape_beside_sizes_by_gear_is_sought_for_the_gears_that_are_left(torq
     assert gears <= {str(n) for n in range(1, 5) if torque.get(n, 0.0) >= 0}
     again = diagnose(problem, split, library, seed=0, checkpoint=checkpoint)
     np.testing.assert_array_equal(again.predicted_after, result.predicted_after)
+
+
+@pytest.mark.parametrize("loses", [False, True], ids=["as many gears", "a gear less"])
+def test_a_finer_shape_is_one_of_the_same_gears(loses, monkeypatch, tmp_path):
+    """Where the finest grid would lose a gear it is another candidate, which this refit was not asked for."""
+    _, problem, _ = opened(tmp_path, seed=1, trips=6, effects={"driveline_drag": {}}, ratio=1.0)
+    loop, _, view = looked(problem, DragAboveSpeed)
+    every = next(c for c in view.source.candidates if len(c.groups) == 4)
+    s = view.evidence.score(every.only([True, False, True, True]))
+    asked = []
+
+    def best_of(evidence, plain, same, slow):
+        asked.extend(c.groups for c in same)
+        best = same[0].only([True, not loses, True])
+        return {s.candidate.id: replace(evidence.score(best), gain=s.gain + 1.0)}, {s.candidate.id: 2.0}
+
+    monkeypatch.setattr(sharpen, "best_of", best_of)
+    finest, ways = sharpen.refined(loop, s, view)
+    assert set(asked) == {(1, 3, 4)}, "the gear that is out stays out"
+    assert len(asked) > 1
+    assert (finest is s, ways) == (loses, 1.0 if loses else 2.0)
+    assert finest.candidate.groups == (1, 3, 4)
