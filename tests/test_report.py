@@ -375,7 +375,8 @@ def test_calibration_report(tmp_path):
 
 
 def test_sizes_by_gear_are_shown_with_their_gear():
-    assert shown.parameter("torque_nm[2]") == "torque (gear 2)"
+    assert shown.parameter("torque_nm[2]", "driveline_drag") == "torque (gear 2)"
+    assert shown.coefficient("effects.wet_road.excess[B183]")[0] == "wet road: excess [B183]"
     assert shown.coefficient("effects.gear_efficiency.delta[3]")[0] == "efficiency by gear: delta (gear 3)"
     assert shown.coefficient("effects.road_surface.excess[1]")[0].endswith("(road surface 1)")
     assert shown.coefficient("effects.driveline_drag.torque_nm")[0].endswith(": torque")

@@ -307,6 +307,8 @@ def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int 
     for p in candidate.effect.parameters:
         if p.kind == "limit" and p.name not in candidate.sizes:
             values[p.name] = None  # not part of it: the effect skips what it costs
+        if p.whole and None in candidate.groups:  # the log tells no groups
+            values[p.name] = np.asarray(p.null, dtype=float)
     if candidate.kind == "limit" and candidate.parameter(candidate.sizes[0]).smooth:
         values[candidate.sizes[0]] = np.asarray(dict(candidate.shapes)[candidate.sizes[0]] * float(beta[0]))
     if candidate.kind == "size":

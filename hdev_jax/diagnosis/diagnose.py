@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.next_drive import advise
 from hdev_jax.diagnosis.problem import Problem
 from hdev_jax.diagnosis.rest import told_apart
-from hdev_jax.diagnosis.select import search
+from hdev_jax.diagnosis.search import search
 from hdev_jax.diagnosis.shapes import left_open
 from hdev_jax.diagnosis.split import Split
 from hdev_jax.diagnosis.summary import parameters_of, summarise

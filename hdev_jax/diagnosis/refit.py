@@ -19,7 +19,7 @@ from hdev_jax.inference import Calibration, ParameterTable, calibrate, effect_co
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Effect, Vehicle
 
-__all__ = ["Refitted", "as_known", "grow", "is_size", "joined", "refit", "refitted", "without"]
+__all__ = ["Refitted", "as_known", "gained", "grow", "is_size", "joined", "refit", "refitted", "without"]
 
 BORNE_OUT = 2.6  # standard errors: 1 %
 AGREES = 0.9878  # of Student's distribution between what plain rows say of a size and what whitened ones do: 2.25 sd
@@ -34,7 +34,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
     """The joint refit with a candidate, its gain in whitened log-likelihood, and the score with the shapes that it
     started from (what is held stays there).
 
-    None where it fails; the candidate with a group less (a gear) where it puts that one beyond nothing.
+    None where it fails; the candidate with a group less (a gear) where the refit puts its size there beyond its null.
     """
     c = s.candidate
     shaped = any(c.parameter(n).kind != "choice" for n, _ in c.shapes)
@@ -64,7 +64,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
         new = _with(problem, state, start, way)
         if new is not None and _stands(new.fit, c):
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
-            return new, _gain(problem, state, new.fit, view), started
+            return new, gained(problem, state, new.fit, view), started
         if new is not None and fewer is None and c.kind == "size":
             fewer = without_idle(c, _sizes(new.fit, c))
     return fewer
@@ -241,7 +241,7 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
     return True
 
 
-def _gain(problem: Loop, state: Search, fit: Calibration, view: View) -> float:
+def gained(problem: Loop, state: Search, fit: Calibration, view: View) -> float:
     """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
     after = evidence_of(problem.ground(fit, view.ground.noise))
     prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (view.ground.fit, fit)]

@@ -1,4 +1,4 @@
-"""The loop: calibrate, score every candidate, let the leaders compete, add what clears the bar, repeat."""
+"""The choice among candidates: the leaders compete in joint refits, and one that clears every bar is taken."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -8,93 +8,21 @@ from scipy import stats
 
 from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.chunks import Chunk
-from hdev_jax.diagnosis.cycles import add_cycle
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.forms import another_form
 from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
-from hdev_jax.diagnosis.modes import add_mode
 from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, STABLE, inside, plausible, worth
-from hdev_jax.diagnosis.refit import Refitted, grow, is_size, refit, without
+from hdev_jax.diagnosis.refit import Refitted, gained, is_size, refit, without
 from hdev_jax.diagnosis.sharpen import sharpened
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
-from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
-from hdev_jax.physics import Effect, Vehicle
-from hdev_jax.physics.vehicle import Target
 
-__all__ = ["choose", "prune", "search", "twins_of"]
+__all__ = ["choose", "exchanged", "prune", "twins_of"]
 
-MOST_EFFECTS = 10
 MOST_TWINS = 2  # that are named beside an effect
 LEADERS = 3  # candidates that are refitted jointly before one is taken
 PLACEBOS = 199
 RESAMPLES = 100
 TRIES = 4  # rounds of refits in one step before the loop ends
-
-
-def search(
-    vehicle: Vehicle,
-    table: ParameterTable,
-    rows: Fit,
-    target: Target,
-    effects: Sequence[type[Effect]],
-    *,
-    fdr: float,
-    seed: int,
-    gears: int,
-    tell: Callable[[str], None] = lambda _: None,
-    remember: Callable[[int, Callable[[], Search]], Search] = lambda _, compute: compute(),
-) -> Search:
-    """Steps 1 to 5 of the loop on training rows alone.
-
-    **Arguments:** the declared vehicle with its table, `rows` from `padded`, the candidates' classes, `fdr` the level
-    of false discoveries over the whole library, `seed` for placebos and resampling, `gears` the highest id of a gear
-    or a kind of road that any trip has, `tell` for progress, `remember` what keeps the state of each step for a run
-    that is killed.
-
-    **Returns:** the vehicle with every effect that cleared the bar, its fit, and a verdict on every other candidate.
-    """
-    clusters = cluster_rows(rows.segments.take(np.arange(rows.rows)))
-
-    def declared() -> Search:
-        tell("calibrating the declared model")
-        return Search(vehicle, table, calibrate(vehicle, table, rows, target, clusters))
-
-    state = remember(0, declared)
-    for step in range(1, MOST_EFFECTS + 2):
-        problem = Loop(rows, target, clusters, effects, fdr, np.random.default_rng([seed, step]), gears)
-        state = remember(step, lambda p=problem, s=state, k=step: _step(p, s, k, tell))
-        if state.finished:
-            break
-    return state
-
-
-def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) -> Search:
-    """One look at all candidates, and the vehicle with the one that is taken; `finished` where none is."""
-    tell(f"scoring candidates, step {step}")
-    view = sharpened(problem, look(problem, state))
-    if step == 1:
-        state = replace(state, absorbs=view.absorbs)
-    choice = choose(problem, state, view, tell, skip=state.refused) if step <= MOST_EFFECTS else None
-    if choice is None and state.refused and step <= MOST_EFFECTS:
-        choice = choose(problem, state, view, tell, skip=tuple(view.reasons))  # tried just now: no second time
-    if choice is None and step <= MOST_EFFECTS:
-        # last: what misses an effect that comes and goes with the traffic is not noise, and may have cycles
-        for add in (add_cycle, add_mode):
-            if choice is None:
-                choice, why = add(problem, state)
-                view.sought += [why] if why is not None else []
-    if choice is None:
-        grown = grow(problem, state, tell)
-        return replace(grown or state, verdicts=view.verdicts(state, problem.fdr), finished=grown is None)
-    choice = replace(choice, refused=tuple(dict.fromkeys((*state.refused, *view.reasons))))
-    tell(f"added {choice.found[-1].id}")
-    return _added(problem, prune(problem, choice, tell), view)
-
-
-def _added(problem: Loop, state: Search, view: View) -> Search:
-    """The state after an effect was added, with its fit on the trail."""
-    trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
-    return replace(state, verdicts=view.verdicts(state, problem.fdr), trail=trail)
 
 
 def choose(
@@ -106,13 +34,12 @@ def choose(
     `forms`: whether it has to say more than what was found would in another form. What describes the rest need not,
     nor what was found before the rest.
     """
-    able = [
-        s for id_, s in view.best.items()
-        if id_ not in state.taken_out and id_ not in skip and _clears(problem, view, s)
-    ]  # fmt: skip
-    # what rows tell comes first; what only the clusters tell, when nothing else is left
-    able.sort(key=lambda s: (s.plain, -worth(s.gain, s.candidate)))
+    done = {*state.taken_out, *skip}
     for _ in range(tries):
+        # each round anew: an effect that was taken in fewer groups has another p, and with it all have another q
+        able = [s for id_, s in view.best.items() if id_ not in done and _clears(problem, view, s)]
+        # what rows tell comes first; what only the clusters tell, when nothing else is left
+        able.sort(key=lambda s: (s.plain, -worth(s.gain, s.candidate)))
         if not able:
             break
         first = able[0]
@@ -129,12 +56,12 @@ def choose(
                 taken, fitted = tried
                 gain = max(fitted[1], taken.gain) if taken.plain else fitted[1]
                 fits.append((worth(gain, taken.candidate), taken, fitted, gain))
-        # an effect that was taken in fewer groups has another p, and with it all have another q
-        able = [s for s in able if s not in close and _clears(problem, view, s)]
+        done |= {s.candidate.id for s in close}
         fits.sort(key=lambda f: -f[0])
         for _, s, (new, _, started), gain in fits:
             c = s.candidate
             if not _clears(problem, view, s):
+                tell(f"turned down {c.id}: it does not clear every bar beside what has changed")
                 continue
             if why := _placebo(problem, s, view) or (another_form(problem, state, s, view) if forms else None):
                 view.reasons[c.id] = why
@@ -155,7 +82,7 @@ def choose(
 
 
 def _clears(problem: Loop, view: View, s: Score) -> bool:
-    """Whether a candidate clears what can be asked of it before any refit."""
+    """Whether a candidate clears what is asked of its score."""
     told = view.q[s.candidate.id] <= problem.fdr and s.left_out_gain > LEFT_OUT
     return told and plausible(s) and worth(s.gain, s.candidate) > 0
 
@@ -165,7 +92,8 @@ def _tried(
 ) -> tuple[Score, Refitted] | str:
     """A candidate as it was taken, with its joint refit, or why it fails.
 
-    Without the groups (gears) that the refit puts beyond nothing it is another candidate, which clears every bar anew.
+    Without a group (a gear) that the refit puts beyond nothing it is another candidate, which clears every bar anew: as
+    scored at the shapes that it started from, however much finer ones were sought before.
     """
     scores = view.plain.plain_scores if s.plain else view.evidence.scores
     tell(f"refitting with {s.candidate.id}")
@@ -173,8 +101,9 @@ def _tried(
         s = inside(scores([tried])[0], scores)
         view.retaken(s)
         if not _clears(problem, view, s):
-            return "without the gears or kinds of road in which it does nothing it does not clear every bar"
-        tell(f"refitting with {s.candidate.id} in fewer gears or kinds of road")
+            by = s.candidate.parameter(s.candidate.sizes[0]).by.replace("_", " ")
+            return f"in the joint refit it does nothing in one {by} or more, and the others do not clear every bar"
+        tell(f"refitting {s.candidate.id} with {len(s.candidate.groups)} groups")
     return (s, tried) if tried is not None else "in the joint refit it is out of range or not told from nothing"
 
 
@@ -285,3 +214,36 @@ def prune(problem: Loop, state: Search, tell: Callable[[str], None], *, newest: 
         tell(f"taking {drop} out again")
         state = replace(without(problem, state, drop), taken_out=(*state.taken_out, drop))
     return state
+
+
+def exchanged(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search | None:
+    """The state with a found effect exchanged for another that does more in its place; None where none does.
+
+    Each but the newest was chosen beside fewer effects than there are now. A swap has to clear every bar of an addition
+    to the others, and to leave what it replaces well behind in the joint refits (one of its class comes to the same);
+    that one is not tried again.
+    """
+    for f in state.found[:-1]:
+        if f.score.candidate.effect.searched:
+            continue
+        start = without(problem, state, f.id)
+        view = look(problem, start)
+        if (own := view.best.get(f.id)) is None:
+            continue
+        more = [
+            id_ for id_, s in view.best.items()
+            if id_ not in (f.id, *state.taken_out) and s.plain == own.plain and _clears(problem, view, s)
+            and CLOSE * worth(s.gain, s.candidate) > worth(own.gain, own.candidate)
+        ]  # fmt: skip
+        if not more:
+            continue
+        tell(f"does {' or '.join(more)} do more than {f.id} in its place")
+        new = choose(problem, start, sharpened(problem, view), tell, skip=[k for k in view.best if k not in more])
+        if new is None:
+            continue
+        first, gain = new.found[-1], max(gained(problem, start, state.fit, view), own.gain)
+        if CLOSE * worth(first.gain, first.score.candidate) <= worth(gain, f.score.candidate):
+            continue
+        tell(f"exchanged {f.id} for {first.id}")
+        return replace(new, taken_out=(*state.taken_out, f.id))
+    return None

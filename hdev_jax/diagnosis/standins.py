@@ -43,7 +43,8 @@ def stand_ins(
 ) -> tuple[str, ...]:
     """Effects of those `asked` that are not found again beside the description of the rest in `state`'s vehicle.
 
-    One that reads one of the description's `channels` is left: the two may be one cause, told in parts.
+    One that reads one of the description's `channels`, or has sizes by one, is left: the two may be one cause, told in
+    parts.
     """
     gone = []
     for f in reversed(state.found):

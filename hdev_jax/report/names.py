@@ -83,7 +83,7 @@ _PARAMETERS = {
     "w_per_radps2": "power per motor speed squared",
     "w_per_passenger": "power per passenger",
 }
-_GROUPED = {"torque_nm": "gear", "delta": "gear", "excess": "road surface"}
+_GROUPED = {"driveline_drag": "gear", "gear_efficiency": "gear", "road_surface": "road surface"}
 _SUFFIXES = {"w", "s", "m", "mps", "nm", "n", "ohm", "rad", "c", "v", "mps2", "kg", "kw"}
 
 _COEFFICIENTS = {
@@ -176,13 +176,14 @@ def explained(effect_id: str) -> dict[str, Any]:
     }
 
 
-def parameter(name: str) -> str:
-    """`"speed_mps"` -> `"speed"`, `"torque_nm[2]"` -> `"torque (gear 2)"`: the unit stands with the value."""
+def parameter(name: str, effect_id: str = "") -> str:
+    """`"speed_mps"` -> `"speed"`: the unit stands with the value; what follows a bracket stays, but for effects by
+    gear or kind of road: `"torque_nm[2]"` of `driveline_drag` -> `"torque (gear 2)"`."""
     stem, bracket, group = name.partition("[")
     head, _, tail = stem.rpartition("_")
     word = _PARAMETERS.get(stem) or (head if head and tail in _SUFFIXES else stem).replace("_", " ")
-    if bracket and stem in _GROUPED:
-        return f"{word} ({_GROUPED[stem]} {group.removesuffix(']')})"
+    if bracket and effect_id in _GROUPED:
+        return f"{word} ({_GROUPED[effect_id]} {group.removesuffix(']')})"
     return f"{word} [{group}" if bracket else word
 
 
@@ -193,7 +194,7 @@ def coefficient(path: str) -> tuple[str, str]:
         words, unit = _COEFFICIENTS[stem]
     elif stem.startswith("effects."):
         _, effect_id, name = [*path.split(".", 2), "", ""][:3]
-        return f"{effect(effect_id)}: {parameter(name)}", ""
+        return f"{effect(effect_id)}: {parameter(name, effect_id)}", ""
     else:
         words, unit = stem.rpartition(".")[2].replace("_", " "), ""
     return (f"{words} [{group}" if bracket else words), unit

@@ -223,7 +223,7 @@ def _found(data: ReportData, e: dict[str, Any]) -> dict[str, Any]:
         "words": e.get("words") or said.get("words", ""),
         "equation": e.get("equation") or said.get("equation", ""),
         "separated_by": e.get("separated_by") or said.get("separated_by", ""),
-        "sizes": [(names.parameter(k), words.known(p)) for k, p in e.get("parameters", {}).items()],
+        "sizes": [(names.parameter(k, e["id"]), words.known(p)) for k, p in e.get("parameters", {}).items()],
         "stability": words.percent(None if stability is None else 100 * stability, signed=False, decimals=0),
         "twins": [names.effect(t) for t in e.get("indistinguishable_from") or []],
         "rmse": words.pair(e.get("test_rmse_before"), e.get("test_rmse_after")),

@@ -147,7 +147,7 @@ def count(n: int, word: str) -> str:
 def _sizes(effect: dict[str, Any]) -> str:
     """` (scale 0.98 ± 0.03)`."""
     found = [
-        f"{names.parameter(name)} {known(p)}"
+        f"{names.parameter(name, effect['id'])} {known(p)}"
         for name, p in effect.get("parameters", {}).items()
         if p.get("sd")  # what was chosen among a few is in the table
     ]

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,7 @@ from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.physics import LIBRARY, Effect, Grouped, Vehicle, at_null
+from hdev_jax.physics import LIBRARY, Effect, Grouped, Parameter, Vehicle, at_null
 from hdev_jax.rundir import open_run
 
 # by hook and kind: force, power and sensor effects of one row, sums over a trip, groups, switches, shifts
@@ -269,3 +269,22 @@ def test_a_step_is_kept_and_comes_back(through, state, problem, rows, tmp_path):
     assert [replace(f.score.candidate) for f in again.found] == [f.score.candidate for f in state.found]
     assert again.fit.table.structure == state.fit.table.structure
     np.testing.assert_array_equal(again.fit.table.values(again.fit.vehicle), jnp.asarray(state.fit.values))
+
+
+def test_an_effect_by_gear_starts_as_one_number_each_where_the_log_tells_no_gear():
+    """Sizes that a variant leaves out too: nothing may ask for a gear then."""
+
+    class TwoDrags(LIBRARY["driveline_drag"]):
+        parameters: ClassVar = tuple(
+            Parameter(n, "Nm", 0.0, 5.0, 0.0, 200.0, by="gear", whole=True) for n in ("torque_nm", "more_nm")
+        )
+        variants: ClassVar = (("torque_nm",), ("more_nm",))
+        more_nm: Any
+
+    c = Candidate(TwoDrags, ("more_nm",), (None,), (), "size", (0,))
+    effect = realised(c, np.array([4.0]))
+    assert float(effect.more_nm) == 4.0
+    assert float(effect.torque_nm) == 0.0
+    by_gear = realised(replace(c, groups=(2,)), np.array([4.0]), gears=3)
+    np.testing.assert_array_equal(by_gear.more_nm.values, [0.0, 0.0, 4.0, 0.0])
+    np.testing.assert_array_equal(by_gear.torque_nm.values, np.zeros(4))

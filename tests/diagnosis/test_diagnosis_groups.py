@@ -132,7 +132,7 @@ def test_a_gear_that_the_joint_refit_puts_below_nothing_leaves_and_the_others_ar
         f"effects.driveline_drag.torque_nm[{n}]" for n in (1, 2, 3)
     }
     hard = replace(loop, fdr=0.0)
-    assert "does not clear" in _tried(hard, state, s, view, lambda _: None)
+    assert "do not clear" in _tried(hard, state, s, view, lambda _: None)
 
 
 def test_a_gear_of_test_trips_alone_has_no_torque(tmp_path):
