@@ -79,6 +79,7 @@ class Search:
     verdicts: list[Verdict] = field(default_factory=list)
     absorbs: dict[str, list[str]] = field(default_factory=dict)
     taken_out: tuple[str, ...] = ()  # added once, superfluous later: not tried again
+    exchanged: tuple[str, ...] = ()  # left for another that does more in its place: takes no other's place
     refused: tuple[str, ...] = ()  # cleared the tests but not the joint refit: tried again only before the end
     trail: dict[str, list[float]] = field(default_factory=dict)  # values of the fit, by the effects it had
     finished: bool = False
@@ -153,6 +154,7 @@ class View:
     absorbs: dict[str, list[str]]
     absorbed_by: dict[str, str]
     reasons: dict[str, str] = field(default_factory=dict)
+    in_other_forms: set[str] = field(default_factory=set)  # say no more than what was found would in another form
     sought: list[Verdict] = field(default_factory=list)  # on what is looked for elsewhere than in columns
     q: dict[str, float] = field(init=False)
 

@@ -64,7 +64,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
         new = _with(problem, state, start, way)
         if new is not None and _stands(new.fit, c):
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
-            return new, gained(problem, state, new.fit, view), started
+            return new, gained(problem, new.fit, view), started
         if new is not None and fewer is None and c.kind == "size":
             fewer = without_idle(c, _sizes(new.fit, c))
     return fewer
@@ -241,7 +241,7 @@ def _in_range(fit: Calibration, candidate: Candidate) -> bool:
     return True
 
 
-def gained(problem: Loop, state: Search, fit: Calibration, view: View) -> float:
+def gained(problem: Loop, fit: Calibration, view: View) -> float:
     """Gain of a refitted vehicle over the present one, both under the present colour and at their own best levels."""
     after = evidence_of(problem.ground(fit, view.ground.noise))
     prior = [0.5 * float(np.sum(np.square(np.divide(*distance_from_table(f))))) for f in (view.ground.fit, fit)]

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from hdev_jax.diagnosis.cycles import add_cycle
+from hdev_jax.diagnosis.exchange import exchanged
 from hdev_jax.diagnosis.look import Loop, Search, View, look
 from hdev_jax.diagnosis.modes import add_mode
 from hdev_jax.diagnosis.refit import grow
-from hdev_jax.diagnosis.select import choose, exchanged, prune
+from hdev_jax.diagnosis.select import choose, prune
 from hdev_jax.diagnosis.sharpen import sharpened
 from hdev_jax.inference import Fit, ParameterTable, calibrate, cluster_rows
 from hdev_jax.physics import Effect, Vehicle
@@ -73,7 +74,7 @@ def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) 
                 choice, why = add(problem, state)
                 view.sought += [why] if why is not None else []
     if choice is None:
-        swapped = exchanged(problem, state, tell)
+        swapped = exchanged(problem, state, view, tell) if step <= MOST_EFFECTS else None
         if swapped is not None:
             return _added(prune(problem, swapped, tell), view, problem.fdr)
         grown = grow(problem, state, tell)
@@ -84,6 +85,6 @@ def _step(problem: Loop, state: Search, step: int, tell: Callable[[str], None]) 
 
 
 def _added(state: Search, view: View, fdr: float) -> Search:
-    """The state after an effect was added, with its fit on the trail."""
+    """The state after an effect was added or exchanged, with its fit on the trail."""
     trail = {**state.trail, ",".join(f.id for f in state.found): [float(x) for x in state.fit.values]}
     return replace(state, verdicts=view.verdicts(state, fdr), trail=trail)

@@ -10,13 +10,12 @@ from hdev_jax.diagnosis.candidates import Candidate
 from hdev_jax.diagnosis.chunks import Chunk
 from hdev_jax.diagnosis.evidence import Score
 from hdev_jax.diagnosis.forms import another_form
-from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
+from hdev_jax.diagnosis.look import Found, Loop, Search, View
 from hdev_jax.diagnosis.ranking import CLOSE, LEFT_OUT, STABLE, inside, plausible, worth
-from hdev_jax.diagnosis.refit import Refitted, gained, is_size, refit, without
-from hdev_jax.diagnosis.sharpen import sharpened
+from hdev_jax.diagnosis.refit import Refitted, is_size, refit, without
 from hdev_jax.diagnosis.sums import evidence_of, written_by_chunk
 
-__all__ = ["choose", "exchanged", "prune", "twins_of"]
+__all__ = ["choose", "clears", "prune", "twins_of"]
 
 MOST_TWINS = 2  # that are named beside an effect
 LEADERS = 3  # candidates that are refitted jointly before one is taken
@@ -37,7 +36,7 @@ def choose(
     done = {*state.taken_out, *skip}
     for _ in range(tries):
         # each round anew: an effect that was taken in fewer groups has another p, and with it all have another q
-        able = [s for id_, s in view.best.items() if id_ not in done and _clears(problem, view, s)]
+        able = [s for id_, s in view.best.items() if id_ not in done and clears(problem, view, s)]
         # what rows tell comes first; what only the clusters tell, when nothing else is left
         able.sort(key=lambda s: (s.plain, -worth(s.gain, s.candidate)))
         if not able:
@@ -60,10 +59,13 @@ def choose(
         fits.sort(key=lambda f: -f[0])
         for _, s, (new, _, started), gain in fits:
             c = s.candidate
-            if not _clears(problem, view, s):
+            if not clears(problem, view, s):
                 tell(f"turned down {c.id}: it does not clear every bar beside what has changed")
                 continue
-            if why := _placebo(problem, s, view) or (another_form(problem, state, s, view) if forms else None):
+            why = _placebo(problem, s, view)
+            if why is None and forms and (why := another_form(problem, state, s, view)) is not None:
+                view.in_other_forms.add(c.id)
+            if why is not None:
                 view.reasons[c.id] = why
                 tell(f"turned down {c.id}: {why}")
                 continue
@@ -81,7 +83,7 @@ def choose(
     return None
 
 
-def _clears(problem: Loop, view: View, s: Score) -> bool:
+def clears(problem: Loop, view: View, s: Score) -> bool:
     """Whether a candidate clears what is asked of its score."""
     told = view.q[s.candidate.id] <= problem.fdr and s.left_out_gain > LEFT_OUT
     return told and plausible(s) and worth(s.gain, s.candidate) > 0
@@ -100,7 +102,7 @@ def _tried(
     while isinstance(tried := refit(problem, state, s, view), Candidate):
         s = inside(scores([tried])[0], scores)
         view.retaken(s)
-        if not _clears(problem, view, s):
+        if not clears(problem, view, s):
             by = s.candidate.parameter(s.candidate.sizes[0]).by.replace("_", " ")
             return f"in the joint refit it does nothing in one {by} or more, and the others do not clear every bar"
         tell(f"refitting {s.candidate.id} with {len(s.candidate.groups)} groups")
@@ -214,36 +216,3 @@ def prune(problem: Loop, state: Search, tell: Callable[[str], None], *, newest: 
         tell(f"taking {drop} out again")
         state = replace(without(problem, state, drop), taken_out=(*state.taken_out, drop))
     return state
-
-
-def exchanged(problem: Loop, state: Search, tell: Callable[[str], None]) -> Search | None:
-    """The state with a found effect exchanged for another that does more in its place; None where none does.
-
-    Each but the newest was chosen beside fewer effects than there are now. A swap has to clear every bar of an addition
-    to the others, and to leave what it replaces well behind in the joint refits (one of its class comes to the same);
-    that one is not tried again.
-    """
-    for f in state.found[:-1]:
-        if f.score.candidate.effect.searched:
-            continue
-        start = without(problem, state, f.id)
-        view = look(problem, start)
-        if (own := view.best.get(f.id)) is None:
-            continue
-        more = [
-            id_ for id_, s in view.best.items()
-            if id_ not in (f.id, *state.taken_out) and s.plain == own.plain and _clears(problem, view, s)
-            and CLOSE * worth(s.gain, s.candidate) > worth(own.gain, own.candidate)
-        ]  # fmt: skip
-        if not more:
-            continue
-        tell(f"does {' or '.join(more)} do more than {f.id} in its place")
-        new = choose(problem, start, sharpened(problem, view), tell, skip=[k for k in view.best if k not in more])
-        if new is None:
-            continue
-        first, gain = new.found[-1], max(gained(problem, start, state.fit, view), own.gain)
-        if CLOSE * worth(first.gain, first.score.candidate) <= worth(gain, f.score.candidate):
-            continue
-        tell(f"exchanged {f.id} for {first.id}")
-        return replace(new, taken_out=(*state.taken_out, f.id))
-    return None

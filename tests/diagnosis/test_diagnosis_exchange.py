@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from planted import opened
 
+from hdev_jax.diagnosis import exchange, select
 from hdev_jax.diagnosis import search as searching
-from hdev_jax.diagnosis.look import Found, Loop, Search, look
+from hdev_jax.diagnosis.exchange import exchanged
+from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
+from hdev_jax.diagnosis.memory import from_plain, to_plain
 from hdev_jax.diagnosis.refit import refit
-from hdev_jax.diagnosis.select import exchanged
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.physics import LIBRARY
 
@@ -46,36 +48,90 @@ def problem(tmp_path_factory):
 LIKELY = (*PLANTED, "auxiliary_power", "cabin_warmup", "step_change", "rolling_speed")
 
 
+def seen(loop: Loop, state: Search, *in_other_forms: str) -> View:
+    view = look(loop, state)
+    view.in_other_forms.update(in_other_forms)
+    return view
+
+
+@pytest.fixture(scope="module")
+def stood_in(problem):
+    """Warm-up of the cabin in the place of a load at standstill, then the headwind."""
+    loop, state = found_in_turn(problem, ("cabin_warmup", "headwind"), LIKELY)
+    return loop, state, seen(loop, state)
+
+
 @pytest.mark.parametrize("wrong", ["auxiliary_power", "cabin_warmup", "step_change"])
 def test_what_does_more_takes_the_place_of_what_was_found(wrong, problem):
     loop, state = found_in_turn(problem, (wrong, "headwind"), LIKELY)
+    state = replace(state, refused=("rolling_speed",))
     said = []
-    swapped = exchanged(loop, state, said.append)
+    swapped = exchanged(loop, state, seen(loop, state), said.append)
     assert swapped is not None
     assert [f.id for f in swapped.found] == ["headwind", "standstill_load"]
-    assert swapped.taken_out == (wrong,)
+    assert (swapped.exchanged, swapped.taken_out, swapped.refused) == ((wrong,), (), ("rolling_speed",))
     assert not swapped.vehicle.has(wrong)
     assert not any(wrong in c.path for c in swapped.table.rows)
     assert swapped.fit.sigma < state.fit.sigma
     assert f"exchanged {wrong} for standstill_load" in said
-    assert state.taken_out == (), "the state that was asked stays as it is"
-    assert exchanged(loop, swapped, silent) is None, "no way back"
+    assert state.exchanged == (), "the state that was asked stays as it is"
+    back = replace(swapped, found=swapped.found[::-1])
+    assert exchanged(loop, back, seen(loop, back), silent) is None
+    again = from_plain(to_plain(swapped), problem.vehicle, LIBRARY, 4)
+    assert again.exchanged == swapped.exchanged
+    np.testing.assert_array_equal(problem.predict(again.fit.vehicle), problem.predict(swapped.fit.vehicle))
 
 
-def test_what_does_most_stays_and_so_does_what_cannot_be_told_from_more(problem):
+def test_what_does_most_stays_and_so_does_one_of_a_class(problem):
     loop, right = found_in_turn(problem, ("standstill_load", "headwind"), LIKELY)
-    assert exchanged(loop, right, silent) is None
-    loop, state = found_in_turn(problem, ("cabin_warmup", "headwind"), LIKELY)
-    assert exchanged(loop, replace(state, taken_out=("standstill_load", "auxiliary_power")), silent) is None
-    assert exchanged(loop, replace(state, found=state.found[::-1]), silent) is None, "the newest has just competed"
+    assert exchanged(loop, right, seen(loop, right), silent) is None
     for one in ("auxiliary_power", "power_gain"):
         loop, state = found_in_turn(problem, (one, "headwind"), ("headwind", "auxiliary_power", "power_gain"))
-        assert exchanged(loop, state, silent) is None, "a constant load and an offset of the power are one column"
+        view = seen(loop, state)
+        assert exchanged(loop, state, view, silent) is None, "a constant load and an offset of the power are one column"
 
 
-def test_a_swap_clears_every_bar(problem):
-    loop, state = found_in_turn(problem, ("cabin_warmup", "headwind"), LIKELY)
-    assert exchanged(replace(loop, fdr=0.0), state, silent) is None
+def test_the_newest_is_not_asked_nor_what_trips_alone_tell_of_rows(stood_in):
+    loop, state, view = stood_in
+    assert exchanged(loop, replace(state, found=state.found[::-1]), view, silent) is None
+    first = state.found[0]
+    by_trips = replace(first, score=replace(first.score, plain=True))
+    assert exchanged(loop, replace(state, found=[by_trips, *state.found[1:]]), view, silent) is None
+
+
+ABLE = ("standstill_load", "auxiliary_power", "step_change")
+
+
+@pytest.mark.parametrize("bar", ["taken_out", "exchanged"])
+def test_what_has_left_takes_no_place(bar, stood_in):
+    loop, state, view = stood_in
+    assert exchanged(loop, replace(state, **{bar: ABLE}), view, silent) is None
+
+
+def test_another_form_of_what_was_found_takes_no_place(stood_in):
+    loop, state, _ = stood_in
+    assert exchanged(loop, state, seen(loop, state, *ABLE), silent) is None
+
+
+def test_a_swap_clears_every_bar(stood_in, monkeypatch):
+    loop, state, view = stood_in
+    assert exchanged(replace(loop, fdr=0.0), state, view, silent) is None
+    monkeypatch.setattr(select, "_placebo", lambda *_: "a placebo does as well")
+    assert exchanged(loop, state, view, silent) is None
+
+
+def test_the_joint_refits_decide(stood_in, monkeypatch):
+    """What looks better by the first linear step, and is not well ahead once both are fitted, takes no place."""
+    loop, state, view = stood_in
+    monkeypatch.setattr(exchange, "gained", lambda *_: 1e6)
+    assert exchanged(loop, state, view, silent) is None
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "ahead"), [(100.0, 84.0, True), (100.0, 86.0, False), (9.0, 5.5, True), (5.0, 2.5, False)]
+)
+def test_well_ahead_is_by_a_share_and_by_more_than_chance(one, other, ahead):
+    assert exchange._well_ahead(one, other) is ahead
 
 
 def test_the_search_swaps_once_nothing_is_left_to_add(monkeypatch, problem):
