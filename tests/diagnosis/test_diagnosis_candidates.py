@@ -211,7 +211,7 @@ def state(problem, rows, gathered) -> Search:
     fit = calibrate(vehicle, table, rows, problem.target, cluster_rows(problem.segments))
     return Search(
         fit.vehicle, table, fit, found, [Verdict("drafting", None, 1.0, "no gap")], {"road.c_rr": ["mass_scale"]},
-        ("headwind",), ("air_density",), {"tyre_warmup": [1.0, 2.0]}, True,
+        ("headwind",), ("drafting",), ("air_density",), {"tyre_warmup": [1.0, 2.0]}, True,
     )  # fmt: skip
 
 
