@@ -50,7 +50,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
         one = (1.0 - AGREES) / (len(c.groups) if None not in c.groups else 1)
         apart = stats.t.isf(one, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
         turned = clear & (np.sign(plain) != np.sign(white))
-        lends = bool(np.all((np.abs(plain - white) <= apart * plain_sd) & ~turned))
+        lends = bool(np.all((np.abs(_possible(c, plain) - white) <= apart * plain_sd) & ~turned))
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
@@ -66,8 +66,18 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
             return new, gained(problem, new.fit, view), started
         if new is not None and fewer is None and c.kind == "size":
-            fewer = without_idle(c, _sizes(new.fit, c))
+            # what whitened rows clearly show is there, whatever rows of equal weight make of it beside rolling and drag
+            shown = np.abs(white) > BORNE_OUT * white_sd
+            fewer = without_idle(c, np.where(shown, white, _sizes(new.fit, c)))
     return fewer
+
+
+def _possible(c: Candidate, plain: np.ndarray) -> np.ndarray:
+    """Sizes by group as near as their range allows: of several gears one may come out below nothing by chance."""
+    if None in c.groups:
+        return plain
+    ranges = [(p.lower - p.null, p.upper - p.null) for p in map(c.parameter, c.sizes)]
+    return np.clip(plain, *np.transpose(ranges))
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:
