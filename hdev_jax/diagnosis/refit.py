@@ -66,18 +66,21 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
             return new, gained(problem, new.fit, view), started
         if new is not None and fewer is None and c.kind == "size":
-            # what whitened rows clearly show is there, whatever rows of equal weight make of it beside rolling and drag
-            shown = np.abs(white) > BORNE_OUT * white_sd
-            fewer = without_idle(c, np.where(shown, white, _sizes(new.fit, c)))
+            # a gear that whitened rows clearly show goes last: rows of equal weight may lose it beside rolling and drag
+            sizes = _sizes(new.fit, c)
+            shown = (np.abs(white) > BORNE_OUT * white_sd) & (white == _possible(c, white))
+            fewer = without_idle(c, np.where(shown, white, sizes)) or without_idle(c, sizes)
     return fewer
 
 
-def _possible(c: Candidate, plain: np.ndarray) -> np.ndarray:
-    """Sizes by group as near as their range allows: of several gears one may come out below nothing by chance."""
+def _possible(c: Candidate, beta: np.ndarray) -> np.ndarray:
+    """Sizes by group, those beyond a null that bounds their range at it: one of several gears may be so by chance."""
     if None in c.groups:
-        return plain
-    ranges = [(p.lower - p.null, p.upper - p.null) for p in map(c.parameter, c.sizes)]
-    return np.clip(plain, *np.transpose(ranges))
+        return beta
+    of = [c.parameter(n) for n in c.sizes]
+    return np.clip(
+        beta, [0.0 if p.null == p.lower else -np.inf for p in of], [0.0 if p.null == p.upper else np.inf for p in of]
+    )
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:

@@ -160,6 +160,23 @@ def test_a_gear_below_nothing_by_chance_stays_where_whitened_rows_show_it(tmp_pa
     assert all(abs(p["value"] - truth[name]) <= 3.0 * p["sd"] for name, p in sizes.items())
 
 
+def test_a_gear_that_rows_of_equal_weight_have_far_below_nothing_goes_though_whitened_rows_show_it(tmp_path):
+    """Something slow goes against the fourth gear: that gear is not known, which is no reason to lose the drag."""
+    _, problem, split = opened(tmp_path, seed=1, trips=24, rows_per_trip=200, effects={"driveline_drag": {}}, ratio=1.0)
+    every, column, _ = columns(
+        problem.vehicle, [LIBRARY["driveline_drag"]], problem.segments, len(problem.measured), problem.target
+    )
+    (drag,) = [c for c in every if 4 in c.groups]
+    trip, fourth = np.asarray(problem.segments.trip), column[:, drag.columns[drag.groups.index(4)]]
+    slow = np.zeros_like(fourth)
+    for t in np.unique(trip):
+        slow[trip == t] = np.convolve(fourth[trip == t], np.full(81, 1 / 81), "same")
+    summary = diagnosed(replace(problem, measured=problem.measured - 110.0 * slow), split).summary
+    assert [e["id"] for e in summary["effects"]] == ["driveline_drag"]
+    assert set(summary["effects"][0]["parameters"]) == {f"torque_nm[{n}]" for n in (1, 2, 3)}
+    assert summary["verdict"] == "effects_found_and_unexplained_structure"
+
+
 class DragAboveSpeed(LIBRARY["driveline_drag"]):
     """A drag by gear that sets in at a speed: sizes by gear with a shape, which the library has not."""
 
