@@ -50,7 +50,7 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
         one = (1.0 - AGREES) / (len(c.groups) if None not in c.groups else 1)
         apart = stats.t.isf(one, np.maximum(view.plain.bearing(c) - 1.0, 1.0))
         turned = clear & (np.sign(plain) != np.sign(white))
-        lends = bool(np.all((np.abs(_possible(c, plain) - white) <= apart * plain_sd) & ~turned))
+        lends = bool(np.all((np.abs(plain - white) <= apart * plain_sd) & ~turned))
     better = lends and bool(np.all(KNOWN * white_sd <= plain_sd))
     # one linear step says about what a refit will, unless thresholds and time constants are free to move
     try_plain = borne_out or shaped or s.plain or c.kind == "limit"
@@ -66,21 +66,8 @@ def refit(problem: Loop, state: Search, s: Score, view: View) -> Refitted | Cand
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
             return new, gained(problem, new.fit, view), started
         if new is not None and fewer is None and c.kind == "size":
-            # a gear that whitened rows clearly show goes last: rows of equal weight may lose it beside rolling and drag
-            sizes = _sizes(new.fit, c)
-            shown = (np.abs(white) > BORNE_OUT * white_sd) & (white == _possible(c, white))
-            fewer = without_idle(c, np.where(shown, white, sizes)) or without_idle(c, sizes)
+            fewer = without_idle(c, _sizes(new.fit, c))
     return fewer
-
-
-def _possible(c: Candidate, beta: np.ndarray) -> np.ndarray:
-    """Sizes by group, those beyond a null that bounds their range at it: one of several gears may be so by chance."""
-    if None in c.groups:
-        return beta
-    of = [c.parameter(n) for n in c.sizes]
-    return np.clip(
-        beta, [0.0 if p.null == p.lower else -np.inf for p in of], [0.0 if p.null == p.upper else np.inf for p in of]
-    )
 
 
 def _contradicted(plain: np.ndarray, white: np.ndarray, white_sd: np.ndarray) -> bool:
