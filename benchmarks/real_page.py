@@ -45,7 +45,7 @@ from the diagnosis.json of each run. Everything here is measured; nothing is syn
 choice has seen, and predictions are free of measured power (no feedback). Both logs are public, and effects of the
 library were added with them in view: this page says what the loop makes of measured data, not how it does on a log that
 nobody has seen. Synthetic logs that no rule of the search was mended on are in planted_again.md.
-Cost is the wall clock of one run with its compiling, and the most memory it held; other work ran beside some."""
+Cost is the wall clock of one run with its compiling, on a shared machine, and the most memory it held."""
 READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with what was found.
 - *found*: the loop added the effect. *one of a class*: it added one of several that this log cannot tell apart.
 - The number behind it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
