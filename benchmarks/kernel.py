@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.inference.parameters import ParameterTable
-from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.inference.sheet import build, read_sheet
 from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 
@@ -89,7 +89,7 @@ def cast(tree: Any, dtype: Any) -> Any:
 
 def contestants(segments: Segments, dtype: Any) -> dict[str, dict[str, Callable[[], Any]]]:
     """For each task: by name, a call that returns once its result is there, and `compile:name`, seconds to compile."""
-    built = read_sheet(SHEET).build(segments, "road", "energy_wh")
+    built = build(read_sheet(SHEET), segments, "road", "energy_wh")
     rows = tuple(r for name in NAMES for r in built.table.rows if r.name == name)
     table = ParameterTable(rows).with_free(**dict.fromkeys(NAMES, True))
     theta = jnp.asarray(table.values(built.vehicle), dtype)

@@ -25,9 +25,9 @@ from scipy.optimize import least_squares
 from timing import median_seconds
 
 from hdev_jax.learn import KernelTerms, Structure, Trip, fit_prediction, prepared, starts, with_theta
-from hdev_jax.learn.network import direct, free_run, output
-from hdev_jax.learn.normal import simulated, windows_of
-from hdev_jax.learn.online import recursive, update
+from hdev_jax.learn.narx.network import direct, free_run, output
+from hdev_jax.learn.narx.normal import simulated, windows_of
+from hdev_jax.learn.narx.online import recursive, update
 from hdev_jax.segments import Segments
 
 LIMITS = {"fit": 8.0, "free_run_us": 1.0, "free_run_batch_us": 0.1, "one_step_us": 30.0, "update_us": 50.0}

@@ -34,11 +34,11 @@ import numpy as np
 from pinn_page import page
 from pinn_sides import BATCH, Learner, Torch, same_loss
 
-from experiments.pinn_data import load
-from experiments.pinn_known import known
-from hdev_jax.learn.pinn import Recipe, predict, ready
-from hdev_jax.learn.pinn_fit import Ensemble, Member
-from hdev_jax.learn.pinn_rows import FEATURES, Rows
+from experiments.pinn.data import load
+from experiments.pinn.known import known
+from hdev_jax.learn.pinn.fit import Ensemble, Member
+from hdev_jax.learn.pinn.model import Recipe, predict, ready
+from hdev_jax.learn.pinn.rows import FEATURES, Rows
 from hdev_jax.learn.sequences import Scale
 from hdev_jax.learn.train import Trained
 

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from hdev_jax.learn.heads import Network
-from hdev_jax.learn.pinn import C_RR_LIMIT, Pinn, Recipe
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, stretches
-from hdev_jax.learn.pinn_loss import Objective
-from hdev_jax.learn.pinn_rows import Rows
+from hdev_jax.learn.pinn.fit import PAPER_WEIGHTS, stretches
+from hdev_jax.learn.pinn.heads import Network
+from hdev_jax.learn.pinn.loss import Objective
+from hdev_jax.learn.pinn.model import C_RR_LIMIT, Pinn, Recipe
+from hdev_jax.learn.pinn.rows import Rows
 from hdev_jax.learn.train import Plan, Trained, train
 from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
 

@@ -109,7 +109,7 @@ def linear_fleet() -> list[list[str]]:
     import jax
 
     from hdev_jax.inference import Rows, linear_fit
-    from hdev_jax.inference.hierarchy import fleet_draws
+    from hdev_jax.inference.posterior.hierarchy import fleet_draws
 
     car, table, rows, vehicle, _ = fleet(20, 25_000, hills=-1.0, tails=False)
     piece = Rows(rows, vehicle, vehicle)
@@ -138,8 +138,8 @@ def through_kernel(vehicles: int, rows_each: int, draws: int, plain_draws: int) 
     import jax
 
     from hdev_jax.inference import Rows, linear_fit
-    from hdev_jax.inference.models import Model
-    from hdev_jax.inference.nuts import compiled, coordinates, numpyro_nuts
+    from hdev_jax.inference.posterior.models import Model
+    from hdev_jax.inference.posterior.nuts import compiled, coordinates, numpyro_nuts
 
     car, table, rows, vehicle, _ = fleet(vehicles, rows_each, hills=0.03, tails=True)
     piece = Rows(rows, vehicle, vehicle)

@@ -38,13 +38,13 @@ def measure(rows: int, seed: int) -> dict[str, float]:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from hdev_jax.diagnosis.problem import prepare
-    from hdev_jax.diagnosis.stream import Piece, look_through
+    from hdev_jax.diagnosis.scores.stream import Piece, look_through
     from hdev_jax.fleet import demo_log
     from hdev_jax.inference import calibrate, cluster_rows, padded
     from hdev_jax.inference.sheet import read_sheet
     from hdev_jax.logs import read_log
     from hdev_jax.physics import LIBRARY
+    from hdev_jax.problem import prepare
 
     made = demo_log(seed, trips=TRIPS)
     _more_channels(made.frame, np.random.default_rng(seed))

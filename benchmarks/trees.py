@@ -22,9 +22,9 @@ import jax
 import numpy as np
 from timing import median_seconds
 
-from experiments.paper1_gears import fleet_rows
-from hdev_jax.learn.classifiers import Classifier
-from hdev_jax.learn.gears import EVERY, FEATURES, PLACE
+from experiments.paper1.gears import fleet_rows
+from hdev_jax.learn.gears.classifiers import Classifier
+from hdev_jax.learn.gears.gears import EVERY, FEATURES, PLACE
 
 LIMITS = {"kernel_mrows_s": 1.0, "over_lightgbm": 30.0, "one_row_us": 100.0, "accuracy_behind": 0.003}
 HELD = ("truck_4x2_16t", "bus_12m_3speed", "truck_8x4_37t", "tractor_6x2_44t")

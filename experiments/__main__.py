@@ -21,8 +21,8 @@ def main(argv: list[str] | None = None) -> int:
     options = _parser().parse_args(argv)
     import jax
 
-    from experiments.config import listed
-    from experiments.workers import ClusterError
+    from experiments.runner.config import listed
+    from experiments.runner.workers import ClusterError
     from hdev_jax.compiling import compile_quickly
 
     if options.compile_quickly:
@@ -84,9 +84,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run_one(options: argparse.Namespace) -> int:
-    from experiments.config import shown_point
-    from experiments.engine import run_config
-    from experiments.page import write_docs
+    from experiments.runner.config import shown_point
+    from experiments.runner.engine import run_config
+    from experiments.runner.page import write_docs
 
     runs = run_config(
         options.config, options.set, out=options.out, workers=_workers(options), scheduler=options.scheduler,
@@ -103,10 +103,10 @@ def _run_one(options: argparse.Namespace) -> int:
 
 
 def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
-    from experiments.compute import Where
-    from experiments.page import write_list_docs
-    from experiments.paper import against, run_list
-    from experiments.tables import cells
+    from experiments.runner.compute import Where
+    from experiments.runner.page import write_list_docs
+    from experiments.runner.paper import against, run_list
+    from experiments.runner.tables import cells
 
     for name in ("set", "tasks"):
         if getattr(options, name):

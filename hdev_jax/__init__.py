@@ -4,10 +4,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hdev_jax.api import calibrate, check, diagnose, effects, predict, simulate
     from hdev_jax.logs import read_log
     from hdev_jax.physics.vehicle import Vehicle
     from hdev_jax.segments import Segments
+    from hdev_jax.verbs.calibrate import calibrate
+    from hdev_jax.verbs.check import check
+    from hdev_jax.verbs.diagnose import diagnose
+    from hdev_jax.verbs.effects import effects
+    from hdev_jax.verbs.predict import predict
+    from hdev_jax.verbs.simulate import simulate
 
 __version__ = "0.1.0"
 
@@ -28,12 +33,12 @@ _HOME = {
     "Segments": "hdev_jax.segments",
     "Vehicle": "hdev_jax.physics.vehicle",
     "read_log": "hdev_jax.logs",
-    "calibrate": "hdev_jax.api",
-    "check": "hdev_jax.api",
-    "diagnose": "hdev_jax.api",
-    "effects": "hdev_jax.api",
-    "predict": "hdev_jax.api",
-    "simulate": "hdev_jax.api",
+    "calibrate": "hdev_jax.verbs.calibrate",
+    "check": "hdev_jax.verbs.check",
+    "diagnose": "hdev_jax.verbs.diagnose",
+    "effects": "hdev_jax.verbs.effects",
+    "predict": "hdev_jax.verbs.predict",
+    "simulate": "hdev_jax.verbs.simulate",
 }
 
 

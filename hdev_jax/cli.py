@@ -1,4 +1,4 @@
-"""`hdev`: the verbs of the toolkit on a user's own logs. Each verb is the function of `hdev_jax.api` of that name.
+"""`hdev`: the verbs of the toolkit on a user's own logs; each is the function of that name in `hdev_jax.verbs`.
 
 Results go to standard output, progress and errors to standard error. Exit status 0: done, also when nothing was found;
 2: the input is at fault, one line says what to do; 1: our fault; 130: interrupted.
@@ -12,6 +12,7 @@ import sys
 import textwrap
 import traceback
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -256,11 +257,11 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
         compile_quickly()
     import jax
 
-    from hdev_jax import api, progress
+    from hdev_jax import progress
 
     jax.config.update("jax_enable_x64", True)
     with progress.shown():
-        return getattr(api, verb)(**arguments)
+        return getattr(import_module(f"hdev_jax.verbs.{verb}"), verb)(**arguments)
 
 
 def _print(result: Any) -> None:

@@ -21,8 +21,8 @@ SHEET = ["--vehicle", "v.toml"]
 
 @pytest.fixture
 def api(monkeypatch):
-    """A stand-in for `hdev_jax.api` that records calls; `api.result` is returned, or raised."""
-    fake = types.ModuleType("hdev_jax.api")
+    """Modules in place of `hdev_jax.verbs.*` that record calls; `api.result` is returned, or raised."""
+    fake = types.SimpleNamespace()
     fake.result, fake.calls = "the result", []
 
     def answer(verb):
@@ -35,9 +35,9 @@ def api(monkeypatch):
         return call
 
     for verb in VERBS:
-        setattr(fake, verb, answer(verb))
-    monkeypatch.setitem(sys.modules, "hdev_jax.api", fake)
-    monkeypatch.setattr(hdev_jax, "api", fake, raising=False)
+        module = types.ModuleType(f"hdev_jax.verbs.{verb}")
+        setattr(module, verb, answer(verb))
+        monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.delenv("HDEV_DEBUG", raising=False)
     return fake
 
@@ -103,7 +103,7 @@ def test_defaults(api, argv, arguments):
 
 
 def test_each_verb_is_the_function_of_that_name_and_arguments():
-    from hdev_jax import api
+    from hdev_jax.verbs import api
 
     (subparsers,) = (a for a in cli.parser()._actions if isinstance(a, argparse._SubParsersAction))
     assert set(subparsers.choices) == set(VERBS)
@@ -199,8 +199,8 @@ def test_nothing_to_print(api, capsys):
 
 def test_a_reader_that_stops_early_is_no_error():
     code = (
-        "import sys, types; api = types.ModuleType('hdev_jax.api'); api.effects = lambda: 'x\\n' * 100000\n"
-        "sys.modules['hdev_jax.api'] = api; import hdev_jax; hdev_jax.api = api\n"
+        "import sys, types; m = types.ModuleType('hdev_jax.verbs.effects'); m.effects = lambda: 'x\\n' * 100000\n"
+        "sys.modules[m.__name__] = m\n"
         "from hdev_jax.cli import main; sys.exit(main(['effects']))"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

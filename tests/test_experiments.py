@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from experiments import store
-from experiments.compute import Asked, Where, compute
-from experiments.config import CONFIGS, artefact, changes, every_config, expanded, listed, resolve, typed
-from experiments.data import MissingDataError
-from experiments.engine import run_config
-from experiments.log import Log
-from experiments.page import write_docs
-from experiments.planted import Config, tasks
-from experiments.tables import wilson
+from experiments.planted.study import Config, tasks
+from experiments.runner import store
+from experiments.runner.compute import Asked, Where, compute
+from experiments.runner.config import CONFIGS, artefact, changes, every_config, expanded, listed, resolve, typed
+from experiments.runner.data import MissingDataError
+from experiments.runner.engine import run_config
+from experiments.runner.log import Log
+from experiments.runner.page import write_docs
+from experiments.runner.tables import wilson
 from hdev_jax.errors import InputError
 
 STUDIES = Path(__file__).parents[1] / "configs" / "studies"
@@ -225,7 +225,7 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     sizes = ["cases.single.sizes=[1.0, 2.0]"]
     run_config(STUDIES / "planted_quick.toml", sizes, out=tmp_path / "sizes", kept=tmp_path / "kept")
     assert (tmp_path / "sizes/figures/power.png").stat().st_size > 200
-    monkeypatch.setattr("experiments.planted.run", lambda task: pytest.fail(f"run again: {task}"))
+    monkeypatch.setattr("experiments.planted.study.run", lambda task: pytest.fail(f"run again: {task}"))
     again = once("b")
     assert again["rows"] == first["rows"]
     assert json.loads((tmp_path / "b" / "metrics.json").read_text())["rows"] == first["rows"]

@@ -5,10 +5,10 @@ import gzip
 import numpy as np
 import pytest
 
-from experiments.config import CONFIGS, resolve, typed
-from experiments.data import MissingDataError
-from experiments.pinn import Config, tasks
-from experiments.pinn_buses import ADAPTER, BUSES, SHEET, bus_files, bus_sources, buses, read_mission
+from experiments.pinn.buses import ADAPTER, BUSES, SHEET, bus_files, bus_sources, buses, read_mission
+from experiments.pinn.study import Config, tasks
+from experiments.runner.config import CONFIGS, resolve, typed
+from experiments.runner.data import MissingDataError
 from hdev_jax.logs import TARGETS, read_log
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.engine import run_config
+from experiments.runner.engine import run_config
 
 ROOT = Path(__file__).parents[1]
 CONFIG = """
@@ -88,8 +88,8 @@ def test_a_sweep_outlives_a_worker_and_its_numbers_are_those_of_one_process(tmp_
 
 
 def test_no_cluster_is_one_line_and_loses_nothing(tmp_path, capsys, monkeypatch):
-    from experiments import workers
     from experiments.__main__ import main
+    from experiments.runner import workers
 
     (tmp_path / "c.toml").write_text(CONFIG.partition("[sweep]")[0])
     monkeypatch.setattr(workers, "PATIENCE", 0.5)

@@ -10,21 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import pinn, pinn_networks, pinn_pooled
-from experiments.config import CONFIGS, resolve, typed
-from experiments.paper1_halves import coefficient
-from experiments.pinn import Config, chosen, tasks, together
-from experiments.pinn_closed import closed, kernel, said, sized, trainable
-from experiments.pinn_data import Data, load, weighed
-from experiments.pinn_diagnosed import united
-from experiments.pinn_known import known
-from experiments.pinn_models import boosted
-from experiments.pinn_pooled import fleet, sizes_of
-from experiments.pinn_scores import TAUGHT, pooled, scores
+from experiments.paper1.halves import coefficient
+from experiments.pinn import networks as pinn_networks
+from experiments.pinn import pooled as pinn_pooled
+from experiments.pinn import study as pinn
+from experiments.pinn.closed import closed, kernel, said, sized, trainable
+from experiments.pinn.data import Data, load, weighed
+from experiments.pinn.diagnosed import united
+from experiments.pinn.known import known
+from experiments.pinn.models import boosted
+from experiments.pinn.pooled import fleet, sizes_of
+from experiments.pinn.scores import TAUGHT, pooled, scores
+from experiments.pinn.study import Config, chosen, tasks, together
+from experiments.runner.config import CONFIGS, resolve, typed
 from hdev_jax.errors import InputError
-from hdev_jax.learn.pinn import Pinn, Recipe, predict
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS
-from hdev_jax.learn.pinn_rows import FEATURES
+from hdev_jax.learn.pinn.fit import PAPER_WEIGHTS
+from hdev_jax.learn.pinn.model import Pinn, Recipe, predict
+from hdev_jax.learn.pinn.rows import FEATURES
 from hdev_jax.learn.train import DivergedError
 from hdev_jax.physics import Grouped
 from hdev_jax.physics.battery import RegenLimit

@@ -6,13 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import pinn, pinn_figures, pinn_networks, pinn_pages
-from experiments.config import CONFIGS, resolve, typed
-from experiments.pinn_data import Data, Member
-from experiments.pinn_scores import TAUGHT, pooled, scores
-from experiments.tables import read_markdown
+from experiments.pinn import figures as pinn_figures
+from experiments.pinn import networks as pinn_networks
+from experiments.pinn import pages as pinn_pages
+from experiments.pinn import study as pinn
+from experiments.pinn.data import Data, Member
+from experiments.pinn.scores import TAUGHT, pooled, scores
+from experiments.runner.config import CONFIGS, resolve, typed
+from experiments.runner.tables import read_markdown
 from hdev_jax.errors import InputError
-from hdev_jax.learn.pinn import Recipe
+from hdev_jax.learn.pinn.model import Recipe
 from hdev_jax.learn.train import DivergedError
 from hdev_jax.rundir import Run
 from hdev_jax.segments import Segments

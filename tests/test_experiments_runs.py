@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from toy_studies import squares
 
-from experiments import store, workers
 from experiments.__main__ import main
-from experiments.compare import check, comparison
-from experiments.engine import run_config
-from experiments.tables import read_markdown
+from experiments.runner import store, workers
+from experiments.runner.compare import check, comparison
+from experiments.runner.engine import run_config
+from experiments.runner.tables import read_markdown
 from hdev_jax.errors import InputError
 
 ROOT = Path(__file__).parents[1]

@@ -20,7 +20,7 @@ from hdev_jax.fleet.hidden import shift_program
 from hdev_jax.fleet.rows import ROW_FIELDS, padded
 from hdev_jax.fleet.shifting import engaged, load_share, shift_lines
 from hdev_jax.fleet.variants import variant
-from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.inference.sheet import build, read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics.across import DISTANCE_SINCE_START, FIRST, LAST, distance_since_start, trip_bounds
 
@@ -391,7 +391,7 @@ def test_the_sheet_predicts_what_the_truth_says_it_does(folder):
     for name in ("A", "bus_12m_2speed"):
         log = read_log(folder / "a" / "log.parquet" / f"{name}.parquet")
         sheet = read_sheet(folder / "a" / "sheets" / f"{name}.toml")
-        built = sheet.build(log.segments, "road", "energy_wh")
+        built = build(sheet, log.segments, "road", "energy_wh")
         truth = pd.read_parquet(folder / "a" / "truth.parquet" / f"{name}.parquet")
         predicted = energy(built.vehicle, jax.tree.map(jnp.asarray, log.segments))
         np.testing.assert_allclose(predicted, truth["tabular_wh"], rtol=1e-6, atol=1e-6)

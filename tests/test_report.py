@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hdev_jax import report
-from hdev_jax.diagnosis.metrics import metrics as errors
+from hdev_jax.problem import metrics as errors
 from hdev_jax.report import ReportData, answer, statistics, words, write_calibration_report, write_report
 from hdev_jax.report import data as report_data
 from hdev_jax.report import names as shown

@@ -8,9 +8,8 @@ import pytest
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference import ParameterTable
-from hdev_jax.inference.maps import read_map
-from hdev_jax.inference.sheet import choose_entry, read_sheet, traction_force_from_torque
-from hdev_jax.inference.sheet_text import augmented_sheet
+from hdev_jax.inference.maps.read import read_map
+from hdev_jax.inference.sheet import augmented_sheet, build, choose_entry, read_sheet, traction_force_from_torque
 from hdev_jax.physics import LIBRARY, EfficiencyMap, Grouped, at_null
 from hdev_jax.segments import Segments
 from hdev_jax.units import GRAVITY_MPS2
@@ -219,17 +218,17 @@ def test_vehicle_with_a_map_uses_it(sheet, tmp_path):
     (tmp_path / "m.csv").write_text(HEADER + "\n".join(f"{g},0,0,{0.9 + 0.01 * g}" for g in range(1, 5)))
     log = a_log("gear")
     text = ROAD + "[driveline]\nmap = 'm.csv'\n" + GEARS
-    built = sheet(text).build(log, "road", "energy_wh")
-    lossless = sheet(ROAD + "[driveline]\nefficiency = 1.0\n" + GEARS).build(log, "road", "energy_wh")
+    built = build(sheet(text), log, "road", "energy_wh")
+    lossless = build(sheet(ROAD + "[driveline]\nefficiency = 1.0\n" + GEARS), log, "road", "energy_wh")
     wheel, battery = lossless.vehicle.power(log), np.asarray(built.vehicle.power(log))
     eta = 0.9 + 0.01 * log.channels["gear"]
     np.testing.assert_allclose(battery, np.where(wheel > 0, wheel / eta, wheel * eta), rtol=1e-9)
     assert built.notes == []
     assert not any(c.path.startswith("driveline") for c in built.table.rows)
-    bare = sheet(ROAD + "[driveline]\nmap = 'm.csv'\n").build(log, "road", "energy_wh")
+    bare = build(sheet(ROAD + "[driveline]\nmap = 'm.csv'\n"), log, "road", "energy_wh")
     assert len(bare.notes) == 2
     assert "wheel radius of 0.478 m" in bare.notes[1]
-    no_gear = sheet(text).build(a_log(), "road", "energy_wh")
+    no_gear = build(sheet(text), a_log(), "road", "energy_wh")
     assert any("no column 'gear'" in n for n in no_gear.notes)
 
 
@@ -277,7 +276,7 @@ USED = {  # (entry, target): coefficients of the table, and what the notes speak
 def test_only_the_sections_in_use(entry, target, sheet):
     paths, notes = USED[entry, target]
     log = a_log("motor_torque_nm", "motor_speed_radps", "traction_force_n", "gear")
-    built = sheet(FULL).build(log, entry, target)
+    built = build(sheet(FULL), log, entry, target)
     assert [c.path for c in built.table.rows] == paths
     assert all(any(n.startswith(part) for n in built.notes) for part in notes)
     assert len(built.notes) == len(notes)
@@ -311,19 +310,19 @@ def test_a_needed_key_that_is_missing(entry, target, text, key, sheet):
 
 
 def test_no_note_on_the_efficiency_that_the_target_is_derived_with(sheet):
-    built = sheet(ROAD + DRIVELINE).build(a_log("motor_torque_nm", "gear"), "road", "traction_force_n")
+    built = build(sheet(ROAD + DRIVELINE), a_log("motor_torque_nm", "gear"), "road", "traction_force_n")
     assert built.notes == []
 
 
 def test_entry_behind_the_target(sheet):
     with pytest.raises(ValueError, match="motor_torque_nm"):
-        sheet(FULL).build(a_log("gear"), "shaft", "motor_torque_nm")
+        build(sheet(FULL), a_log("gear"), "shaft", "motor_torque_nm")
 
 
 def test_efficiency_covers_wheel_to_battery(sheet):
     log = a_log("gear")
-    built = sheet(FULL).build(log, "road", "energy_wh")
-    force = np.asarray(sheet(FULL).build(log, "road", "traction_force_n").vehicle.force(log))
+    built = build(sheet(FULL), log, "road", "energy_wh")
+    force = np.asarray(build(sheet(FULL), log, "road", "traction_force_n").vehicle.force(log))
     power = force * log.speed_mps
     np.testing.assert_allclose(
         built.vehicle.power(log), np.where(power > 0, power / 0.91, power * 0.91) + 900, rtol=1e-9
@@ -332,36 +331,36 @@ def test_efficiency_covers_wheel_to_battery(sheet):
 
 def test_machine_covers_wheel_to_battery_without_a_driveline_efficiency(sheet):
     log = a_log("gear")
-    built = sheet(ROAD + MACHINE).build(log, "road", "energy_wh")
+    built = build(sheet(ROAD + MACHINE), log, "road", "energy_wh")
     assert built.notes == ["[machine] covers wheel to battery: the sheet has no driveline.efficiency"]
-    force = np.asarray(sheet(FULL).build(log, "road", "traction_force_n").vehicle.force(log))
+    force = np.asarray(build(sheet(FULL), log, "road", "traction_force_n").vehicle.force(log))
     power = force * log.speed_mps
     np.testing.assert_allclose(built.vehicle.power(log), np.where(power > 0, power / 0.93, power * 0.9), rtol=1e-9)
 
 
 def test_without_a_battery_section_nothing_is_drawn_and_nothing_estimated(sheet):
-    built = sheet(MACHINE).build(a_log("traction_force_n"), "wheel", "energy_wh")
+    built = build(sheet(MACHINE), a_log("traction_force_n"), "wheel", "energy_wh")
     assert float(built.vehicle.effect("auxiliary").auxiliary_w) == 0.0
     assert "battery.auxiliary_w" not in [c.path for c in built.table.rows]
 
 
 def test_mass_of_the_log_comes_first(sheet):
     log = a_log("mass_kg", "gear")
-    built = sheet(FULL).build(log, "road", "traction_force_n")
+    built = build(sheet(FULL), log, "road", "traction_force_n")
     assert "mass_kg" not in [c.path for c in built.table.rows]
     assert any("mass_kg" in n for n in built.notes)
     text = FULL.replace("mass_kg = 24000.0\n", "")
     np.testing.assert_allclose(
-        sheet(text).build(log, "road", "traction_force_n").vehicle.force(log), built.vehicle.force(log)
+        build(sheet(text), log, "road", "traction_force_n").vehicle.force(log), built.vehicle.force(log)
     )
-    free = sheet("mass_kg = { value = 24000.0, sd = 500.0 }\n" + text).build(a_log(), "road", "traction_force_n")
+    free = build(sheet("mass_kg = { value = 24000.0, sd = 500.0 }\n" + text), a_log(), "road", "traction_force_n")
     row = next(c for c in free.table.rows if c.path == "mass_kg")
     assert row.free
     assert (row.value, row.sd, row.unit, row.lower) == (24000.0, 500.0, "kg", 0.0)
 
 
 def test_rows_carry_prior_unit_and_support(sheet):
-    rows = {c.path: c for c in sheet(FULL).build(a_log("gear"), "road", "energy_wh").table.rows}
+    rows = {c.path: c for c in build(sheet(FULL), a_log("gear"), "road", "energy_wh").table.rows}
     c_rr, auxiliary, efficiency = (rows[k] for k in ("road.c_rr", "battery.auxiliary_w", "driveline.efficiency"))
     assert (c_rr.value, c_rr.sd, c_rr.scale, c_rr.unit, c_rr.lower, c_rr.upper) == (0.006, 8e-4, 8e-4, "1", 0.0, np.inf)
     assert (auxiliary.unit, auxiliary.lower, auxiliary.upper, auxiliary.free) == ("W", -np.inf, np.inf, True)
@@ -376,13 +375,13 @@ def test_per_vehicle(sheet):
         "sd = 0.0008", "sd = 0.0008, per_vehicle = true, vehicles = { B = { value = 0.008, sd = 0.001 } }"
     )
     log = a_log("gear", vehicles=3)
-    built = sheet(text).build(log, "road", "traction_force_n", vehicle_names=("A", "B", "C"))
+    built = build(sheet(text), log, "road", "traction_force_n", vehicle_names=("A", "B", "C"))
     rows = [c for c in built.table.rows if c.path == "road.c_rr"]
     assert [(c.name, c.group, c.value, c.sd) for c in rows] == [
         ("road.c_rr[A]", 0, 0.006, 0.0008), ("road.c_rr[B]", 1, 0.008, 0.001), ("road.c_rr[C]", 2, 0.006, 0.0008),
     ]  # fmt: skip
     assert isinstance(built.vehicle.effect("rolling").c_rr, Grouped)
-    shared = sheet(FULL).build(log, "road", "traction_force_n").vehicle
+    shared = build(sheet(FULL), log, "road", "traction_force_n").vehicle
     more = np.asarray(built.vehicle.force(log)) - np.asarray(shared.force(log))
     np.testing.assert_allclose(more, np.where(log.vehicle == 1, 0.002 * 24000 * GRAVITY_MPS2, 0.0), atol=1e-6)
     free = built.table.values(built.vehicle)
@@ -394,15 +393,15 @@ def test_mass_per_vehicle_with_a_sensor_effect(sheet):
     text = FULL.replace("24000.0", "{ value = 24000.0, sd = 500.0, per_vehicle = true, vehicles = { B = 20000.0 } }")
     read = sheet(text + "[effects.mass_scale]\nscale = 0.1\n")
     log = a_log("gear", vehicles=2)
-    built = read.build(log, "road", "traction_force_n", vehicle_names=("A", "B"))
+    built = build(read, log, "road", "traction_force_n", vehicle_names=("A", "B"))
     logged = log.with_channels(mass_kg=np.where(log.vehicle == 1, 22000.0, 26400.0))
-    expected = sheet(FULL).build(logged, "road", "traction_force_n").vehicle.force(logged)
+    expected = build(sheet(FULL), logged, "road", "traction_force_n").vehicle.force(logged)
     np.testing.assert_allclose(built.vehicle.force(log), expected, rtol=1e-12)
 
 
 def test_per_vehicle_without_names(sheet):
     text = MACHINE.replace("sd = 0.05", "sd = 0.05, per_vehicle = true")
-    built = sheet(text).build(a_log("traction_force_n", vehicles=2), "wheel", "energy_wh")
+    built = build(sheet(text), a_log("traction_force_n", vehicles=2), "wheel", "energy_wh")
     assert [c.name for c in built.table.rows][:2] == [
         "machine.motoring_efficiency[0]",
         "machine.motoring_efficiency[1]",
@@ -418,7 +417,7 @@ def test_effects_are_added_with_their_values(sheet):
         "[effects.regen_limit]\npower_w = { value = 9e4, sd = 2e3 }\n"
     )
     log = a_log("gear")
-    built = sheet(text).build(log, "road", "energy_wh")
+    built = build(sheet(text), log, "road", "energy_wh")
     effect = built.vehicle.effect("tyre_warmup")
     assert (float(effect.excess), float(effect.distance_m)) == (0.3, 4000.0)
     rows = {c.path: c for c in built.table.rows}
@@ -433,7 +432,7 @@ def test_effects_that_this_log_or_target_cannot_show_are_skipped(sheet):
         "[effects.headwind]\nscale = 1.0\n[effects.torque_offset]\ngain = 0.1\n"
         "[effects.auxiliary_power]\npower_w = 500.0\n[effects.road_grade]\nscale = 1.0\n"
     )
-    built = sheet(text).build(a_log("gear", "grade_rad", "accel_mps2"), "road", "traction_force_n")
+    built = build(sheet(text), a_log("gear", "grade_rad", "accel_mps2"), "road", "traction_force_n")
     skipped = [n for n in built.notes if n.startswith("effect ")]
     reasons = ("wind_speed_mps", "measured motor torque", "behind the target", "the log has grade_rad")
     assert len(skipped) == 4
@@ -445,12 +444,12 @@ def test_effects_that_this_log_or_target_cannot_show_are_skipped(sheet):
 def test_an_effect_by_gear(sheet):
     text = FULL + "[effects.gear_efficiency]\ndelta = { 2 = { value = 0.03, sd = 0.01 }, 4 = 0.05 }\n"
     log = a_log("gear")
-    built = sheet(text).build(log, "road", "motor_torque_nm")
+    built = build(sheet(text), log, "road", "motor_torque_nm")
     rows = [c for c in built.table.rows if c.path.startswith("effects.")]
     assert [(c.name, c.free) for c in rows] == [
         ("effects.gear_efficiency.delta[2]", True), ("effects.gear_efficiency.delta[4]", False),
     ]  # fmt: skip
-    plain = np.asarray(sheet(FULL).build(log, "road", "motor_torque_nm").vehicle.torque(log))
+    plain = np.asarray(build(sheet(FULL), log, "road", "motor_torque_nm").vehicle.torque(log))
     ratio = np.asarray(built.vehicle.torque(log)) / plain - 1
     delta = np.array([0, 0, 0.03, 0, 0.05])[log.channels["gear"].astype(int)]
     np.testing.assert_allclose(ratio, delta * np.sign(plain), atol=1e-12)
@@ -459,10 +458,10 @@ def test_an_effect_by_gear(sheet):
 def test_an_effect_by_gear_is_skipped_where_the_log_tells_none_and_one_number_holds_in_all(sheet):
     by_gear, one = "torque_nm = { 1 = 5.0, 2 = 9.0 }", "torque_nm = { value = 9.0, sd = 1.0 }"
     log = a_log()
-    built = sheet(FULL + f"[effects.driveline_drag]\n{by_gear}\n").build(log, "road", "energy_wh")
+    built = build(sheet(FULL + f"[effects.driveline_drag]\n{by_gear}\n"), log, "road", "energy_wh")
     assert not built.vehicle.has("driveline_drag")
     assert any("driveline_drag" in n and "no column 'gear'" in n for n in built.notes)
-    built = sheet(FULL + f"[effects.driveline_drag]\n{one}\n").build(log, "road", "energy_wh")
+    built = build(sheet(FULL + f"[effects.driveline_drag]\n{one}\n"), log, "road", "energy_wh")
     assert [(c.name, c.free) for c in built.table.rows if c.path.startswith("effects.")] == [
         ("effects.driveline_drag.torque_nm", True)
     ]
@@ -475,7 +474,7 @@ def test_effects_of_the_users_own(tmp_path):
     (tmp_path / "s.toml").write_text(MACHINE + "[effects.mine]\npower_w = 100.0\n")
     refusal(read_sheet, tmp_path / "s.toml")
     read = read_sheet(tmp_path / "s.toml", library={**LIBRARY, "mine": Mine})
-    assert read.build(a_log("traction_force_n"), "wheel", "energy_wh").vehicle.has("mine")
+    assert build(read, a_log("traction_force_n"), "wheel", "energy_wh").vehicle.has("mine")
 
 
 @pytest.mark.parametrize("effect_id", LIBRARY)
@@ -501,8 +500,8 @@ def test_traction_force_from_torque(sheet):
 def test_traction_force_is_the_inverse_of_torque(sheet):
     log = a_log("gear")
     read = sheet(FULL)
-    torque = np.asarray(read.build(log, "road", "motor_torque_nm").vehicle.torque(log))
-    force = np.asarray(read.build(log, "road", "traction_force_n").vehicle.force(log))
+    torque = np.asarray(build(read, log, "road", "motor_torque_nm").vehicle.torque(log))
+    force = np.asarray(build(read, log, "road", "traction_force_n").vehicle.force(log))
     np.testing.assert_allclose(
         traction_force_from_torque(log.with_channels(motor_torque_nm=torque), read), force, rtol=1e-9
     )
@@ -535,7 +534,7 @@ def test_round_trip(entry, target, sheet):
         "sd = 0.05", "sd = 0.05, per_vehicle = true"
     )
     read = sheet('name = "truck \\"34\\" \\u007f"\nsource = "somewhere"\n' + text)
-    built = read.build(log, entry, target, vehicle_names=("bus 1", "B.2"))
+    built = build(read, log, entry, target, vehicle_names=("bus 1", "B.2"))
     rng = np.random.default_rng(1)
     values = built.table.values(built.vehicle) * (1.0 + 0.2 * rng.random(len(built.table.free)))  # efficiencies above 1
     after = built.table.insert(built.vehicle, jnp.asarray(values))
@@ -552,7 +551,7 @@ def test_round_trip(entry, target, sheet):
     }  # fmt: skip
     text = augmented_sheet(read, calibration, effects)
     again = sheet(text, "augmented.toml")
-    rebuilt = again.build(log, entry, target, vehicle_names=("bus 1", "B.2"))
+    rebuilt = build(again, log, entry, target, vehicle_names=("bus 1", "B.2"))
     np.testing.assert_allclose(rebuilt.vehicle.predict(log, target), after.predict(log, target), rtol=1e-9)
     rows = {c.name: c for c in rebuilt.table.rows}
     for name, (value, sd) in calibration.items():
@@ -572,7 +571,7 @@ def test_round_trip_by_gear_and_of_effects_in_the_sheet(sheet):
     read = sheet(FULL + "[effects.gear_efficiency]\ndelta = { 1 = 0.02, 2 = { value = 0.03, sd = 0.01 } }\n")
     effects = {"tyre_warmup": {"excess": (0.4, 0.1, "1"), "distance_m": (7e3, 1e3, "m")}}
     again = sheet(augmented_sheet(read, {"effects.gear_efficiency.delta[2]": (0.05, 0.002)}, effects), "b.toml")
-    rows = {c.name: (c.value, c.sd) for c in again.build(log, "road", "energy_wh").table.rows}
+    rows = {c.name: (c.value, c.sd) for c in build(again, log, "road", "energy_wh").table.rows}
     assert rows["effects.gear_efficiency.delta[1]"] == (0.02, None)
     assert rows["effects.gear_efficiency.delta[2]"] == (0.05, 0.002)
     assert rows["effects.tyre_warmup.distance_m"] == (7e3, 1e3)
@@ -609,7 +608,7 @@ def test_sheets_of_the_project():
     road = sheets["kia_niro_road"]
     assert road.declared["mass_kg"].value == 1739.0  # paper 2, table I
     assert float(road.driveline(1.0).ratio_radpm(a_log())) == pytest.approx(33.28, abs=0.01)
-    built = sheets["truck_34t"].build(a_log("gear"), "road", "energy_wh")
+    built = build(sheets["truck_34t"], a_log("gear"), "road", "energy_wh")
     assert [c.path for c in built.table.free] == ["road.c_rr", "road.cda_m2"]
-    built = road.build(a_log("motor_torque_nm"), "road", "traction_force_n")
+    built = build(road, a_log("motor_torque_nm"), "road", "traction_force_n")
     assert [c.path for c in built.table.free] == ["road.c_rr", "road.cda_m2"]

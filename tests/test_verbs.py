@@ -16,10 +16,10 @@ import pytest
 
 from hdev_jax import cli
 from hdev_jax.fleet import SyntheticLog, synthetic_log
-from hdev_jax.opening import known_effects, opened
 from hdev_jax.physics import LIBRARY
-from hdev_jax.prediction import told_together
 from hdev_jax.rundir import Run
+from hdev_jax.verbs.opening import known_effects, opened
+from hdev_jax.verbs.predict import told_together
 
 CHECKER = Path(__file__).parents[2] / "shared" / "check_diagnosis.py"
 ONLY = ["--only", "headwind,auxiliary_power"]  # two candidates: quick
@@ -273,7 +273,7 @@ def test_the_same_command_is_done_at_once(first, given, monkeypatch):
     """The text is the same, and nothing is computed for it."""
     folder, text = first
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
-    monkeypatch.setattr("hdev_jax.api.run_loop", lambda *a, **k: pytest.fail("the loop ran again"))
+    monkeypatch.setattr("hdev_jax.verbs.diagnose.run_loop", lambda *a, **k: pytest.fail("the loop ran again"))
     assert hdev("diagnose", *given, *ONLY, "--out", folder) == (0, text)
     assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == before
 

@@ -6,18 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.look import Loop, Search
-from hdev_jax.diagnosis.memory import from_plain, to_plain
-from hdev_jax.diagnosis.next_drive import advise
-from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.rest import told_apart
-from hdev_jax.diagnosis.search import search
-from hdev_jax.diagnosis.shapes import left_open
-from hdev_jax.diagnosis.split import Split
-from hdev_jax.diagnosis.summary import parameters_of, summarise
+from hdev_jax.diagnosis.competition.search import search
+from hdev_jax.diagnosis.remainder.rest import told_apart
+from hdev_jax.diagnosis.result.memory import from_plain, to_plain
+from hdev_jax.diagnosis.result.next_drive import advise
+from hdev_jax.diagnosis.result.shapes import left_open
+from hdev_jax.diagnosis.result.summary import parameters_of, summarise
+from hdev_jax.diagnosis.scores.look import Loop, Search
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, cluster_rows, padded
 from hdev_jax.physics import Effect, Vehicle, most_group
+from hdev_jax.problem import Problem, Split
 
 __all__ = ["Diagnosis", "diagnose"]
 

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.diagnose import Diagnosis
-from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.split import Split
 from hdev_jax.inference import padded
 from hdev_jax.physics.across import distance_since_start
+from hdev_jax.problem import Problem, Split
 from hdev_jax.report.data import ReportData
 from hdev_jax.report.words import answer, next_drives, plus_minus
 

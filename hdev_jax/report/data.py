@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.metrics import PER_KWH, sum_weight
-from hdev_jax.diagnosis.metrics import metrics as errors
+from hdev_jax.problem import PER_KWH, sum_weight
+from hdev_jax.problem import metrics as errors
 
 __all__ = ["ReportData", "TripLine", "metrics", "same_model", "test_rows", "total", "total_name", "trip_lines"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.summary import FAR
+from hdev_jax.diagnosis.result.summary import FAR
 from hdev_jax.report import names, words
 from hdev_jax.report.canvas import png, style
 from hdev_jax.report.data import ReportData, metrics, same_model, test_rows, total_name, trip_lines

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
-from hdev_jax.diagnosis.significance import least_clusters
-from hdev_jax.diagnosis.split import LAST_THIRD
-from hdev_jax.diagnosis.unexplained import LEAST_SHARE
+from hdev_jax.diagnosis.remainder.unexplained import LEAST_SHARE
+from hdev_jax.diagnosis.scores.significance import least_clusters
+from hdev_jax.problem import LAST_THIRD
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
 

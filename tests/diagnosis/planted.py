@@ -7,12 +7,11 @@ from pathlib import Path
 import jax
 
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
-from hdev_jax.diagnosis.problem import Problem, prepare
-from hdev_jax.diagnosis.split import Split, split_trips
 from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import Problem, Split, prepare, split_trips
 
 __all__ = ["ROAD_SIDE", "breaches", "opened", "run"]
 

@@ -10,19 +10,18 @@ from hypothesis import strategies as st
 from planted import run
 from scipy import stats
 
-from hdev_jax.diagnosis.cycles import COST, _fitted, _profile, _Rows
+from hdev_jax.diagnosis.candidates.cycles import COST, _fitted, _profile, _Rows
+from hdev_jax.diagnosis.candidates.modes import BEATS, LASTING, _against, _gain, _left_out, _p, _split, _stability
 from hdev_jax.diagnosis.diagnose import diagnose
-from hdev_jax.diagnosis.modes import BEATS, LASTING, _against, _gain, _left_out, _p, _split, _stability
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.ranking import LEFT_OUT
-from hdev_jax.diagnosis.split import split_trips
-from hdev_jax.diagnosis.whiten import Noise
+from hdev_jax.diagnosis.noise.model import Noise
+from hdev_jax.diagnosis.scores.ranking import LEFT_OUT
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
 from hdev_jax.physics.battery import ModeChange
 from hdev_jax.physics.loads import PeriodicLoad
+from hdev_jax.problem import prepare, split_trips
 
 
 @given(

@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis import select
-from hdev_jax.diagnosis.candidates import Candidate, columns, finer, realised
-from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Found, Search, Verdict, View
-from hdev_jax.diagnosis.memory import from_plain, to_plain
-from hdev_jax.diagnosis.problem import Problem, prepare
-from hdev_jax.diagnosis.summary import _effect_block
+from hdev_jax.diagnosis.candidates.candidate import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.competition import select
+from hdev_jax.diagnosis.result.memory import from_plain, to_plain
+from hdev_jax.diagnosis.result.summary import _effect_block
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.look import Found, Search, Verdict, View
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, Effect, Grouped, Parameter, Vehicle, at_null
+from hdev_jax.problem import Problem, prepare
 from hdev_jax.rundir import open_run
 
 # by hook and kind: force, power and sensor effects of one row, sums over a trip, groups, switches, shifts

@@ -6,19 +6,19 @@ import jax
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.chunks import Shapes, chunks_of, cut
-from hdev_jax.diagnosis.facts import MOST_STEPS, facts_of, merged
-from hdev_jax.diagnosis.problem import Problem, prepare
-from hdev_jax.diagnosis.stream import look_through
-from hdev_jax.diagnosis.sums import written_by_chunk
-from hdev_jax.diagnosis.whiten import Noise, whiten
+from hdev_jax.diagnosis.candidates.facts import MOST_STEPS, facts_of, merged
+from hdev_jax.diagnosis.noise.model import Noise, whiten
+from hdev_jax.diagnosis.scores import look as looks
+from hdev_jax.diagnosis.scores.chunks import Shapes, chunks_of, cut
+from hdev_jax.diagnosis.scores.stream import look_through
+from hdev_jax.diagnosis.scores.sums import written_by_chunk
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, clusters_of, padded
 from hdev_jax.inference.clusters import MOST_CLUSTERS
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, most_group
+from hdev_jax.problem import Problem, prepare
 from hdev_jax.segments import trip_slices
 
 # groups, sums and shifts across rows, switches, steps from a trip on, and a few of one row
@@ -180,7 +180,7 @@ def test_long_trips_are_whitened_in_pieces(monkeypatch):
     noise = Noise(np.array([[0, 0], [0.8, 0], [1.1, -0.2]]), np.array([2.0, 1.2, 1.0]), 0.0, np.ones(3), 0.0)
     columns, seconds = rng.normal(size=(200, 3)), np.ones(200)
     whole = whiten(columns, noise, trip, seconds)
-    monkeypatch.setattr("hdev_jax.diagnosis.whiten.PIECE", 37)
+    monkeypatch.setattr("hdev_jax.diagnosis.noise.model.PIECE", 37)
     np.testing.assert_allclose(whiten(columns, noise, trip, seconds), whole, rtol=1e-12, atol=1e-12)
 
 

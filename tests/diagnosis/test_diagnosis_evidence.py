@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hdev_jax.diagnosis import normal_equations
-from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.evidence import Evidence
-from hdev_jax.diagnosis.ranking import best_of
-from hdev_jax.diagnosis.significance import effective_number, wald
-from hdev_jax.diagnosis.sums import LEVELS, Sums
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.scores import normal_equations
+from hdev_jax.diagnosis.scores.evidence import Evidence
+from hdev_jax.diagnosis.scores.ranking import best_of
+from hdev_jax.diagnosis.scores.significance import effective_number, wald
+from hdev_jax.diagnosis.scores.sums import LEVELS, Sums
 from hdev_jax.inference import Clusters
 from hdev_jax.physics import LIBRARY
 from hdev_jax.segments import trip_slices

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from planted import opened
 
-from hdev_jax.diagnosis import exchange, select
-from hdev_jax.diagnosis import search as searching
-from hdev_jax.diagnosis.exchange import exchanged
-from hdev_jax.diagnosis.look import Found, Loop, Search, View, look
-from hdev_jax.diagnosis.memory import from_plain, to_plain
-from hdev_jax.diagnosis.refit import refit
+from hdev_jax.diagnosis.competition import exchange, select
+from hdev_jax.diagnosis.competition import search as searching
+from hdev_jax.diagnosis.competition.exchange import exchanged
+from hdev_jax.diagnosis.competition.refit import refit
+from hdev_jax.diagnosis.result.memory import from_plain, to_plain
+from hdev_jax.diagnosis.scores.look import Found, Loop, Search, View, look
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.physics import LIBRARY
 

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from planted import opened
 
-from hdev_jax.diagnosis import sharpen
-from hdev_jax.diagnosis.candidates import Candidate, columns
+from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
+from hdev_jax.diagnosis.competition import sharpen
+from hdev_jax.diagnosis.competition.refit import refit
+from hdev_jax.diagnosis.competition.select import _tried
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
-from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Loop, Search, View, look
-from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.ranking import inside, plausible, without_idle
-from hdev_jax.diagnosis.refit import refit
-from hdev_jax.diagnosis.select import _tried
-from hdev_jax.diagnosis.split import Split
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.look import Loop, Search, View, look
+from hdev_jax.diagnosis.scores.ranking import inside, plausible, without_idle
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.physics import LIBRARY, Effect, Parameter
+from hdev_jax.problem import Problem, Split
 
 TOLD = (1e-9, 1e-9, 9.0, 0.5)  # p of the model and of clusters, gain on clusters left out, share left of the column
 FEW = ("driveline_drag", "iron_loss", "gear_efficiency", "constant_headwind", "auxiliary_power", "rolling_speed")

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis.hint import find_hint, of_others
-from hdev_jax.diagnosis.look import Loop, Search
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.split import split_trips
+from hdev_jax.diagnosis.remainder.hint import find_hint, of_others
+from hdev_jax.diagnosis.scores.look import Loop, Search
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
+from hdev_jax.problem import prepare, split_trips
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis.metrics import metrics, sum_weight
-from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.errors import InputError
 from hdev_jax.logs import Log
+from hdev_jax.problem import metrics, split_trips, sum_weight
 from hdev_jax.segments import Segments
 
 # --- metrics ---------------------------------------------------------------------------------------------------------

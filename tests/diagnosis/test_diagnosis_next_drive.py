@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.candidates import columns, realised
-from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.next_drive import DRIVES, TOLD, _information, _prior, _relative_sd, advise, simulate
-from hdev_jax.diagnosis.problem import prepare
+from hdev_jax.diagnosis.candidates.candidate import columns, realised
+from hdev_jax.diagnosis.result.next_drive import DRIVES, TOLD, _information, _prior, _relative_sd, advise, simulate
+from hdev_jax.diagnosis.scores import look as looks
+from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import prepare
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hdev_jax.diagnosis.candidates import columns
+from hdev_jax.diagnosis.candidates.candidate import columns
+from hdev_jax.diagnosis.candidates.facts import facts_of
 from hdev_jax.diagnosis.diagnose import Diagnosis
-from hdev_jax.diagnosis.facts import facts_of
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded, predict
 from hdev_jax.inference.sheet import Sheet, read_sheet
@@ -21,6 +19,7 @@ from hdev_jax.physics import LIBRARY
 from hdev_jax.physics.brakes import BrakeDrag
 from hdev_jax.physics.sensors import SamplingFilter
 from hdev_jax.physics.tyres import TyreWarmup
+from hdev_jax.problem import prepare, split_trips
 from hdev_jax.report.build import of_diagnosis
 
 

@@ -6,18 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.candidates import Candidate, columns
-from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.memory import from_plain, to_plain
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.refit import grow, joined, refit, without
-from hdev_jax.diagnosis.select import prune
+from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
+from hdev_jax.diagnosis.competition.refit import grow, joined, refit, without
+from hdev_jax.diagnosis.competition.select import prune
+from hdev_jax.diagnosis.result.memory import from_plain, to_plain
+from hdev_jax.diagnosis.scores import look as looks
+from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, effect_coefficients, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import prepare
 
 HVAC = {"below_w_per_k": 900.0, "heat_c": 14.0, "cool_c": 20.0}
 

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from bare import bare
 
-from hdev_jax.diagnosis import rest
-from hdev_jax.diagnosis.expression import Expression
-from hdev_jax.diagnosis.look import Found, Loop, Search
-from hdev_jax.diagnosis.problem import Problem
-from hdev_jax.diagnosis.split import Split
-from hdev_jax.diagnosis.unexplained import Remainder, Rows, remainder
+from hdev_jax.diagnosis.candidates.expression import Expression
+from hdev_jax.diagnosis.remainder import rest
+from hdev_jax.diagnosis.remainder.unexplained import Remainder, Rows, remainder
+from hdev_jax.diagnosis.scores.look import Found, Loop, Search
 from hdev_jax.inference import Calibration, Clusters
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import Problem, Split
 
 TRIPS, ROWS = 8, 150
 CYCLE = "not found again beside the cycle for what is left"

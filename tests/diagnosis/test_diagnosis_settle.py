@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from hdev_jax.diagnosis import look as looks
-from hdev_jax.diagnosis.look import Verdict
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.refit import _contradicted, as_known
-from hdev_jax.diagnosis.settle import settle
-from hdev_jax.diagnosis.significance import clusters_needed, clusters_to_tell, effective_number, ruled_out
-from hdev_jax.diagnosis.summary import _not_decidable, _sized
-from hdev_jax.diagnosis.sums import Sums, distance_from_table, evidence_of
-from hdev_jax.diagnosis.unexplained import Remainder
+from hdev_jax.diagnosis.competition.refit import _contradicted, as_known
+from hdev_jax.diagnosis.remainder.unexplained import Remainder
+from hdev_jax.diagnosis.result.summary import _not_decidable, _sized
+from hdev_jax.diagnosis.scores import look as looks
+from hdev_jax.diagnosis.scores.look import Verdict
+from hdev_jax.diagnosis.scores.settle import settle
+from hdev_jax.diagnosis.scores.significance import clusters_needed, clusters_to_tell, effective_number, ruled_out
+from hdev_jax.diagnosis.scores.sums import Sums, distance_from_table, evidence_of
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import prepare
 
 
 def calibrated(folder, seed: int, noise: str = "ar1"):

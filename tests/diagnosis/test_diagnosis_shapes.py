@@ -12,20 +12,19 @@ from hypothesis import strategies as st
 from planted import run
 from scipy import stats
 
-from hdev_jax.diagnosis import shapes
-from hdev_jax.diagnosis.candidates import Candidate, finer
+from hdev_jax.diagnosis.candidates.candidate import Candidate, finer
 from hdev_jax.diagnosis.diagnose import diagnose
-from hdev_jax.diagnosis.evidence import Score
-from hdev_jax.diagnosis.look import Loop, Search
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.shapes import Open, _wide, other_size, shapes_of
-from hdev_jax.diagnosis.split import split_trips
-from hdev_jax.diagnosis.summary import _opened
+from hdev_jax.diagnosis.result import shapes
+from hdev_jax.diagnosis.result.shapes import Open, _wide, other_size, shapes_of
+from hdev_jax.diagnosis.result.summary import _opened
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.look import Loop, Search
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Calibration
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter
+from hdev_jax.problem import prepare, split_trips
 
 
 def parameters(result):

@@ -6,13 +6,12 @@ import pytest
 from planted import ROAD_SIDE
 
 from hdev_jax.diagnosis.diagnose import diagnose
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.split import split_trips
-from hdev_jax.diagnosis.stages import add_stages
+from hdev_jax.diagnosis.result.stages import add_stages
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import prepare, split_trips
 
 SIDES = ("copper_loss", "iron_loss", "auxiliary_power", "rolling_speed", "headwind", "mass_scale")
 

@@ -8,15 +8,31 @@ import numpy as np
 import pytest
 from planted import ROAD_SIDE
 
-from hdev_jax.diagnosis.expression import TERM, DescribedForce, Factor, _coefficient_unit, find_expression, monomials
-from hdev_jax.diagnosis.look import Loop, Search
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.spectrum import Clocked, strongest_period
-from hdev_jax.diagnosis.unexplained import Rows, _learner, _levels, _noise, _period, _scale, remainder, swing_w
+from hdev_jax.diagnosis.candidates.expression import (
+    TERM,
+    DescribedForce,
+    Factor,
+    _coefficient_unit,
+    find_expression,
+    monomials,
+)
+from hdev_jax.diagnosis.noise.spectrum import Clocked, strongest_period
+from hdev_jax.diagnosis.remainder.unexplained import (
+    Rows,
+    _learner,
+    _levels,
+    _noise,
+    _period,
+    _scale,
+    remainder,
+    swing_w,
+)
+from hdev_jax.diagnosis.scores.look import Loop, Search
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Clusters, calibrate, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
+from hdev_jax.problem import prepare
 from hdev_jax.units import _SUFFIXES
 
 

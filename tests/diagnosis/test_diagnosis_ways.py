@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis import expression, sharpen
-from hdev_jax.diagnosis.candidates import Candidate
-from hdev_jax.diagnosis.evidence import Evidence, Score
-from hdev_jax.diagnosis.expression import Described, Factor, find_expression
-from hdev_jax.diagnosis.look import Loop, Search, View
-from hdev_jax.diagnosis.sums import Ground
+from hdev_jax.diagnosis.candidates import expression
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.candidates.expression import Described, Factor, find_expression
+from hdev_jax.diagnosis.competition import sharpen
+from hdev_jax.diagnosis.scores.evidence import Evidence, Score
+from hdev_jax.diagnosis.scores.look import Loop, Search, View
+from hdev_jax.diagnosis.scores.sums import Ground
 from hdev_jax.inference import Calibration, ParameterTable
 from hdev_jax.physics import LIBRARY, Vehicle
 from hdev_jax.segments import Segments

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hdev_jax.diagnosis.whiten import BLOCK_S, Noise, estimate_noise, whiten
+from hdev_jax.diagnosis.noise.model import BLOCK_S, Noise, estimate_noise, whiten
 
 # coefficients of stationary autoregressions, with roots from mild to nearly a random walk, and an oscillation
 COLOURS = {"white": (), "ar1": (0.7,), "ar1_slow": (0.95,), "ar2": (1.2, -0.4), "ar2_cycle": (0.9, -0.7)}

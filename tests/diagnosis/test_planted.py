@@ -13,12 +13,11 @@ import pytest
 from planted import breaches, run
 
 from hdev_jax.diagnosis.diagnose import diagnose
-from hdev_jax.diagnosis.problem import prepare
-from hdev_jax.diagnosis.split import split_trips
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import prepare, split_trips
 
 SHARED = Path(os.environ.get("HDEV_DATA", "../shared/data")).parent
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from planted import opened
 
-from experiments import planted_scores as scores
-from experiments import rivals
-from experiments.config import resolve, typed
-from experiments.oracle import confusable, noise_rmse, oracle_rmse
-from experiments.planted import Config, acts_in, run, tasks
-from experiments.planted_rivals import outcome, rival_rows
-from experiments.planted_tables import collect
-from experiments.rivals import comparable
+from experiments.planted import rivals
+from experiments.planted import scores as scores
+from experiments.planted.oracle import confusable, noise_rmse, oracle_rmse
+from experiments.planted.rivals import comparable
+from experiments.planted.rivals_table import outcome, rival_rows
+from experiments.planted.study import Config, acts_in, run, tasks
+from experiments.planted.tables import collect
+from experiments.runner.config import resolve, typed
 from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.rundir import open_run
 

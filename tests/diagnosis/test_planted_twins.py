@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from planted import opened
 
-from experiments.config import resolve, typed
-from experiments.planted import Config
-from experiments.planted_scores import TWINS
-from hdev_jax.diagnosis.candidates import columns
+from experiments.planted.scores import TWINS
+from experiments.planted.study import Config
+from experiments.runner.config import resolve, typed
+from hdev_jax.diagnosis.candidates.candidate import columns
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.truth import power_w
 from hdev_jax.inference import jacobian

@@ -10,17 +10,17 @@ from inference_rows import C_RR, C_RR_SD, CDA, CDA_SD, PRIOR, PRIOR_SD, driving,
 from scipy import optimize, stats
 
 import hdev_jax
-from experiments import ranks
-from experiments.config import CONFIGS, resolve, typed
+from experiments.calibration import ranks
+from experiments.runner.config import CONFIGS, resolve, typed
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Rows, linear_fit, padded
 from hdev_jax.inference.calibrate import tabular as tabular_of
-from hdev_jax.inference.draws import Draws
-from hdev_jax.inference.hierarchy import Sums, drawn, fleet_draws, marginal, resembling
 from hdev_jax.inference.linear import Prior, Statistics, posterior
 from hdev_jax.inference.mass import loads, mass_posterior, with_sd
-from hdev_jax.inference.models import Model
-from hdev_jax.inference.nuts import sampled
+from hdev_jax.inference.posterior.draws import Draws
+from hdev_jax.inference.posterior.hierarchy import Sums, drawn, fleet_draws, marginal, resembling
+from hdev_jax.inference.posterior.models import Model
+from hdev_jax.inference.posterior.nuts import sampled
 from hdev_jax.physics import Grouped
 from hdev_jax.rundir import open_run
 

@@ -31,7 +31,7 @@ from hdev_jax.inference import (
     statistics,
     update,
 )  # fmt: skip
-from hdev_jax.inference.methods import calibrated
+from hdev_jax.inference.posterior.methods import calibrated
 from hdev_jax.segments import Segments
 
 TRUTH = np.array([0.0068, 6.1])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hdev_jax.errors import InputError
-from hdev_jax.inference import map_fit
-from hdev_jax.inference.map_fit import learn_map
-from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.inference.maps import fit as map_fit
+from hdev_jax.inference.maps.fit import learn_map
+from hdev_jax.inference.sheet import build, read_sheet
 from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.segments import Segments
@@ -64,21 +64,21 @@ def write(folder, gears: tuple[int, ...], most_nm: float) -> None:
 def test_rows_beyond_the_map_are_reported(tmp_path):
     rows = log(400)
     write(tmp_path, (1, 2), 1000.0)
-    built = read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh")
+    built = build(read_sheet(tmp_path / "sheet.toml"), rows, "road", "energy_wh")
     (note,) = (n for n in built.notes if "beyond its edge" in n)
     ratio = np.where(rows.channels["gear"] == 1, 50.0, 20.0)
     share = 100 * np.mean(np.abs(np.asarray(car(true_map()).force(rows)) / ratio) > 1000.0)
     assert share > 0.2
     assert f"{share:.2g} % of the moving rows" in note
     write(tmp_path, (1, 2), 1e5)
-    assert not [n for n in read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh").notes if "edge" in n]
+    assert not [n for n in build(read_sheet(tmp_path / "sheet.toml"), rows, "road", "energy_wh").notes if "edge" in n]
 
 
 def test_a_gear_that_the_map_lacks_is_refused(tmp_path):
     rows = log(50)
     write(tmp_path, (2, 3), 1e5)
     with pytest.raises(InputError, match=r"map\.csv: the log's row \d+ drives in gear 1, .* it has gears 2, 3") as e:
-        read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh")
+        build(read_sheet(tmp_path / "sheet.toml"), rows, "road", "energy_wh")
     assert "\n" not in str(e.value)
     with pytest.raises(InputError, match="gear 2, which the grid does not have"):
         one = true_map()
@@ -95,7 +95,7 @@ def test_a_gear_without_a_ratio_is_refused(tmp_path, gears):
     rows = rows.with_channels(gear=np.where(np.arange(50) == 7, 3.0, rows.channels["gear"]))
     write(tmp_path, gears, 1e5)  # a map of one gear holds for all, the sheet has two ratios
     with pytest.raises(InputError, match=r"gear_ratios has 2 gears, but the log is in gear 3; a ratio") as e:
-        read_sheet(tmp_path / "sheet.toml").build(rows, "road", "energy_wh")
+        build(read_sheet(tmp_path / "sheet.toml"), rows, "road", "energy_wh")
     assert "\n" not in str(e.value)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.learn.pinn_rows import Rows, rows_of
+from hdev_jax.learn.pinn.rows import Rows, rows_of
 from hdev_jax.physics import Driveline, Machine, Vehicle
 from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling

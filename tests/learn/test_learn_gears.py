@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from experiments.paper1_gear_tables import equation_1, macro_f1
+from experiments.paper1.gear_tables import equation_1, macro_f1
 from hdev_jax.errors import InputError
-from hdev_jax.learn.classifiers import alike, balanced_accuracy, route_folds, scored, search_classifier
-from hdev_jax.learn.gears import (
+from hdev_jax.learn.gears.classifiers import alike, balanced_accuracy, route_folds, scored, search_classifier
+from hdev_jax.learn.gears.gears import (
     EVERY,
     FEATURES,
     PLACE,
@@ -23,8 +23,8 @@ from hdev_jax.learn.gears import (
     markov,
     requested_torque,
 )
-from hdev_jax.learn.tree_arrays import oblivious
-from hdev_jax.learn.trees import Reading, Trees
+from hdev_jax.learn.trees.arrays import oblivious
+from hdev_jax.learn.trees.trees import Reading, Trees
 from hdev_jax.physics import GEAR_PROBABILITY, Driveline, EfficiencyMap, Machine, Vehicle
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.segments import Segments

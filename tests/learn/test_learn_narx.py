@@ -21,10 +21,10 @@ from hdev_jax.learn import (
     starts,
     with_theta,
 )
-from hdev_jax.learn.network import output
-from hdev_jax.learn.normal import one_step, rows_of, simulated, windows_of
+from hdev_jax.learn.narx.network import output
+from hdev_jax.learn.narx.normal import one_step, rows_of, simulated, windows_of
+from hdev_jax.learn.narx.selection import edge, folds, validated
 from hdev_jax.learn.robust import huber_fit
-from hdev_jax.learn.selection import edge, folds, validated
 from hdev_jax.learn.sequences import Scale, blocks, energy_kwh, lagged, trips_of
 
 STRUCTURES = {
@@ -80,7 +80,7 @@ def test_equations_of_one_step_are_those_of_autodiff(name):
 
 @pytest.mark.parametrize("name", ["inputs", "all", "linear"])
 def test_windows_in_parallel_are_the_plain_free_run(name):
-    from hdev_jax.learn.network import free_run
+    from hdev_jax.learn.narx.network import free_run
 
     s, trip = STRUCTURES[name], drive(500)
     model = random_model(s, trip, scale=0.05)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from learn_rows import drive
 
 from hdev_jax.errors import InputError
-from hdev_jax.learn.classical import CLASSICAL, search_classical
-from hdev_jax.learn.online import follow, recursive, update
-from hdev_jax.learn.recurrent import train_recurrent
+from hdev_jax.learn.baselines.classical import CLASSICAL, search_classical
+from hdev_jax.learn.baselines.recurrent import train_recurrent
+from hdev_jax.learn.narx.online import follow, recursive, update
 
 
 def rows(n=200, columns=3, seed=0):

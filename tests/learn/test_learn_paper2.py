@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 from learn_rows import drive
 
-from experiments import paper2, paper2_choice, paper2_figures, paper2_online, paper2_pedal, paper2_selection
-from experiments.config import CONFIGS, resolve, typed
-from experiments.data import MissingDataError
-from experiments.engine import run_config
-from experiments.paper2_choice import chosen_keys
-from experiments.paper2_models import Settings
+from experiments.paper2 import choice as paper2_choice
+from experiments.paper2 import figures as paper2_figures
+from experiments.paper2 import online as paper2_online
+from experiments.paper2 import pedal as paper2_pedal
+from experiments.paper2 import selection as paper2_selection
+from experiments.paper2 import study as paper2
+from experiments.paper2.choice import chosen_keys
+from experiments.paper2.models import Settings
+from experiments.runner.config import CONFIGS, resolve, typed
+from experiments.runner.data import MissingDataError
+from experiments.runner.engine import run_config
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import open_run
 

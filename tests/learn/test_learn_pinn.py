@@ -17,11 +17,11 @@ from scipy.special import expit, logit
 from scipy.stats import multivariate_t, norm
 
 from hdev_jax.errors import InputError
-from hdev_jax.learn.heads import Heads, _kept
-from hdev_jax.learn.pinn import Pinn, Recipe, Sized, predict, ready
-from hdev_jax.learn.pinn_fit import PAPER_WEIGHTS, Member, Sizes, fit, stretches
-from hdev_jax.learn.pinn_loss import Objective
-from hdev_jax.learn.pinn_rows import concatenated
+from hdev_jax.learn.pinn.fit import PAPER_WEIGHTS, Member, Sizes, fit, stretches
+from hdev_jax.learn.pinn.heads import Heads, _kept
+from hdev_jax.learn.pinn.loss import Objective
+from hdev_jax.learn.pinn.model import Pinn, Recipe, Sized, predict, ready
+from hdev_jax.learn.pinn.rows import concatenated
 from hdev_jax.learn.train import DivergedError, Plan
 from hdev_jax.physics import LIBRARY
 

@@ -14,8 +14,8 @@ from learn_trucks import TABLE, energy_by_hand, road, truck, truck_rows
 
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import simulate
-from hdev_jax.learn import pinn_rows
-from hdev_jax.learn.pinn_rows import (
+from hdev_jax.learn.pinn import rows as pinn_rows
+from hdev_jax.learn.pinn.rows import (
     FEATURES,
     PHYSICAL,
     concatenated,

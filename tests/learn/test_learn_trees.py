@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hdev_jax.errors import InputError
-from hdev_jax.learn.tree_files import above, below, read_trees
-from hdev_jax.learn.trees import ordered
+from hdev_jax.learn.trees.files import above, below, read_trees
+from hdev_jax.learn.trees.trees import ordered
 
 FEATURES, CLASSES = 5, 4
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from pydantic import Field
 
-from experiments.config import Strict
-from experiments.data import data_folder
-from experiments.figures import save_figure, styled
-from experiments.tables import write_tables
+from experiments.runner.config import Strict
+from experiments.runner.data import data_folder
+from experiments.runner.figures import save_figure, styled
+from experiments.runner.tables import write_tables
 from hdev_jax.report.canvas import figure
 
 __all__ = ["SOURCES", "Config", "alone", "collect", "run", "run_together", "tasks", "together"]

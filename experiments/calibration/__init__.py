@@ -1,0 +1,3 @@
+"""Studies of calibration: coverage, ranks, linearity, mass, efficiency maps."""
+
+__all__ = []

@@ -1,0 +1,3 @@
+"""Running experiments: configs, tasks, workers, tables, pages."""
+
+__all__ = []

@@ -1,0 +1,181 @@
+"""Pages: a run's tables and figures, or those of many runs, in one file that opens offline."""
+
+import base64
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from experiments.runner.compare import DECIDES, comparison, headlines, told
+from experiments.runner.config import shown
+from experiments.runner.tables import cells, markdown, read_markdown
+from hdev_jax.rundir import Run, atomic_file
+
+__all__ = ["Section", "of_run", "write_docs", "write_html", "write_list_docs", "write_page"]
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; color: #1b1f24; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; font-size: 13px; margin-bottom: 1.2rem; }
+td, th { padding: .3rem .6rem; border-bottom: 1px solid #d9dee3; text-align: right; vertical-align: bottom; }
+td:first-child, th:first-child { text-align: left; } caption { text-align: left; font-weight: 600; padding: .3rem 0; }
+.scroll { overflow-x: auto; } img { max-width: 100%; margin: 1rem 0; } .tag { background: #fff3cd; padding: 0 .4rem; }
+h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made { color: #57606a; }
+</style></head><body>
+<h1>{{ title }}</h1>
+{% for s in sections %}
+{% if sections | length > 1 and s.title %}<h2 id="{{ s.anchor }}">{{ s.title }}</h2>{% endif %}
+{% if s.synthetic %}<p><span class="tag">synthetic</span></p>{% endif %}
+{% for line in s.made %}<p class="made">{{ line }}</p>{% endfor %}
+{% if s.told %}<ul>{% for line in s.told %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
+{% if s.links %}<p>{% for name, to in s.links %}<a href="{{ to }}">{{ name }}</a> {% endfor %}</p>{% endif %}
+{% for caption, lines in s.tables %}<div class="scroll"><table><caption>{{ caption }}</caption><thead><tr>
+{% for h in lines[0] %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
+{% for line in lines[1:] %}<tr>{% for c in line %}<td>{{ c }}</td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div>{% endfor %}
+{% for name, data in s.figures %}<img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
+{% endfor %}
+{% endfor %}
+</body></html>
+"""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page: how it was `made`, what is `told` of it, tables (caption, lines), figures (name, PNG)."""
+
+    title: str
+    synthetic: bool = False
+    made: Sequence[str] = ()
+    told: Sequence[str] = ()
+    links: Sequence[tuple[str, str]] = ()
+    tables: Sequence[tuple[str, list[list[str]]]] = field(default_factory=list)
+    figures: Sequence[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def anchor(self) -> str:
+        """Where links within the page lead."""
+        return re.sub(r"[^\w.]+", "-", self.title).strip("-")
+
+
+def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = (), home: Path | None = None) -> Section:
+    """The part of a page for the run in `folder`: paper against ours, its own tables, its figures.
+
+    **Arguments:** `made`, lines on what made it; `home`, the folder of the page, for links to the run's files.
+    """
+    against = comparison(metrics)
+    tables = [("Paper against ours", cells(against, 4))] if against else []
+    tables += [read_markdown(path) for path in sorted((folder / "tables").glob("*.md"))]
+    images = sorted((folder / "figures").glob("*.png"))
+    names = ("report.html", "config.toml", "metrics.json", "log.txt")
+    links = [(n, (folder / n).relative_to(home).as_posix()) for n in names] if home is not None else []
+    return Section(
+        title=metrics["artefact"],
+        synthetic=metrics["synthetic"],
+        made=made,
+        told=[*told(metrics), f"{metrics['seconds']} s."],
+        links=links,
+        tables=tables,
+        figures=[(p.stem.replace("_", " "), base64.b64encode(p.read_bytes()).decode("ascii")) for p in images],
+    )
+
+
+def write_html(path: Path, title: str, sections: Sequence[Section]) -> None:
+    """A page of these parts. **Raises:** `InputError` where the file cannot be written."""
+    from jinja2 import Environment, StrictUndefined
+
+    page = Environment(autoescape=True, undefined=StrictUndefined).from_string(_PAGE)
+    with atomic_file(path) as temporary:
+        temporary.write_text(page.render(title=title, sections=sections), encoding="utf-8")
+
+
+def write_page(run: Run, metrics: dict[str, Any]) -> None:
+    """`report.html` of a run, from its metrics, Markdown tables and PNG figures."""
+    write_html(run.path("report.html"), metrics["artefact"], [of_run(run.work, metrics)])
+
+
+def write_docs(
+    docs: Path, config: str | Path, folders: Sequence[Path], sets: Sequence[str] = (), points: Sequence[str] = (),
+    flags: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """`docs/NAME.md`, NAME being the config's, its tables and figures, from complete runs of that config.
+
+    **Arguments:** `folders` of the runs; `sets`, the overrides that they ran with; `points` of a sweep, one for each
+    run, which head them; `flags` that change what is run. Figures go to `docs/figures/NAME/`.
+    """
+    name = Path(config).stem
+    every = " ".join([shown(config), *(f"--set {s}" for s in sets)])
+    lines = [
+        f"# {_kind(Path(config))}: {name}",
+        "",
+        _by(f"{' '.join([every, *flags])} --tasks DIR --out OUT --docs docs"),
+        "",
+    ]
+    for k, folder in enumerate(folders):
+        lines += ["", f"## {points[k]}", ""] if k < len(points) and points[k] else []
+        lines += _lines(folder, docs, name, "" if len(folders) == 1 else f"{k}_")
+    (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_list_docs(
+    docs: Path, configs: str | Path, made: Mapping[Path, Sequence[Path]], missing: Sequence[str] = (),
+    flags: Sequence[str] = (),
+) -> list[Path]:  # fmt: skip
+    """`docs/FOLDER.md` for each folder of configs in a list: what decides, every table and figure, paper and ours.
+
+    **Arguments:** `configs`, the list; `made`, the folders of each config's runs; `missing`, why others have none;
+    `flags` that change what is run.
+    Figures go to `docs/figures/FOLDER/`.
+    """
+    pages = []
+    for home in dict.fromkeys(path.parent for path in made):
+        runs = {path: folders for path, folders in made.items() if path.parent == home}
+        every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
+        lines = [
+            f"# {_kind(next(iter(runs)))}",
+            "",
+            _by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs"),
+            "",
+        ]
+        lines += [line for why in missing for line in (f"Not made: {why}.", "")]
+        if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
+            lines += [markdown(cells(first, 4), DECIDES)]
+        for path, folders in runs.items():
+            lines += [f"## {path.stem}", ""]
+            for k, folder in enumerate(folders):
+                lines += [*_lines(folder, docs, home.name, f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"), ""]
+        if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
+            lines += ["## Paper against ours", "", markdown(cells(against, 4), "Every number of the paper")]
+        pages.append(docs / f"{home.name}.md")
+        pages[-1].write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    return pages
+
+
+def _by(arguments: str) -> str:
+    return f"Made by `python -m experiments {arguments}`."
+
+
+def _lines(folder: Path, docs: Path, name: str, before: str) -> list[str]:
+    """What is told of the run in `folder`, its tables, and its figures, which are put under `docs/figures/NAME/`."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    lines = [f"- {line}" for line in told(metrics)]
+    for table in sorted((folder / "tables").glob("*.md")):
+        lines += ["", table.read_text(encoding="utf-8").rstrip()]
+    home = docs / "figures" / name
+    for figure in sorted((folder / "figures").glob("*.png")):
+        home.mkdir(parents=True, exist_ok=True)
+        to = home / (figure.name if before == f"{figure.stem}_" else f"{before}{figure.name}")
+        to.write_bytes(figure.read_bytes())
+        lines += ["", f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})"]
+    return lines
+
+
+def _kind(config: Path) -> str:
+    """What a page of a config in this folder is of: a study, paper 2, …"""
+    folder = config.resolve().parent.name
+    if folder.startswith("paper"):
+        return f"Paper {folder.removeprefix('paper')}".strip()
+    return "Study" if folder == "studies" else "Experiment"

@@ -1,0 +1,149 @@
+"""Every table and figure there is: a list of configs, each run in its place, paper against ours, one page of all."""
+
+import contextlib
+import dataclasses
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.runner.compare import DECIDES, comparison, headlines
+from experiments.runner.compute import Where, compute
+from experiments.runner.config import artefact, changes, shown, shown_point
+from experiments.runner.engine import Plan, claim_folder, plan, refuse_hurry, run_config, unfinished
+from experiments.runner.log import Log
+from experiments.runner.page import Section, of_run, write_html
+from experiments.runner.tables import cells
+from experiments.runner.workers import ClusterError
+from hdev_jax.errors import InputError
+
+__all__ = ["Outcomes", "against", "run_list"]
+
+
+@dataclasses.dataclass
+class Outcomes:
+    """What came of a list: each config's runs (their metrics), and why there are none, our faults apart."""
+
+    made: dict[Path, list[dict[str, Any]]] = dataclasses.field(default_factory=dict)
+    refused: dict[Path, str] = dataclasses.field(default_factory=dict)
+    broken: dict[Path, str] = dataclasses.field(default_factory=dict)
+
+    def reasons(self) -> list[str]:
+        """One line for each reason, with all the configs that it stopped."""
+        by: dict[str, list[str]] = {}
+        for path, why in {**self.refused, **self.broken}.items():
+            by.setdefault(why, []).append(artefact(path))
+        return [f"{', '.join(names)}: {why}" for why, names in by.items()]
+
+
+def run_list(
+    configs: Sequence[Path], *, out: str | Path, where: Where, tiny: bool = False, fresh: bool = True
+) -> Outcomes:
+    """Run each config in `out/NAME`, those whose tasks run on all workers at once first; then write `out/index.html`.
+
+    A config that cannot run leaves the others alone. A run of an older configuration in its place is replaced.
+    `fresh=False` runs no task and reports on those that `out` keeps; a config with none of them is not made.
+
+    **Raises:** `InputError` where `out` holds something else.
+    """
+    claim_folder(out)
+    home, came = Path(out), Outcomes()
+    log = Log(home / "log.txt")
+    store = home / "tasks"
+    planned: list[Plan] = []
+    of: dict[str, Path] = {}
+    for path in configs:
+        with _caught(came, path, log):
+            plans = plan(path, tiny=tiny, kept=None if fresh else store)
+            if not plans:
+                raise InputError("none of its tasks has been run yet")
+            refuse_hurry(plans, where)
+            planned += unfinished(plans, home / artefact(path))
+            of[artefact(path)] = path
+    log.say(f"{len(configs)} configs, {len({p.name for p in planned})} of them to run")
+    for name, why in compute([p.asked for p in planned], where, store, log, keep_going=True).items():
+        _blame(came, of[name], why, log)
+    for name, path in of.items():
+        if path not in came.refused and path not in came.broken:
+            with _caught(came, path, log):
+                came.made[path] = run_config(
+                    path, out=home / name, workers=where.workers, scheduler=where.scheduler, kept=store, tiny=tiny,
+                    fresh=fresh, replace=True,
+                )  # fmt: skip
+    _write_index(home, came)
+    log.say("index.html")
+    return came
+
+
+@contextlib.contextmanager
+def _caught(came: Outcomes, path: Path, log: Log) -> Iterator[None]:
+    """What a config raises is the config's: an interrupt is not, nor is a cluster that is gone."""
+    try:
+        yield
+    except ClusterError:
+        raise
+    except Exception as e:
+        _blame(came, path, e, log)
+
+
+def _blame(came: Outcomes, path: Path, error: Exception, log: Log) -> None:
+    if isinstance(error, InputError):
+        came.refused[path] = str(error)
+        return
+    came.broken[path] = " ".join(f"{type(error).__name__}: {error}".split())
+    for line in "".join(traceback.format_exception(error)).splitlines():
+        log.say(f"{artefact(path)}: {line}", shown=False)
+
+
+def against(came: Outcomes) -> list[dict[str, Any]]:
+    """A line for each number of the papers: config, name, quantity, paper, ours, ratio, why there is none."""
+    pairs = [(path, run) for path, every in came.made.items() for run in every]
+    return [{"config": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
+
+
+def _title(path: Path, run: Mapping[str, Any]) -> str:
+    """What the config is called, and of a sweep the point of the grid."""
+    point = shown_point(run["sweep"])
+    return f"{artefact(path)} ({point})" if point else artefact(path)
+
+
+def _write_index(home: Path, came: Outcomes) -> None:
+    parts: list[Section] = []
+    for path, runs in came.made.items():
+        if runs[0]["sweep"]:
+            page = f"{artefact(path)}/report.html"
+            parts.append(Section(artefact(path), links=[("the sweep as a table over its runs", page)]))
+        for run in runs:
+            part = of_run(Path(run["folder"]), run, made=_made(path, run["sweep"]), home=home)
+            parts.append(dataclasses.replace(part, title=_title(path, run)))
+    write_html(home / "index.html", "Every table and figure", [_summary(came, parts), *parts])
+
+
+def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
+    rows = [
+        {
+            "config": _title(path, run), "data": run["data"],
+            "at least as good": f"{run['better_than_paper']} of {run['of']}" if run["of"] else None,
+            "seconds": run["seconds"],
+        }
+        for path, runs in came.made.items() for run in runs
+    ]  # fmt: skip
+    lines, every = against(came), [(path, run) for path, runs in came.made.items() for run in runs]
+    first = [{"config": _title(path, run), **line} for path, run in every for line in headlines(run)]
+    tables = [("Runs", cells(rows))] if rows else []
+    tables += [(DECIDES, cells(first, 4))] if first else []
+    tables += [("Paper against ours", cells(lines, 4))] if lines else []
+    told = [] if came.made else ["No config of the list has been run."]
+    told += [f"Not made: {why}." for why in came.reasons()]
+    return Section("", told=told, links=[(p.title, f"#{p.anchor}") for p in parts], tables=tables)
+
+
+def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:
+    """The command of a run, and what its config changes in the one that it extends."""
+    point = shown_point(delta)
+    lines = [f"python -m experiments {shown(path)} --out DIR{f': the run at {point}' if point else ''}"]
+    changed = [
+        f"{k} = {new!r:.60} ({'not there' if old is None else f'there {old!r:.60}'})"
+        for k, (old, new) in changes(path).items()
+    ]
+    return [*lines, f"Changes in the config that it extends: {'; '.join(changed)}."] if changed else lines

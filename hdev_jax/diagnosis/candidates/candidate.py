@@ -1,0 +1,321 @@
+"""Candidates: what each effect that the vehicle lacks would add to every row, without refitting anything."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
+from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
+from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unavailable
+from hdev_jax.physics.vehicle import Target
+from hdev_jax.segments import Segments
+
+__all__ = [
+    "FIXED",
+    "Candidate",
+    "Column",
+    "Grids",
+    "Plan",
+    "Source",
+    "as_seen",
+    "beyond",
+    "columns",
+    "finer",
+    "plan_of",
+    "realised",
+]
+
+FIXED = ("shape", "choice")  # what has no column of its own
+TOGETHER = 6  # effects in one program: more of them run slower, fewer take longer to compile
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to have an effect: which of its sizes, at which shapes. `columns` are its places in the matrix.
+
+    `kind` "size": the column is the derivative in the size, its coefficient is the size. "limit": the column is the
+    difference that the switch at `shapes` makes, its coefficient should be near 1.
+    """
+
+    effect: type[Effect]
+    sizes: tuple[str, ...]
+    groups: tuple[int | None, ...]
+    shapes: tuple[tuple[str, float], ...]
+    kind: str
+    columns: tuple[int, ...]
+
+    @property
+    def id(self) -> str:
+        """Id of the effect."""
+        return self.effect.id
+
+    @property
+    def freedoms(self) -> int:
+        """How many numbers it fits, those chosen on a grid included."""
+        chosen = sum(len(p.grid) > 1 for p in self.effect.parameters if p.kind in FIXED and _matters(p, self.sizes))
+        return len(self.columns) + chosen
+
+    def only(self, kept: Sequence[bool] | np.ndarray) -> "Candidate | None":
+        """With these of its columns: those of a group (a gear) may go by themselves, others all or none."""
+        if all(kept):
+            return self
+        if None in self.groups or not any(kept):
+            return None
+        at = np.flatnonzero(np.asarray(kept))
+        sizes, groups, columns = (tuple(x[k] for k in at) for x in (self.sizes, self.groups, self.columns))
+        return replace(self, sizes=sizes, groups=groups, columns=columns)
+
+    @property
+    def by_trip(self) -> dict[str, dict[int, float]]:
+        """Shapes that were sought for each trip, `phase[3]` among `shapes`: by name, then by the trip's id."""
+        out: dict[str, dict[int, float]] = {}
+        for key, value in self.shapes:
+            name, bracket, trip = key.partition("[")
+            if bracket:
+                out.setdefault(name, {})[int(trip.removesuffix("]"))] = value
+        return out
+
+    def parameter(self, name: str) -> Parameter:
+        """The effect's parameter of that name."""
+        return next(p for p in self.effect.parameters if p.name == name)
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column to compute: an effect's size (and group) at given shapes, or the difference a limit makes."""
+
+    effect_id: str
+    name: str
+    group: int | None
+    shapes: tuple[tuple[str, float], ...]
+    kind: str
+
+
+def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
+    """Whether a shape acts on these sizes."""
+    return not shape.of or shape.of in sizes
+
+
+Grids = Mapping[str, tuple[float, ...]]
+
+
+def _own(effect: Effect, size: str, shapes: tuple[tuple[str, float], ...]) -> tuple[tuple[str, float], ...]:
+    """The shapes that act on one size: two sizes with a shape each need a column each, not one for every pair."""
+    by_name = {p.name: p for p in effect.parameters}
+    return tuple((n, v) for n, v in shapes if n == size or _matters(by_name[n], (size,)))
+
+
+def _grid(p: Parameter, facts: Facts, grids: Grids) -> tuple[float, ...]:
+    if p.name in grids:
+        return grids[p.name]
+    if p.name == "at_trip":
+        return facts.steps
+    return tuple(g * facts.row_s if p.in_rows else g for g in p.grid)
+
+
+def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tuple[Any, ...]]:
+    """`(sizes, groups, shapes, kind)` for each way to have the effect."""
+    by_name = {p.name: p for p in effect.parameters}
+    sizes = tuple(p.name for p in effect.parameters if p.kind not in FIXED)
+    for variant in effect.variants or (sizes,):
+        shapes = [p for p in effect.parameters if p.kind in FIXED and _matters(p, variant)]
+        each = [[(p.name, g) for g in _grid(p, facts, grids)] for p in shapes]
+        for at in product(*each):
+            first = by_name[variant[0]]
+            if first.kind == "limit":
+                for g in _grid(first, facts, grids):
+                    yield variant, (None,), (*at, (first.name, g)), "limit"
+            elif first.by:
+                # the commonest is the reference where it is declared already
+                if groups := tuple(sorted(facts.seen(first.by)[0 if first.whole else 1 :])):
+                    yield variant * len(groups), groups, at, "size"
+                elif first.whole:
+                    yield variant, (None,) * len(variant), at, "size"
+            else:
+                yield variant, (None,) * len(variant), at, "size"
+
+
+def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int = 7) -> dict[str, tuple[float, ...]]:
+    """Grids for the candidate's shapes and limits, `reach` of a step to either side of where it stands.
+
+    `row_s` is the median duration of a row [s].
+    """
+    grids: dict[str, tuple[float, ...]] = {}
+    for name, at in candidate.shapes:
+        p = candidate.parameter(name)
+        grid = [g * row_s if p.in_rows else g for g in p.grid]
+        if p.kind == "choice" or len(grid) < 2 or p.smooth:
+            grids[name] = (at,)
+            continue
+        k = int(np.argmin(np.abs(np.array(grid) - at)))
+        below = grid[k - 1] if k > 0 else beyond(grid[k + 1], at)
+        above = grid[k + 1] if k + 1 < len(grid) else beyond(grid[k - 1], at)
+        near = np.r_[
+            np.linspace(at + reach * (below - at), at, points // 2 + 1),
+            np.linspace(at, at + reach * (above - at), points // 2 + 1),
+        ]
+        grids[name] = tuple(float(x) for x in np.unique(np.clip(near, p.lower, p.upper)))
+    return grids
+
+
+def beyond(from_: float, at: float) -> float:
+    """One more step in the same direction; by ratio where both are positive, since a time constant stays so."""
+    return at * at / from_ if min(from_, at) > 0 else 2.0 * at - from_
+
+
+def _row_level(effect: Effect) -> bool:
+    return not any(effect.overrides(h) for h in ("across", "observe", "derive"))
+
+
+@runtime_checkable
+class Source(Protocol):
+    """What makes candidates' columns of any rows: the library's `Plan`, or the terms of a formula.
+
+    `candidates` hold places among `width` columns; `left_out` says by id why other effects are no candidates.
+    """
+
+    @property
+    def candidates(self) -> Sequence[Candidate]: ...
+
+    @property
+    def left_out(self) -> Mapping[str, str]: ...
+
+    @property
+    def width(self) -> int: ...
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The candidates that a log allows, and how each of their columns is made of any of its rows.
+
+    Made once from the facts of the whole log; whole trips are then evaluated a chunk at a time.
+    """
+
+    candidates: tuple[Candidate, ...]
+    left_out: Mapping[str, str]
+    target: Target
+    programs: tuple[Program, ...]
+    recipes: tuple[Recipe, ...]
+
+    @property
+    def width(self) -> int:
+        """How many columns there are."""
+        return len(self.recipes)
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column], in the target's unit."""
+        written(out, [self.recipes[k] for k in (range(self.width) if at is None else at)], segments, self.target)
+
+
+def plan_of(
+    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: Target, grids: Grids | None = None,
+    *, searched: bool = False,
+) -> Plan:  # fmt: skip
+    """Every candidate that a log of these facts allows beside what the vehicle has.
+
+    Effects of one row share a vehicle, a few with all of them at their null value, so that one compiled `jvp` serves
+    them all; what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name;
+    `searched` takes effects that are looked for otherwise too.
+    """
+    left_out: dict[str, str] = {}
+    nulls: list[Effect] = []
+    for c in effects:
+        if vehicle.has(c.id) or (c.searched and not searched):
+            continue
+        if why := unavailable(c, facts.sample, vehicle.entry):
+            left_out[c.id] = why
+        else:
+            nulls.append(as_seen(at_null(c, gears=facts.gears), facts))
+    shared = [e for e in nulls if _row_level(e)]
+    groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
+    groups += [(shared[k : k + TOGETHER], None) for k in range(0, len(shared), TOGETHER)]
+    for e in (e for e in nulls if not _row_level(e)):
+        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.kind not in FIXED),):
+            groups.append(([_only(e, sizes)], sizes))
+
+    found: list[Candidate] = []
+    place: dict[Column, int] = {}
+    recipes: list[Recipe] = []
+    programs = [Program.of(vehicle, group) for group, _ in groups]
+    for program, (group, only) in zip(programs, groups, strict=True):
+        for e in group:
+            for sizes, subs, shapes, kind in _of_effect(type(e), facts, grids or {}):
+                if only is not None and sizes != only:
+                    continue
+                keys = [Column(e.id, s, g, _own(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
+                for key in keys:
+                    if key not in place:
+                        place[key] = len(recipes)
+                        size = None if kind == "limit" else (key.name, key.group)
+                        recipes.append(program.recipe(e.id, shapes, size))
+                found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
+    return Plan(tuple(found), left_out, target, tuple(programs), tuple(recipes))
+
+
+def columns(
+    vehicle: Vehicle,
+    effects: Sequence[type[Effect]],
+    segments: Segments,
+    rows: int,
+    target: Target,
+    grids: Grids | None = None,
+) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
+    """Every candidate's columns on the first `rows` rows of padded segments, all at once: for few rows or effects.
+
+    **Returns:** candidates, their columns in the target's unit, and why the other effects were left out.
+    """
+    plan = plan_of(vehicle, effects, facts_of(segments, rows), target, grids)
+    out = np.zeros((len(segments), plan.width))
+    plan.write(out, segments)
+    return list(plan.candidates), out[:rows], dict(plan.left_out)
+
+
+def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
+    """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
+    idle = {p.name for p in effect.parameters if p.kind == "limit" and p.name not in sizes}
+    return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
+
+
+def as_seen(effect: Effect, facts: Facts) -> Effect:
+    """The effect with one number for all rows in place of groups that the log does not tell."""
+    one = {p.name: np.asarray(p.null, dtype=float) for p in effect.parameters if p.whole and not facts.seen(p.by)}
+    return type(effect)(**({p.name: getattr(effect, p.name) for p in effect.parameters} | one)) if one else effect
+
+
+def _grouped(by_trip: Mapping[int, float]) -> Grouped:
+    """A number of each trip, NaN for every other trip."""
+    values = np.full(max(by_trip) + 2, np.nan)  # ids past the end take the last
+    values[list(by_trip)] = list(by_trip.values())
+    return Grouped(jnp.asarray(values), "trip")
+
+
+def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int = 1) -> Effect:
+    """The effect with these coefficients as its sizes and the candidate's shapes: where a joint refit starts."""
+    effect = at_null(candidate.effect, gears=gears)
+    values: dict[str, Any] = {p.name: getattr(effect, p.name) for p in effect.parameters}
+    values.update({name: np.asarray(v, dtype=float) for name, v in candidate.shapes if "[" not in name})
+    values.update({name: _grouped(by_trip) for name, by_trip in candidate.by_trip.items()})
+    for p in candidate.effect.parameters:
+        if p.kind == "limit" and p.name not in candidate.sizes:
+            values[p.name] = None  # not part of it: the effect skips what it costs
+        if p.whole and None in candidate.groups:  # the log tells no groups
+            values[p.name] = np.asarray(p.null, dtype=float)
+    if candidate.kind == "limit" and candidate.parameter(candidate.sizes[0]).smooth:
+        values[candidate.sizes[0]] = np.asarray(dict(candidate.shapes)[candidate.sizes[0]] * float(beta[0]))
+    if candidate.kind == "size":
+        for name, group, b in zip(candidate.sizes, candidate.groups, beta, strict=True):
+            if group is None:
+                values[name] = np.asarray(float(b))
+            else:
+                old = values[name]
+                values[name] = Grouped(jnp.asarray(old.values).at[group].set(float(b)), old.by)
+    return candidate.effect(**values)

@@ -1,0 +1,3 @@
+"""The competition: candidates are added, taken out and exchanged until nothing changes."""
+
+__all__ = []

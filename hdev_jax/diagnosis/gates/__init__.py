@@ -1,0 +1,3 @@
+"""Gates: what a candidate has to pass before it is named."""
+
+__all__ = []

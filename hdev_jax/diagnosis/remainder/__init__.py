@@ -1,0 +1,3 @@
+"""What remains unexplained, and what it looks like."""
+
+__all__ = []

@@ -1,0 +1,3 @@
+"""The result: diagnosis.json, intervals, checkpoints, the next drive."""
+
+__all__ = []

@@ -1,0 +1,301 @@
+"""The plain values of diagnosis.json, from where the loop ended."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from hdev_jax.diagnosis.remainder.unexplained import Remainder
+from hdev_jax.diagnosis.result.shapes import Open
+from hdev_jax.diagnosis.scores.look import Found, Search, Verdict
+from hdev_jax.inference import Calibration, Coefficient, cluster_rows
+from hdev_jax.physics import Parameter
+from hdev_jax.problem import Problem, Split, metrics
+
+__all__ = ["FAR", "SUSPICIOUS", "baseline_block", "parameters_of", "summarise"]
+
+ODD_SHARE = 0.2
+SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
+MOST_HINTED = 3
+DOUBTFUL = 0.5  # q from which on the clusters speak against it
+FAR = 2.0  # tabular standard deviations beyond which a coefficient has moved suspiciously far
+
+
+def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """The contract's `baseline.parameters`: value, sd, the table's, how far it moved, what it may have absorbed."""
+    block = {}
+    for c, value, sd, z in zip(fit.table.free, fit.values, fit.sd, fit.prior_z(), strict=True):
+        prior = {} if c.sd is None else {"prior_value": c.value, "prior_sd": c.sd, "prior_z": float(z)}
+        block[c.name] = {
+            "value": float(value), "sd": float(sd), "unit": c.unit, **prior, "absorbs": list(absorbs.get(c.name, ())),
+        }  # fmt: skip
+    return block
+
+
+def _sized(value: float, error: float, clusters: int) -> dict[str, Any]:
+    """A size with what is known of it from a few clusters: Student's t with `clusters` − 1 degrees of freedom.
+
+    **Arguments:** `error`, the standard error jackknifed over clusters.
+
+    **Returns:** `value`, the distribution's standard deviation `sd` (wider than the standard error; of three degrees
+    of freedom where there are fewer, which have none) and the central `interval_90`.
+    """
+    half = error * float(stats.t.ppf(0.95, _freedom(clusters)))
+    return {"value": value, "sd": error * _heavier(clusters), "interval_90": [value - half, value + half]}
+
+
+def _freedom(clusters: int) -> int:
+    return max(clusters - 1, 1)
+
+
+def _heavier(clusters: int) -> float:
+    """Standard deviation of Student's t over its scale."""
+    freedom = max(_freedom(clusters), 3)
+    return float(np.sqrt(freedom / (freedom - 2)))
+
+
+def _opened(told: dict[str, Any], p: Parameter, left: Open, error: float | None, clusters: int) -> dict[str, Any]:
+    """What is known of a parameter with what its effect's shapes or other size leave open of it, inside its plausible
+    range: what was `told` of it, widened where that is too narrow.
+
+    `error`: its standard error where those are held; None where it was fitted with them or is one of them.
+    """
+    low, high = (told["value"] + x for x in left.interval(0.9, _freedom(clusters), error))
+    inner = told.get("interval_90", [told["value"]] * 2)
+    sd = max(told["sd"], left.error(error) * _heavier(clusters))
+    within = np.clip([min(low, inner[0]), max(high, inner[1])], p.lower, p.upper).tolist()
+    return {
+        "value": told["value"],
+        "sd": sd,
+        "interval_90": [min(within[0], told["value"]), max(within[1], told["value"])],
+    }
+
+
+def _error(row: Coefficient, error: float) -> float:
+    """A standard error; of what was borrowed no smaller than where it comes from, since both are the same rows."""
+    return max(error, row.told[1]) if row.told else error
+
+
+def parameters_of(f: Found, fit: Calibration, leeway: Mapping[str, Open], clusters: int) -> dict[str, dict[str, Any]]:
+    """A found effect's parameters, each with value, sd, unit and, unless it is a choice, its 90 % interval.
+
+    What was held has an sd of 0 by the fit alone, `leeway` empty: the sheet's numbers, which belong together. With what
+    its shapes or its other size leave open every number stands for itself.
+    """
+    c = f.score.candidate
+    prefix = f"effects.{f.id}."
+    rows = [r for r in zip(fit.table.free, fit.values, fit.sd, strict=True) if r[0].path.startswith(prefix)]
+    fitted = {row.path.removeprefix(prefix) for row, _, _ in rows}
+    held = fitted <= set(c.sizes)
+    parameters: dict[str, dict[str, Any]] = {}
+    for row, value, sd in rows:
+        name, error = row.name.removeprefix(prefix), _error(row, float(sd))
+        told = _sized(float(value), error, clusters)
+        if name in leeway:
+            told = _opened(told, c.parameter(name), leeway[name], error if held else None, clusters)
+        parameters[name] = {**told, "unit": row.unit}
+    for name, value in c.shapes:
+        p = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
+        if p:
+            told = {"value": value, "sd": 0.0}
+            told = _opened(told, p, leeway[name], None, clusters) if name in leeway else told
+            parameters[name] = {**told, "unit": p.unit}
+    return parameters
+
+
+def _effect_block(
+    f: Found, fit: Calibration, leeway: Mapping[str, Open], before: float, after: float, clusters: int
+) -> dict[str, Any]:
+    c = f.score.candidate
+    return {
+        "id": f.id,
+        "stage": c.effect.stage,
+        "verdict": "one_of_class" if f.twins else "found",
+        "parameters": parameters_of(f, fit, leeway, clusters),
+        "equation": c.effect.equation,
+        "separated_by": c.effect.separated_by,
+        "q_value": f.q_value,
+        "stability": f.stability,
+        "test_rmse_before": before,
+        "test_rmse_after": after,
+        "indistinguishable_from": list(f.twins),
+        "class_size": 1 + f.alike,
+    }
+
+
+def summarise(
+    problem: Problem,
+    split: Split,
+    state: Search,
+    steps: list[Calibration],
+    predicted: list[np.ndarray],
+    left: Remainder,
+    leeway: Mapping[str, Mapping[str, Open]],
+) -> dict[str, Any]:
+    """The contract's diagnosis.json. `leeway`: by effect and parameter, what is left open."""
+    weight, y = problem.weight(), problem.measured
+    train, test = problem.rows(split.train), problem.rows(split.test)
+
+    def block(p: np.ndarray) -> dict[str, Any]:
+        at = {problem.log.trip_names[i]: problem.rows([i]) for i in split.test}
+        return {
+            "train": metrics(y[train], p[train], weight[train]),
+            "test": metrics(y[test], p[test], weight[test]),
+            "test_by_trip": {k: metrics(y[m], p[m], weight[m]) for k, m in at.items()},
+        }
+
+    rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
+    clusters = cluster_rows(problem.segments.take(train))
+    effects = [
+        {**_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
+        for k, f in enumerate(state.found)
+    ]
+    verdict = {
+        (False, False): "nothing_missing",
+        (True, False): "effects_found",
+        (False, True): "unexplained_structure",
+        (True, True): "effects_found_and_unexplained_structure",
+    }[bool(effects), left.significant]
+    candidates = [{"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts]
+    considered = {c["id"] for c in candidates}
+    for e in state.fit.vehicle.effects:  # in the vehicle: nothing to turn down, but considered all the same
+        if e.parameters and e.id not in considered:
+            f = next((f for f in state.found if f.id == e.id), None)
+            here = (f.gain, f.q_value, "found") if f else (None, 1.0, "declared in the sheet")
+            candidates.append(dict(zip(("id", "score", "q_value", "why_not"), (e.id, *here), strict=True)))
+    return {
+        "schema": "hdev-diagnosis/1",
+        "target": problem.target,
+        "split": {
+            "train_trips": split.names(split.train),
+            "test_trips": split.names(split.test),
+            "unused_trips": split.names(split.unused),
+        },
+        "before": block(predicted[0]),
+        "after": block(predicted[-1]),
+        "baseline": {"parameters": baseline_block(steps[0], state.absorbs)},
+        "effects": effects,
+        "candidates": candidates,
+        "unexplained": {
+            "significant": left.significant,
+            "share_of_test_variance": left.share,
+            "share_borne_out": left.borne_out,
+            "noise_floor_rmse": left.noise_floor_rmse,
+            "depends_on": list(left.depends_on),
+            "signature": left.signature,
+            "scales_with": left.scales_with,
+            "correction": left.correction,
+            "expression": left.expression,
+        },
+        "not_decidable": _not_decidable(state.verdicts, left),
+        "verdict": verdict,
+        "parameters_fitted": _fitted(state),
+        "clusters": {"kind": clusters.kind, "count": clusters.count, "trips": len(split.train)},
+        "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
+        "notes": [
+            *problem.notes,
+            *_warnings(steps, state),
+            *_known(problem, state, steps[-1], test, rmse[-1]),
+            *_by_trip(problem, state),
+            *_odd_rows(problem, predicted[0]),
+        ],
+    }
+
+
+def _not_decidable(verdicts: Sequence[Verdict], left: Remainder) -> list[dict[str, Any]]:
+    """What more trips (or stretches of driving) would tell, the nearest of each kind first.
+
+    Either rows speak for it and clusters not yet (one trip in the rain says little of rain), three at most; or trips
+    differ in level, or may, and it is a cause that differs by trip: of any such a log knows no more than it has trips.
+    """
+    able = sorted((v for v in verdicts if v.needed is not None), key=lambda v: v.needed or 0)
+    open_to_doubt = [v for v in able if v.by_rows or v.q_value < DOUBTFUL]
+    hinted = [v for v in open_to_doubt if (v.score or 0.0) > SUSPICIOUS][:MOST_HINTED]
+    told = [*hinted, *(v for v in able if left.trips_differ and v.between and v not in hinted)]
+    return [{"id": v.id, "clusters_needed": v.needed, "why_not": v.why_not} for v in told]
+
+
+def _fitted(state: Search) -> int:
+    """Every fitted or grid-chosen number: free coefficients, and choices among more than one value."""
+    choices = sum(
+        len(p.grid) != 1
+        for f in state.found
+        for p in f.score.candidate.effect.parameters
+        if p.kind == "choice" and any(p.name == n for n, _ in f.score.candidate.shapes)
+    )
+    by_trip = sum(len(x) for f in state.found for x in f.score.candidate.by_trip.values())
+    return len(state.table.free) + choices + by_trip
+
+
+def _subsets(problem: Problem, test: np.ndarray, before: np.ndarray, after: np.ndarray) -> dict[str, Any]:
+    """Errors on parts of the test rows that mean something of their own."""
+    s, weight = problem.segments, problem.weight()
+    moving = np.asarray(s.speed_mps) > 2.0
+    parts = {"standing still": np.asarray(s.speed_mps) < 0.1, "above 2 m/s": moving}
+    if s.has("brake_pressure_pa") or s.has("brake_pedal_pct"):
+        brake = np.asarray(s.get("brake_pressure_pa", s.get("brake_pedal_pct", 0.0)))
+        off = brake < 0.005 * np.max(np.abs(brake))
+        parts["above 2 m/s, friction brake off"] = moving & off
+    y = problem.measured
+    return {
+        name: {k: metrics(y[m], p[m], weight[m]) for k, p in (("before", before), ("after", after))}
+        for name, rows in parts.items()
+        if (m := rows & test).sum() > 50
+    }
+
+
+def _warnings(steps: list[Calibration], state: Search) -> list[str]:
+    out = []
+    for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
+        if not fit.converged:
+            out.append(f"the fit of the {when} stopped early: {fit.message}")
+    for name, p in baseline_block(steps[0], state.absorbs).items():
+        if abs(p.get("prior_z", 0.0)) > FAR:
+            held = f"; on this log it cannot be told from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
+            out.append(f"{name} moved {p['prior_z']:+.1f} tabular sd to fit the declared model{held}")
+    return out
+
+
+def _known(problem: Problem, state: Search, last: Calibration, test: np.ndarray, rmse: float) -> list[str]:
+    """What of the error after is no effect's: where its coefficients come from."""
+    if last is state.fit or not state.found:
+        return []
+    said = problem.predict(state.fit.vehicle)[test]
+    plain = metrics(problem.measured[test], said, problem.weight()[test])["rmse"]
+    return [
+        "coefficients of the model with the effects are of whitened rows, which know them better: test RMSE "
+        f"{rmse:.4g} {problem.unit}; {plain:.4g} with those of rows of equal weight, as the declared model has them"
+    ]
+
+
+def _by_trip(problem: Problem, state: Search) -> list[str]:
+    """What was sought for each trip: the phases of a cycle, the trips of a mode."""
+    out = []
+    for f in state.found:
+        told = next(iter(f.score.candidate.by_trip.values()), {})
+        by_trip = [(problem.log.trip_names[t], v) for t, v in told.items()]
+        mean = "a trip that was not fitted, and every trip in augmented_vehicle.toml, gets its mean"
+        if f.id == "mode_change":
+            trips = ", ".join(t for t, v in by_trip if v > 0)
+            out.append(f"mode_change holds in {trips}; {mean}")
+        elif by_trip:
+            phases = ", ".join(f"{t} {v:+.2f}" for t, v in by_trip)
+            out.append(f"{f.id}: phase by trip {phases}; {mean}")
+    return out
+
+
+def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
+    """A row far beyond all others that holds much of the whole log's squared error by itself."""
+    square = (problem.measured - declared) ** 2
+    worst = int(np.argmax(square))
+    share = square[worst] / max(float(np.sum(square)), 1e-300)
+    size = np.sort(np.abs(problem.measured))
+    if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) <= 3.0 * size[-2]:
+        return []
+    trip = problem.log.trip_names[int(problem.log.trip[worst])]
+    at = float(np.asarray(problem.segments.time_s)[worst])
+    return [
+        f"one row alone holds {100 * share:.0f} % of the declared model's squared error: trip {trip} at {at:.6g} s, "
+        f"{problem.target} = {problem.measured[worst]:.6g}; a faulty instrument there would ruin every fit"
+    ]

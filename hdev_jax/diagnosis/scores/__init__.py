@@ -1,0 +1,3 @@
+"""Scores of candidates from normal equations by cluster, without a refit."""
+
+__all__ = []

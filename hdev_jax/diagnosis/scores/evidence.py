@@ -1,0 +1,181 @@
+"""Scores of candidates from normal equations by cluster: no refit, no second look at the rows.
+
+Gains, clustered tests, left-out gains, resampling and sign placebos are algebra on `NormalEquations`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.scores.normal_equations import NormalEquations, solved
+from hdev_jax.diagnosis.scores.significance import least_clusters, wald
+
+__all__ = ["ABSORBED", "Evidence", "Score"]
+
+ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a log says of one candidate beside what the vehicle has.
+
+    `gain` in log-likelihood on training rows, `p_model` from it (χ²), `p_cluster` from a Wald test with jackknifed
+    clusters (F), `left_out_gain` in log-likelihood over clusters left out in turn, `left` the share of its columns
+    that the Jacobian does not hold. `plain`: told by rows that weigh the same (`Evidence.plain_score`).
+    """
+
+    candidate: Candidate
+    beta: Float[np.ndarray, " k"]
+    gain: float
+    p_model: float
+    p_cluster: float
+    left_out_gain: float
+    left: float
+    plain: bool = False
+
+    @property
+    def p(self) -> float:
+        """Both tests have to agree; twice that, since whitened and plain rows are both looked at."""
+        return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
+
+
+@dataclass(frozen=True)
+class Evidence(NormalEquations):
+    """Normal equations with the tests of candidates: what each would explain, and whether chance could have."""
+
+    def score(self, candidate: Candidate) -> Score:
+        """All tests of one candidate."""
+        return self.scores([candidate])[0]
+
+    def scores(self, candidates: Sequence[Candidate]) -> list[Score]:
+        """All tests of each candidate."""
+        totals, g = self.totals(), self.count
+        base, _ = self._fit(totals, np.empty(0, int))
+        own = int(np.argmax(base))  # the base at the variance that suits the base
+        before, missed = float(base[own]), float(np.sum(self._base_loss(own))) + self.cost[own]
+        out: dict[int, Score] = {}
+        for places, at in self._alike([c.columns for c in candidates], g):
+            likelihood, x = self._fit(totals, at)
+            suits = np.argmax(likelihood, axis=0)
+            for v in np.unique(suits).tolist():
+                here = np.flatnonzero(suits == v)
+                beta, gain = x[v, here, self.base :], likelihood[v, here] - before
+                full = self._jackknife(at[here], v)
+                left_out = missed - np.sum(self._loss(full, self._with_base(at[here]), v), axis=0) - self.cost[v]
+                p_model = stats.chi2.sf(2 * np.maximum(gain, 0.0), at.shape[-1])
+                p_cluster = wald(beta, full[..., self.base :])
+                for i, k in enumerate(places[here]):
+                    out[int(k)] = Score(
+                        candidates[k], beta[i], float(gain[i]), float(p_model[i]), float(p_cluster[i]),
+                        float(left_out[i]), self.left(candidates[k].columns),
+                    )  # fmt: skip
+        return [out[k] for k in range(len(candidates))]
+
+    def estimate(self, candidate: Candidate) -> tuple[np.ndarray, np.ndarray]:
+        """A candidate's coefficients and their standard errors from clusters left out in turn."""
+        at = self.base + np.asarray(candidate.columns)
+        likelihood, x = self._fit(self.totals(), at)
+        v = int(np.argmax(likelihood))
+        beta, g = x[v, self.base :], self.count
+        spread = self._jackknife(at, v)[:, self.base :] - beta
+        return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
+
+    def bearing(self, candidate: Candidate) -> Float[np.ndarray, " k"]:
+        """How many clusters each of a candidate's coefficients rests on: (Σγ)²/Σγ², γ each cluster's share of its
+        variance w'X'Xw (Carter, Schnepel and Steigerwald, Review of Economics and Statistics 99, 2017; rows of a
+        cluster taken as independent). What two trips show is known by two, however many others there are.
+        """
+        at, totals = self.base + np.asarray(candidate.columns), self.totals()
+        v = int(np.argmax(self._fit(totals, at)[0]))
+        index = self._with_base(at)
+        normal = self._normal(totals[v], at)[0]
+        weights = np.stack([solved(normal, e) for e in np.eye(len(index))[self.base :]])
+        told = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
+        share = told / np.maximum(np.sum(told, axis=1, keepdims=True), 1e-300)
+        return 1.0 / np.maximum(np.sum(share**2, axis=1), 1e-300)
+
+    def traded(self, own: Sequence[int], other: int) -> Float[np.ndarray, " k"]:
+        """What a unit of another column adds to the coefficients of a candidate's own."""
+        at, totals = self.base + np.asarray(own, dtype=int), self.totals()
+        v = int(np.argmax(self._fit(totals, at)[0]))
+        return -solved(self._normal(totals[v], at)[0], totals[v][self._with_base(at), self.base + other])[self.base :]
+
+    def plain_score(self, candidate: Candidate) -> Score:
+        """A candidate's tests where rows are as they were measured and only clusters count as independent."""
+        return self.plain_scores([candidate])[0]
+
+    def plain_scores(self, candidates: Sequence[Candidate]) -> list[Score]:
+        """Tests of each candidate where rows are as they were measured and only clusters count as independent.
+
+        Weights that suit the noise inside trips may drown what differs between them (a temperature that moves slowly
+        and is measured late). The gain is the likelihood ratio of as many observations as there are clusters.
+        """
+        totals, g = self.totals(), self.count
+        out: dict[int, Score] = {}
+        for places, at in self._alike([c.columns for c in candidates], g):
+            k = at.shape[-1]
+            likelihood, x = self._fit(totals, at)
+            full, beta = self._jackknife(at, 0), x[0, :, self.base :]
+            p = wald(beta, full[..., self.base :])
+            # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
+            statistic = np.zeros(len(places))
+            if g >= least_clusters(k):
+                statistic = np.minimum(stats.f.isf(np.maximum(p, 1e-60), k, g - k), 1e12) * k / (g - k)
+            better = self._base_loss(0)[:, None] - self._loss(full, self._with_base(at), 0)
+            t = np.mean(better, axis=0) / (np.std(better, axis=0) + 1e-300) * np.sqrt(g)
+            gain = 0.5 * g * np.log1p(statistic)
+            # as much of it as clusters keep that are left out of the fit
+            whole = np.max(likelihood, axis=0) - self.base_likelihood(totals)
+            kept = np.sum(better, axis=0) / np.maximum(whole, 1e-300)
+            left_out = np.where(t > 1.0, gain * np.minimum(kept, 1.0), 0.0)
+            for i, j in enumerate(places):
+                out[int(j)] = Score(
+                    candidates[j], beta[i], float(gain[i]), float(p[i]), float(p[i]), float(left_out[i]),
+                    self.left(candidates[j].columns), plain=True,
+                )  # fmt: skip
+        return [out[k] for k in range(len(candidates))]
+
+    def beside(self, other: Sequence[int], own: Sequence[int]) -> float:
+        """p of a candidate's columns against zero when another's are in, with jackknifed clusters."""
+        at = self.base + np.array([*other, *(k for k in own if k not in other)], dtype=int)
+        if len(at) == len(other):
+            return 1.0
+        _, x = self._fit(self.totals(), at)
+        skip = self.base + len(other)
+        return float(wald(x[0, skip:], self._jackknife(at, 0)[:, skip:]))
+
+    def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
+        """The same evidence with the candidate's columns given a sign in each cluster."""
+        at = self.base + np.asarray(candidate.columns)
+        grams, levels = self.grams.copy(), self.levels.copy()
+        inner = grams[:, at[:, None], at[None, :]]
+        grams[:, :, at] *= sign[:, None, None]
+        grams[:, at, :] *= sign[:, None, None]
+        grams[:, at[:, None], at[None, :]] = inner
+        levels[:, at] *= sign[self.home][:, None]
+        return replace(self, grams=grams, levels=levels)
+
+    def sign_placebos(self, s: Score, rng: np.random.Generator, draws: int) -> Float[np.ndarray, " draw"]:
+        """Gains of the same columns with each cluster's sign drawn at random: what no consistent effect would give."""
+        small, candidate = self.only(s.candidate)
+        out = np.zeros(draws)
+        # what lives in k clusters meets itself, up to its sign, in one draw of 2^(k−1): that is no placebo
+        energy = np.einsum("gii->g", small.by_cluster(0)[:, self.base : -1, self.base : -1])
+        for i in range(draws):
+            sign = rng.choice([-1.0, 1.0], size=self.count)
+            if abs(sign @ energy) > 0.98 * energy.sum():
+                continue
+            other = small.flipped(candidate, sign)
+            out[i] = other.plain_score(candidate).gain if s.plain else other.gain(other.totals(), candidate.columns)[0]
+        return out
+
+    def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:
+        """Evidence of one candidate alone, and the candidate with its columns' places in it."""
+        index = np.r_[np.arange(self.base), self.base + np.asarray(candidate.columns), self.grams.shape[-1] - 1]
+        grams, levels = self.grams[:, index[:, None], index[None, :]], self.levels[:, index]
+        small = replace(self, grams=grams, levels=levels)
+        return small, replace(candidate, columns=tuple(range(len(candidate.columns))))

@@ -1,0 +1,3 @@
+"""Efficiency maps: read from a table, learned from a log, and how a log lies to them."""
+
+__all__ = []

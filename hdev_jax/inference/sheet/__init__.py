@@ -1,0 +1,22 @@
+"""The vehicle sheet: read from TOML, checked against its schema, built into a vehicle, written out again."""
+
+from hdev_jax.inference.sheet.build import Built, build
+from hdev_jax.inference.sheet.sheet import (
+    BATTERY_TARGETS,
+    Sheet,
+    choose_entry,
+    read_sheet,
+    traction_force_from_torque,
+)
+from hdev_jax.inference.sheet.text import augmented_sheet
+
+__all__ = [
+    "BATTERY_TARGETS",
+    "Built",
+    "Sheet",
+    "augmented_sheet",
+    "build",
+    "choose_entry",
+    "read_sheet",
+    "traction_force_from_torque",
+]

@@ -1,0 +1,3 @@
+"""What the papers compare with: classical regressors and recurrent networks."""
+
+__all__ = []

@@ -1,0 +1,3 @@
+"""The gear as a surrogate: features, classifiers, the channel that the kernel reads."""
+
+__all__ = []

@@ -1,0 +1,3 @@
+"""NARX models of paper 2: network, fits in prediction and simulation, choices, recursive identification."""
+
+__all__ = []

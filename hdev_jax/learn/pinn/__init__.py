@@ -1,0 +1,3 @@
+"""The physics-informed network of paper 1."""
+
+__all__ = []

@@ -1,0 +1,3 @@
+"""Boosted trees as arrays, evaluated within jit."""
+
+__all__ = []

@@ -1,0 +1,126 @@
+"""The verb `calibrate`: a sheet's coefficients with their posterior."""
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdev_jax import progress
+from hdev_jax.diagnosis.result.summary import baseline_block
+from hdev_jax.errors import InputError
+from hdev_jax.inference import cluster_rows, padded
+from hdev_jax.inference.posterior.methods import METHODS, Outcome, calibrated
+from hdev_jax.inference.sheet import augmented_sheet
+from hdev_jax.problem import Problem, Split, metrics
+from hdev_jax.report.build import report_data
+from hdev_jax.report.page import write_calibration_report
+from hdev_jax.rundir import open_run
+from hdev_jax.verbs.opening import Paths, command_line, known_effects, opened
+from hdev_jax.verbs.predict import write_predictive
+
+__all__ = ["calibrate"]
+
+
+def calibrate(
+    logs: Paths,
+    vehicle: str | Path,
+    adapter: str | Path | None = None,
+    target: str | None = None,
+    train_trips: Sequence[str] | None = None,
+    test_trips: Sequence[str] | None = None,
+    effects: str | Path | None = None,
+    method: str = "map",
+    noise: str = "normal",
+    *,
+    out: str | Path,
+    seed: int = 0,
+) -> str:
+    """Coefficients of the sheet with uncertainty, from their tabular priors and the training trips of the logs.
+
+    `method` "map": Levenberg-Marquardt to the most probable values, standard errors clustered by trip. "linear":
+    Bayesian linear regression in closed form. "nuts": draws, from sufficient statistics where they are enough and by
+    NUTS through the kernel otherwise; `posterior.nc` holds them for ArviZ. `noise` "student_t" weighs outliers down.
+    **Returns:** a table as text; `calibration.json`, a report and `calibrated_vehicle.toml` are in `out`. Raises
+    `InputError`.
+    """
+    if method not in METHODS:
+        raise InputError(f"--method {method!r}: accepted are {', '.join(METHODS)}")
+    if noise not in ("normal", "student_t"):
+        raise InputError(f"--noise {noise!r}: accepted are normal, student_t")
+    started = time.time()
+    start = opened(
+        "calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known_effects(effects)
+    )
+    problem, split = start.problem, start.split
+    if not problem.table.free:
+        raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")
+    config = {**start.config, "method": method, "noise": noise}
+    with open_run(out, config, seed=seed) as run:
+        if run.done:
+            return (run.work / "answer.txt").read_text()
+        progress.step(f"{start.read}; calibrating")
+        train = problem.rows(split.train)
+        segments = problem.segments.take(train)
+        clusters = cluster_rows(segments)
+        outcome = calibrated(
+            problem.vehicle, problem.table, padded(segments, problem.measured[train]), problem.target, clusters, method,
+            noise=noise, vehicles=len(problem.log.vehicle_names), seed=seed,
+        )  # fmt: skip
+        fit = outcome.fit
+        predicted = problem.predict(fit.vehicle)
+        summary = _summary(problem, split, outcome, predicted, method, noise)
+        values = {c.name: (float(v), float(s)) for c, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)}
+        sheet = run.path("calibrated_vehicle.toml")
+        sheet.write_text(augmented_sheet(start.sheet, values, {}))
+        summary["notes"] += write_predictive(run, sheet, problem, split, fit, noise)
+        run.path("calibration.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+        if outcome.draws is not None:
+            outcome.draws.write(run.path("posterior.nc"))
+        data = report_data(problem, split, summary, predicted, predicted, command_line("calibrate", run), started)
+        write_calibration_report(data, run.work)
+        lines = [f"{name:32s} {v:12.6g} ± {s:.3g}" for name, (v, s) in values.items()]
+        lines += [] if outcome.good else [f"NOT A GOOD FIT: {fit.message}"]
+        lines += [f"note: {note}" for note in summary["notes"]]
+        test_rmse = summary["before"]["test"]["rmse"]
+        answer = "\n".join([*lines, f"test RMSE {test_rmse:.4g} {problem.unit}; {fit.message}; {out}/report.html"])
+        run.path("answer.txt").write_text(answer)
+    return answer
+
+
+def _summary(
+    problem: Problem, split: Split, outcome: Outcome, predicted: np.ndarray, method: str, noise: str
+) -> dict[str, Any]:
+    """The plain values of calibration.json."""
+    fit, (y, w) = outcome.fit, (problem.measured, problem.weight())
+    train, test = problem.rows(split.train), problem.rows(split.test)
+    stopped = [] if fit.converged or method == "nuts" else [f"the fit stopped early: {fit.message}"]
+    summary: dict[str, Any] = {
+        "schema": "hdev-calibration/1",
+        "target": problem.target,
+        "method": method,
+        "noise": noise,
+        "split": {
+            "train_trips": split.names(split.train),
+            "test_trips": split.names(split.test),
+            "unused_trips": split.names(split.unused),
+        },
+        "baseline": {"parameters": baseline_block(fit, {})},
+        "before": {
+            "train": metrics(y[train], predicted[train], w[train]),
+            "test": metrics(y[test], predicted[test], w[test]),
+            "test_by_trip": {
+                split.log.trip_names[i]: metrics(*(a[problem.rows([i])] for a in (y, predicted, w)))
+                for i in split.test
+            },
+        },
+        "converged": fit.converged,
+        "solver": fit.message,
+        "notes": [*problem.notes, *outcome.notes, *stopped],
+        "covariance": {"names": [c.name for c in fit.table.free], "matrix": np.asarray(fit.covariance).tolist()},
+    }  # fmt: skip
+    if outcome.draws is not None:
+        summary["draws"] = {"how": outcome.draws.how, **outcome.draws.quality(), "faults": outcome.draws.faults()}
+    return summary

@@ -1,0 +1,50 @@
+"""The verb `check`: what is read from a log, before anything is fitted."""
+
+from pathlib import Path
+
+import numpy as np
+
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log, write_adapter_skeleton
+from hdev_jax.problem import prepare
+from hdev_jax.verbs.opening import Paths, known_effects
+
+__all__ = ["check"]
+
+
+def check(
+    logs: Paths,
+    vehicle: str | Path | None = None,
+    adapter: str | Path | None = None,
+    effects: str | Path | None = None,
+    skeleton: bool = False,
+) -> str:
+    """What was read: columns, units, trips, kWh/km by trip, what was dropped, filled or clipped. Nothing is fitted.
+
+    With `skeleton`, an adapter to fill in instead. Raises `InputError`.
+    """
+    if skeleton:
+        return write_adapter_skeleton(Path(next(iter(logs))))
+    log = read_log(list(logs), adapter)
+    s = log.segments
+    lines = [f"{len(log)} rows, {len(log.trip_names)} trips, {len(log.vehicle_names)} vehicles"]
+    lines += ["", "columns"] + [f"  {c.source:34s} {c.unit or '-':10s} -> {c.name}" for c in log.columns]
+    has_energy = any(t in log.targets for t in ("energy_wh", "battery_power_kw"))
+    energy = log.target("energy_wh") if has_energy else None
+    lines += ["", f"{'trip':40s} {'rows':>7s} {'min':>7s} {'km':>8s} {'kWh':>9s} {'kWh/km':>8s}"]
+    for i, name in enumerate(log.trip_names):
+        m = s.trip == i
+        km, minutes = float(np.sum(s.distance_m[m])) / 1e3, float(np.sum(s.duration_s[m])) / 60
+        kwh = float(np.sum(energy[m])) / 1e3 if energy is not None else float("nan")
+        per = f"{kwh / km:8.3f}" if km > 0.05 and energy is not None else f"{'-':>8s}"
+        total = f"{kwh:9.3f}" if energy is not None else f"{'-':>9s}"
+        lines.append(f"{name:40s} {int(m.sum()):7d} {minutes:7.1f} {km:8.2f} {total} {per}")
+    lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
+    lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
+    if vehicle is not None:
+        sheet = read_sheet(vehicle, library=known_effects(effects))
+        problem = prepare(log, sheet, None, need_measured=bool(log.targets))
+        free = ", ".join(c.name for c in problem.table.free) or "none"
+        lines += ["", f"vehicle: {sheet.name}; chain entered at the {problem.vehicle.entry}; estimated: {free}"]
+        lines += [f"  {note}" for note in problem.notes]
+    return "\n".join(lines)

@@ -1,0 +1,280 @@
+"""How the verbs begin: the library with a user's effects, the logs read, the trips split, the run's configuration."""
+
+import difflib
+import hashlib
+import importlib.util
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.candidate import FIXED, as_seen, plan_of
+from hdev_jax.diagnosis.candidates.facts import GROUPS, Facts, facts_of
+from hdev_jax.diagnosis.candidates.programs import computed
+from hdev_jax.errors import InputError
+from hdev_jax.inference import padded
+from hdev_jax.inference.sheet import Sheet, read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
+from hdev_jax.physics.effect import KINDS, STAGES
+from hdev_jax.physics.library import DECLARED
+from hdev_jax.problem import Problem, Split, prepare, split_trips
+from hdev_jax.rundir import Run
+
+__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "digest", "known_effects", "opened", "tried"]
+
+Paths = Sequence[str | Path]
+HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
+ROUNDING = 1e4  # units in the last place of the largest prediction, for two that are said to be the same
+
+
+def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
+    """The library with a user's own effects: every `Effect` class that the Python file defines."""
+    if file is None:
+        return dict(LIBRARY)
+    path = Path(file)
+    spec = importlib.util.spec_from_file_location("hdev_user_effects", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise InputError(f"--effects {file}: no such Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as e:  # a script that ends itself has not been read to its end
+        raise InputError(f"--effects {file}: does not run: {type(e).__name__}: {e}") from e
+    own = [
+        c for c in vars(module).values()
+        if isinstance(c, type) and issubclass(c, Effect) and c.__module__ == module.__name__ and hasattr(c, "id")
+    ]  # fmt: skip
+    if not own:
+        raise InputError(f"--effects {file}: defines no subclass of hdev_jax.physics.Effect with an id")
+    for c in own:
+        if why := _malformed(c):
+            raise InputError(f"--effects {file}: class {c.__name__}: {why}")
+    try:
+        return library(own)
+    except ValueError as e:
+        raise InputError(f"--effects {file}: {e}") from e
+
+
+def _malformed(effect: type[Effect]) -> str | None:
+    """Why a user's class is no effect, in one phrase; None where it is one."""
+    stage, parameters = getattr(effect, "stage", None), effect.parameters
+    if not (isinstance(effect.id, str) and effect.id.isascii() and effect.id.isidentifier()):
+        return f"id is {effect.id!r}; letters, digits and underscores are expected"
+    if effect.id in {c.id for c in DECLARED}:
+        return f"id {effect.id!r} is a part of the declared model; give yours a name of its own"
+    if stage not in STAGES:
+        return f"stage is {stage!r}; one of {', '.join(STAGES)} is expected"
+    if not isinstance(getattr(effect, "equation", None), str):
+        return "equation is missing; a line of text is expected"
+    for name in ("needs", "lacks", "entries"):
+        if not _texts(value := getattr(effect, name)):
+            return f"{name} is {value!r}; a tuple of names is expected"
+    if not effect.entries or set(effect.entries) - {*Effect.entries}:
+        return f"entries is {effect.entries!r}; some of {', '.join(Effect.entries)} are expected"
+    if effect.searched:
+        return f"searched is {effect.searched!r}; only effects of the library are looked for in a way of their own"
+    if not any(getattr(effect, hook) is not getattr(Effect, hook) for hook in HOOKS):
+        return f"it has no hook of its own ({', '.join(HOOKS)}), so it does nothing"
+    if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
+        return "parameters is something else than a tuple of hdev_jax.physics.Parameter"
+    return _malformed_parameters(effect, parameters)
+
+
+def _malformed_parameters(effect: type[Effect], parameters: Sequence[Parameter]) -> str | None:
+    if odd := [p.name for p in parameters if not isinstance(p.name, str)]:
+        return f"a parameter's name is {odd[0]!r}; text is expected"
+    names = [p.name for p in parameters]
+    if twice := {n for n in names if names.count(n) > 1}:
+        return f"two parameters are called {min(twice)}"
+    for p in parameters:
+        if why := _malformed_parameter(p):
+            return f"parameter {p.name!r}: {why}"
+        if p.of and p.of not in names:
+            return f"parameter {p.name!r}: of is {p.of!r}; one of {', '.join(names)} is expected"
+    if all(p.kind in FIXED for p in parameters):
+        return "parameters holds no size and no limit, so nothing of it could be found"
+    if not (isinstance(effect.variants, tuple | list) and all(map(_texts, effect.variants))):
+        return f"variants is {effect.variants!r}; a tuple of tuples of names is expected"
+    if odd := [n for variant in effect.variants for n in variant if n not in names]:
+        return f"variants has {odd[0]!r}; sets of {', '.join(names)} are expected"
+    try:
+        made = at_null(effect)
+    except Exception as e:
+        return f"cannot be made with its parameters ({', '.join(names)}): {type(e).__name__}: {e}"
+    if odd := [x for x in jax.tree.leaves(made) if not eqx.is_array_like(x)]:
+        return f"has a field that holds {odd[0]!r}, no number; make it a ClassVar or equinox.field(static=True)"
+    return None
+
+
+def _texts(names: Any) -> bool:
+    return isinstance(names, tuple | list) and all(isinstance(n, str) for n in names)
+
+
+def _malformed_parameter(p: Parameter) -> str | None:
+    """Why a parameter could never be fitted or tried, in one phrase; None where it can."""
+    if not isinstance(p.grid, tuple | list | np.ndarray):
+        return f"grid is {p.grid!r}; a tuple of values is expected"
+    numbers = (p.null, p.scale, p.lower, p.upper, p.least, *p.grid)
+    if not all(isinstance(x, Real) and not math.isnan(x) for x in numbers):
+        return "null, scale, lower, upper, least and the values of grid are numbers"
+    if p.kind not in KINDS:
+        return f"kind is {p.kind!r}; one of {', '.join(KINDS)} is expected"
+    if p.by not in ("", *GROUPS):
+        return f"by is {p.by!r}; empty or one of {', '.join(GROUPS)} is expected"
+    if p.scale == 0 or math.isinf(p.scale):
+        return f"scale is {p.scale:g}; a typical size other than 0 is expected"
+    if not p.lower < p.upper:
+        return f"lower is {p.lower:g} and upper {p.upper:g}; a range is expected"
+    if p.kind == "size" and not (math.isfinite(p.null) and p.lower <= p.null <= p.upper):
+        return f"null is {p.null:g}, no number of its range {p.lower:g} to {p.upper:g}"
+    if p.kind != "size" and not len(p.grid) and p.name != "at_trip":  # whose values are the log's trips
+        return f"a {p.kind} without a grid is never tried; give it values to try"
+    return None
+
+
+def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None, *candidates: str) -> None:
+    """Work out the columns of a user's own effects on every row of the log, before anything is fitted: of those that
+    are `candidates` or that the vehicle has.
+
+    Raises `InputError` that names the class, for one that fails there, does not give a number in every row, or changes
+    the prediction while all of its sizes are null.
+    """
+    own = [c for k, c in known.items() if k not in LIBRARY and (k in candidates or problem.vehicle.has(k))]
+    if not own:
+        return
+    car = problem.vehicle.minus(*(c.id for c in own if problem.vehicle.has(c.id)))
+    rows, facts = padded(problem.segments, problem.measured), facts_of(problem.segments)
+    plain = problem.predict(car)
+    for c in own:
+        where = f"--effects {file}: class {c.__name__}"
+        bad = np.zeros(rows.rows, dtype=bool)
+        try:
+            plan = plan_of(car, [c], facts, problem.target, searched=True)
+            for column in computed(plan.recipes, rows.segments, problem.target):
+                bad |= ~np.isfinite(column[: rows.rows])
+            null = plain if c.id in plan.left_out else problem.predict(car.plus(_idle(c, facts)))
+        except Exception as e:
+            hint = "; every channel that it reads belongs in its needs" if isinstance(e, KeyError) else ""
+            raise InputError(f"{where}: fails on this log: {type(e).__name__}: {e}{hint}") from e
+        if bad.any():
+            first = int(np.argmax(bad))
+            trip, at = problem.log.trip_names[problem.log.trip[first]], problem.segments.time_s[first]
+            raise InputError(
+                f"{where}: it or its slope is no finite number in {bad.sum()} of {rows.rows} rows, the first in trip "
+                f"{trip} at {at:g} s; a number is expected in every row, also of a branch that is not taken"
+            )
+        if not np.allclose(null, plain, rtol=0.0, atol=ROUNDING * np.finfo(plain.dtype).eps * np.max(np.abs(plain))):
+            raise InputError(
+                f"{where}: changes the prediction by up to {np.max(np.abs(null - plain)):.3g} {problem.unit} while its "
+                "sizes are null; what it adds is expected to be 0 there"
+            )
+
+
+def _idle(effect: type[Effect], facts: Facts) -> Effect:
+    """With its sizes null and each shape at a value that is tried."""
+    null = as_seen(at_null(effect, gears=facts.gears), facts)
+    values = {p.name: getattr(null, p.name) for p in effect.parameters}
+    tried = {p.name: np.asarray(float(p.grid[0])) for p in effect.parameters if p.kind in FIXED and len(p.grid)}
+    return effect(**(values | tried))
+
+
+def chosen_effects(
+    known: Mapping[str, type[Effect]], only: Sequence[str] | None, exclude: Sequence[str] | None
+) -> dict[str, type[Effect]]:
+    """Those of the known effects that are tried. Raises `InputError` for a name that none has, or if none is left."""
+    for name in (*(only or ()), *(exclude or ())):
+        if name not in known:
+            near = difflib.get_close_matches(name, list(known), 1)
+            hint = f"; did you mean {near[0]!r}?" if near else "; `hdev effects` lists them"
+            raise InputError(f"no effect {name!r} in the library{hint}")
+    chosen = {k: c for k, c in known.items() if (only is None or k in only) and k not in (exclude or ())}
+    if not chosen:
+        raise InputError("--only and --exclude leave no candidate")
+    return chosen
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What `diagnose` and `calibrate` start from: the log in its trips, the vehicle, what decides the result."""
+
+    sheet: Sheet
+    problem: Problem
+    split: Split
+    config: dict[str, Any]
+
+    @property
+    def read(self) -> str:
+        """What was read, for the first line of progress: said once nothing more can be refused."""
+        return f"read {len(self.problem.log)} rows of {len(self.problem.log.trip_names)} trips"
+
+
+def opened(
+    verb: str,
+    logs: Paths,
+    vehicle: str | Path,
+    adapter: str | Path | None,
+    target: str | None,
+    train_trips: Sequence[str] | None,
+    test_trips: Sequence[str] | None,
+    effects: str | Path | None,
+    seed: int,
+    known: Mapping[str, type[Effect]],
+    *candidates: str,
+) -> Opening:
+    """Read the logs and the sheet, bring them together and split the trips. Raises `InputError`.
+
+    **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried.
+    """
+    sheet = read_sheet(vehicle, library=known)
+    with progress.busy("reading the logs"):
+        log = read_log(list(logs), adapter)
+        split = split_trips(log, train_trips, test_trips)
+        problem = prepare(split.log, sheet, target)
+    tried(problem, known, effects, *candidates)
+    config = {
+        "verb": verb,
+        "logs": [str(p) for p in logs],
+        "log_sha256": problem.log.fingerprint(),
+        "vehicle": str(vehicle),
+        "vehicle_sha256": digest(Path(vehicle)),
+        "adapter": None if adapter is None else str(adapter),
+        "target": problem.target,
+        "train_trips": split.names(split.train),
+        "test_trips": split.names(split.test),
+        "asked_train": None if train_trips is None else list(train_trips),
+        "asked_test": None if test_trips is None else list(test_trips),
+        "effects_file": None if effects is None else str(effects),
+        "effects_sha256": None if effects is None else digest(Path(effects)),
+        "seed": seed,
+        "x64": bool(jax.config.read("jax_enable_x64")),
+    }
+    return Opening(sheet, problem, split, config)
+
+
+def command_line(verb: str, run: Run) -> str:
+    """The command that makes this run again: the split as the user gave it, and options off their defaults."""
+    c = run.config
+    parts = ["hdev", verb, *c["logs"], "--vehicle", c["vehicle"], "--target", c["target"]]
+    lists = {"train-trips": "asked_train", "test-trips": "asked_test", "only": "only", "exclude": "exclude"}
+    for option, key in lists.items():
+        if c.get(key):
+            parts += [f"--{option}", ",".join(c[key])]
+    single = {"adapter": "adapter", "effects": "effects_file", "fdr": "fdr", "method": "method", "noise": "noise"}
+    usual = {"fdr": 0.05, "method": "map", "noise": "normal"}
+    for option, key in single.items():
+        if c.get(key) is not None and c[key] != usual.get(key):
+            parts += [f"--{option}", str(c[key])]
+    return shlex.join([*parts, "--seed", str(c["seed"]), "--out", str(run.out)])

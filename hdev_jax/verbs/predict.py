@@ -1,0 +1,230 @@
+"""The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips that no fit has seen."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hdev_jax.errors import InputError
+from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, left_out, padded, spread_of, sums_of
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.problem import PER_KWH, UNITS, Problem, Split, prepare
+from hdev_jax.rundir import Run, atomic_file
+from hdev_jax.verbs.opening import Paths, digest, known_effects, tried
+
+__all__ = ["predict", "told_together", "write_predictive"]
+
+BESIDE = "predictive.json"  # what a fitted sheet has beside it
+Noise = Literal["normal", "student_t"]
+TOGETHER = 0.95  # correlation of two coefficients, from which on neither is read by itself
+LIKE = 1.5  # times as long: rows of another log whose noise is still like
+
+
+def write_predictive(
+    run: Run, sheet: Path, problem: Problem, split: Split, fit: Calibration, noise: Noise
+) -> list[str]:
+    """Write beside a fitted sheet what intervals need: the coefficients' covariance and the spread of what is left.
+
+    **Returns:** what a user should know of them.
+    """
+    train = problem.rows(split.train)
+    rows = padded(problem.segments.take(train), problem.measured[train])
+    spread, clusters = left_out(fit, rows, problem.target, problem.weight()[train], noise)
+    known = {
+        "schema": "hdev-predictive/1",
+        "sheet_sha256": digest(sheet),
+        "target": problem.target,
+        "covariance": {"names": [c.name for c in fit.table.free], "matrix": np.asarray(fit.covariance).tolist()},
+        "spread": asdict(spread),
+    }
+    run.path(BESIDE).write_text(json.dumps(known, indent=1, allow_nan=False) + "\n")
+    notes = told_together([c.name for c in fit.table.free], np.asarray(fit.covariance))
+    if clusters.kind == "block":
+        notes.append("one training trip: how trips differ from each other is not in the intervals of hdev predict")
+    return notes
+
+
+def told_together(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[str]:
+    """A sentence for each pair of coefficients that a log knows together far better than one by one."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = covariance / np.outer(sd, sd)
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > TOGETHER, 1)), strict=True)
+    return [
+        f"{names[i]} and {names[k]} are known together far better than one by one (correlation "
+        f"{correlation[i, k]:+.2f}): read neither by itself"
+        for i, k in pairs
+    ]
+
+
+def predict(
+    logs: Paths,
+    vehicle: str | Path,
+    adapter: str | Path | None = None,
+    target: str | None = None,
+    effects: str | Path | None = None,
+    level: float = 0.9,
+    *,
+    out: str | Path,
+) -> str:
+    """One line for each row of the logs: `trip_id, time_s, predicted, lower, upper, level` in the target's unit.
+
+    The interval holds what the coefficients leave open (their covariance from the `predictive.json` beside a fitted
+    sheet, else their sds in the sheet) and the noise of a row: as seen where that fit left trips out, else as in this
+    log where it measures the target. A trip's total has the interval that errors of whole trips ask for, by a Student t
+    of as many degrees of freedom as there were trips; of a single trip, its autocorrelation. **Returns:** the total of
+    each trip with its interval, as text. Raises `InputError`.
+    """
+    import pandas as pd
+    from scipy import stats
+
+    if not 0 < level < 1:
+        raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
+    library = known_effects(effects)
+    log = read_log(list(logs), adapter)
+    sheet = read_sheet(vehicle, library=library)
+    beside = _beside(Path(vehicle))
+    measures = target in log.targets if target else bool(log.targets)
+    name = target or (log.default_target if measures else beside.get("target", "energy_wh"))
+    measures = measures or (name == "traction_force_n" and log.segments.has("motor_torque_nm"))
+    problem, reach = prepare(log, sheet, name, need_measured=measures), float(stats.norm.ppf(0.5 + level / 2))
+    tried(problem, library, effects)
+    predicted = problem.predict(problem.vehicle)
+    rows = padded(problem.segments, problem.measured)
+    jac = jacobian(problem.vehicle, problem.table, rows.segments, problem.target)[: len(log)]
+    known = beside if beside.get("target") == problem.target and not beside.get("stale") else {}
+    x = jac @ _root(problem, known)
+    spread = _spread(problem, predicted, x, known, measures)
+    half = np.linalg.norm(x, axis=1)
+    half = reach * half if spread is None else spread.rows(level, half, predicted)
+    frame = pd.DataFrame(
+        {
+            "trip_id": np.asarray(log.trip_names, dtype=object)[log.segments.trip],
+            "time_s": log.segments.time_s,
+            "predicted": predicted,
+            "lower": predicted - half,
+            "upper": predicted + half,
+            "level": level,
+        }
+    )
+    with atomic_file(out) as temporary:
+        if str(out).endswith(".parquet"):
+            frame.to_parquet(temporary, index=False)
+        else:
+            compression: Any = "gzip" if str(out).endswith(".gz") else None
+            frame.to_csv(temporary, index=False, float_format="%.8g", compression=compression)
+    lines = [_whence(level, spread, bool(known)), *_totals(problem, predicted, x, spread, level)]
+    return "\n".join([*lines, *_warnings(problem, spread, beside, known), f"{len(frame)} rows of {name} -> {out}"])
+
+
+def _whence(level: float, spread: Spread | None, known: bool) -> str:
+    """What the intervals are made of."""
+    what = f"trip totals, {100 * level:g} % intervals"
+    if spread is None:
+        return f"{what} of the coefficients alone: the noise of the rows is not known"
+    whose = "the fit's training trips left out" if known else "this log's own errors"
+    return f"{what} from {whose}, Student t of {spread.total_freedom:.3g} degrees of freedom"
+
+
+def _warnings(problem: Problem, spread: Spread | None, beside: dict[str, Any], known: dict[str, Any]) -> list[str]:
+    """Where the intervals are not of this sheet, this target or rows like these."""
+    out = []
+    if beside and not known and not beside.get("stale"):
+        out.append(f"note: {BESIDE} beside the sheet is of {beside['target']} and is not used")
+    if beside.get("stale"):
+        out.append(f"note: the sheet was changed after {BESIDE} was written, which is not used")
+    row_s = float(np.median(np.asarray(problem.segments.duration_s)))
+    if spread is not None and max(row_s, spread.row_s) > LIKE * min(row_s, spread.row_s):
+        out.append(
+            f"note: rows of this log last {row_s:.3g} s, those that the noise is known of {spread.row_s:.3g} s: "
+            "intervals are not of such rows"
+        )
+    return out
+
+
+def _beside(sheet: Path) -> dict[str, Any]:
+    """What lies beside a fitted sheet; of one that was changed since, no more than that (`stale`).
+
+    Raises `InputError` where the file is there and cannot be used.
+    """
+    path = sheet.parent / BESIDE
+    try:
+        found = json.loads(path.read_text())
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as e:
+        raise InputError(f"{path}: does not read as JSON: {e}; fit the sheet again, or delete the file") from e
+    try:
+        same = found["sheet_sha256"] == digest(sheet)
+        names, matrix = found["covariance"]["names"], np.asarray(found["covariance"]["matrix"], dtype=float)
+        spread = {k: float(v) for k, v in found["spread"].items()}
+        right = (
+            found["target"] in UNITS
+            and matrix.size == len(names) ** 2
+            and np.all(np.isfinite(matrix))
+            and {f.name for f in fields(Spread)} == set(spread)
+            and np.all(np.isfinite(list(spread.values())))
+            and min(spread["scale"], spread["freedom"], spread["total_freedom"], spread["row_s"]) > 0
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise InputError(f"{path}: {type(e).__name__}: {e}; fit the sheet again, or delete the file") from e
+    if not right:
+        raise InputError(
+            f"{path}: covariance or spread is not as hdev writes it; fit the sheet again, or delete the file"
+        )
+    return found if same else {"target": found["target"], "stale": True}
+
+
+def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free free"]:
+    """A root of the coefficients' covariance, in the table's order; by their sds alone where no more is known."""
+    free = problem.table.free
+    names = known.get("covariance", {}).get("names", [])
+    covariance = np.diag([(c.sd or 0.0) ** 2 for c in free]).reshape(len(free), len(free))
+    there = [k for k, c in enumerate(free) if c.name in names]
+    if there:
+        at = [names.index(free[k].name) for k in there]
+        matrix = np.asarray(known["covariance"]["matrix"], dtype=float).reshape(len(names), len(names))
+        covariance[np.ix_(there, there)] = matrix[np.ix_(at, at)]
+    return covariance_root(covariance)
+
+
+def _spread(
+    problem: Problem, predicted: np.ndarray, x: np.ndarray, known: dict[str, Any], measures: bool
+) -> Spread | None:
+    """Of the fit that made the sheet; else of this log itself; None where it measures nothing."""
+    if known:
+        return Spread(**known["spread"])
+    if not measures:
+        return None
+    weight, clusters = problem.weight(), sums_of(problem.segments)
+    open_sd = np.linalg.norm(clusters.sums(weight[:, None] * x), axis=1)
+    row_s = float(np.median(np.asarray(problem.segments.duration_s)))
+    error, open_row = problem.measured - predicted, np.linalg.norm(x, axis=1)
+    return spread_of(error, predicted, weight, clusters, open_sd, open_row, row_s=row_s)
+
+
+def _totals(problem: Problem, predicted: np.ndarray, x: np.ndarray, spread: Spread | None, level: float) -> list[str]:
+    """A line for each trip: its total with the interval, in kWh (energy, work) or the mean of a torque."""
+    from scipy import stats
+
+    weight = problem.weight()
+    unit = "kWh" if problem.target in PER_KWH else problem.unit
+    lines = []
+    for i, trip in enumerate(problem.log.trip_names):
+        rows = problem.rows([i])
+        per = PER_KWH.get(problem.target, float(np.sum(weight[rows])))
+        if not per > 0:
+            lines.append(f"{trip:40s} {'-':>10s} {unit}  stands all the time")
+            continue
+        total = float(np.sum((weight * predicted)[rows])) / per
+        open_sd = float(np.linalg.norm(weight[rows] @ x[rows]))
+        if spread is None:
+            half = float(stats.norm.ppf(0.5 + level / 2)) * open_sd / per
+        else:
+            half = spread.total(level, open_sd, weight[rows], predicted[rows]) / per
+        lines.append(f"{trip:40s} {total:10.4g} {unit}  {total - half:.4g} to {total + half:.4g}")
+    return lines
