@@ -1,6 +1,7 @@
 """`Segments`: the only record. One row is one interval of driving, 100 m of road or 0.22 s of CAN samples."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,6 +33,49 @@ class Segments(eqx.Module):
     speed_start_mps: Column
     speed_end_mps: Column
     channels: dict[str, Column]
+
+    @classmethod
+    def from_arrays(
+        cls,
+        *,
+        duration_s: Any,
+        speed_start_mps: Any,
+        speed_end_mps: Any,
+        distance_m: Any = None,
+        time_s: Any = None,
+        trip: Any = None,
+        vehicle: Any = None,
+        **channels: Any,
+    ) -> "Segments":
+        """Rows from arrays (or numbers) of one length, in SI.
+
+        **Arguments:** `distance_m`, by default the mean of the two speeds times the duration; `time_s`, by default the
+        sum of the durations before each row of its trip; `trip` and `vehicle`, 0-based ids, by default one of each;
+        `channels` as in a log: `grade_rad`, `mass_kg`, … **Raises:** `ValueError` for arrays that do not go together.
+        """
+        ends = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (duration_s, speed_start_mps, speed_end_mps)]
+        every = {k: np.atleast_1d(np.asarray(v, dtype=float)) for k, v in channels.items()}
+        try:
+            (n,) = np.broadcast_shapes(*(x.shape for x in (*ends, *every.values())))
+        except ValueError as e:
+            lengths = {"duration_s": ends[0].shape, "speed_start_mps": ends[1].shape, "speed_end_mps": ends[2].shape}
+            lengths |= {k: v.shape for k, v in every.items()}
+            raise ValueError(f"arrays of one length are expected, found {lengths}") from e
+        duration, start, end = (np.broadcast_to(x, n).copy() for x in ends)
+        if not np.all(duration > 0):
+            raise ValueError("duration_s: every row lasts longer than 0 s; found a row that does not")
+        trip = np.zeros(n, dtype=np.int32) if trip is None else np.asarray(trip, dtype=np.int32)
+        vehicle = np.zeros(n, dtype=np.int32) if vehicle is None else np.asarray(vehicle, dtype=np.int32)
+        if time_s is None:
+            time_s = np.concatenate([np.cumsum(duration[s]) - duration[s] for _, s in trip_slices(trip)])
+        distance = 0.5 * (start + end) * duration if distance_m is None else np.asarray(distance_m, dtype=float)
+        if not len(trip) == len(vehicle) == len(time_s) == len(distance) == n:
+            raise ValueError(f"trip, vehicle, time_s and distance_m have {n} values, one a row")
+        return cls(
+            trip=trip, vehicle=vehicle, time_s=np.asarray(time_s, dtype=float), duration_s=duration,
+            distance_m=distance, speed_start_mps=start, speed_end_mps=end,
+            channels={k: np.broadcast_to(v, n).copy() for k, v in every.items()},
+        )  # fmt: skip
 
     @property
     def speed_mps(self) -> Column:

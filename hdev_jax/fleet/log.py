@@ -177,7 +177,7 @@ def _instruments(drive: Drive, truth: Truth, rng: np.random.Generator) -> None:
 
 
 _CHANNELS = (
-    "mass_kg", "grade_rad", "altitude_m", "ambient_temp_c", "air_density_kgpm3", "wind_speed_mps", "wind_from_rad",
+    "mass_kg", "grade_rad", "altitude_m", "ambient_temp_c", "wind_speed_mps", "wind_from_rad",
     "heading_rad", "curvature_1pm", "wet_road", "gear", "brake_pressure_pa", "soc", "voltage_v", "battery_temp_c",
     "door_open", "standstill_flag", *_NUISANCE,
 )  # fmt: skip

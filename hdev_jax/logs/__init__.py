@@ -3,14 +3,13 @@
 from hdev_jax.logs.adapter import Adapter, Companion, Rule
 from hdev_jax.logs.columns import ColumnInfo
 from hdev_jax.logs.ledger import Entry, Ledger
-from hdev_jax.logs.log import MEASURED, TARGETS, Log
-from hdev_jax.logs.read import read_log
+from hdev_jax.logs.log import MEASURED, Log
+from hdev_jax.logs.read import log_from_frame, read_log
 from hdev_jax.logs.skeleton import write_adapter_skeleton
 from hdev_jax.logs.stretches import by_distance
 
 __all__ = [
     "MEASURED",
-    "TARGETS",
     "Adapter",
     "ColumnInfo",
     "Companion",
@@ -19,6 +18,7 @@ __all__ = [
     "Log",
     "Rule",
     "by_distance",
+    "log_from_frame",
     "read_log",
     "write_adapter_skeleton",
 ]

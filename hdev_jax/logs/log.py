@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +12,12 @@ from hdev_jax.logs.adapter import near
 from hdev_jax.logs.columns import ColumnInfo
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TARGETS
 from hdev_jax.units import J_PER_WH
 
-__all__ = ["MEASURED", "TARGETS", "Log"]
+__all__ = ["MEASURED", "Log"]
 
 MEASURED = ("battery_power_w", "energy_wh")
-TARGETS = ("energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n")
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,26 @@ class Log:
     files: tuple[str, ...] = ()
     part: np.ndarray | None = None
 
+    @classmethod
+    def from_frame(cls, frame: Any, *, name: str = "frame", adapter: Any = None) -> "Log":
+        """A log from a pandas, polars or pyarrow table, or a mapping of names to arrays, by the rules for files.
+
+        **Arguments:** `name` stands for the file in messages, and for the trip where there is no `trip_id`; `adapter`,
+        a TOML file where columns have other names. **Raises:** `InputError`, one line that says what to do.
+        """
+        from hdev_jax.logs.read import log_from_frame  # that module makes logs
+
+        return log_from_frame(frame, name=name, adapter=adapter)
+
     def __len__(self) -> int:
         return len(self.segments)
+
+    def __repr__(self) -> str:
+        measured = ", ".join(self.measured) or "nothing at the battery"
+        return (
+            f"Log({len(self):,} rows, {len(self.trip_names)} trips, {len(self.vehicle_names)} vehicles; "
+            f"measured: {measured}; channels: {', '.join(self.segments.channels) or 'none'})"
+        )
 
     @property
     def trip(self) -> np.ndarray:
@@ -50,10 +69,11 @@ class Log:
     @property
     def targets(self) -> tuple[str, ...]:
         """The targets this log can give, nearest the battery first."""
-        channels = tuple(t for t in TARGETS[2:] if t in self.segments.channels)
-        if "energy_wh" in self.measured:
-            return ("energy_wh", "battery_power_kw", *channels)
-        return (*(("battery_power_kw", "energy_wh") if "battery_power_w" in self.measured else ()), *channels)
+        there = {*self.measured, *self.segments.channels}
+        found = [t for t in TARGETS.values() if there & {*t.columns}]
+        # of the battery's that first which is measured itself
+        found.sort(key=lambda t: (not t.of_battery, t.of_battery and t.columns[0] not in there))
+        return tuple(t.name for t in found)
 
     @property
     def default_target(self) -> str:
@@ -66,16 +86,16 @@ class Log:
     def target(self, name: str) -> np.ndarray:
         """The measured target `[row]` in the unit of its name. Raises `InputError` if the log lacks it."""
         if name not in TARGETS:
-            raise InputError(f"unknown target '{name}'{near(name, TARGETS)} accepted: {', '.join(TARGETS)}")
+            raise InputError(f"unknown target '{name}'{near(name, tuple(TARGETS))} accepted: {', '.join(TARGETS)}")
         if name not in self.targets:
             has = f"it has {', '.join(self.targets)}" if self.targets else "it measures none"
             raise InputError(f"{self._name()}: target {name} is not in this log ({has}){self._near()}")
         hours = self.segments.duration_s / 3600.0
-        if name == "energy_wh":
-            return np.asarray(self.measured["energy_wh"] if name in self.measured else self._watts() * hours)
-        if name == "battery_power_kw":
+        if not TARGETS[name].of_battery:
+            return np.asarray(self.segments.channels[name])
+        if TARGETS[name].weight == "duration":
             return np.asarray(self._watts() / 1000.0)
-        return np.asarray(self.segments.channels[name])
+        return np.asarray(self.measured[name] if name in self.measured else self._watts() * hours)
 
     def _watts(self) -> np.ndarray:
         if "battery_power_w" in self.measured:

@@ -1,6 +1,6 @@
 """`read_log`: files, adapter and checks put together."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,14 @@ from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import MEASURED, Log
-from hdev_jax.logs.readers import find_files, read_raw
+from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
 from hdev_jax.logs.rows import MAX_GRADE_RAD, Rows, check_rows, concatenate
 from hdev_jax.logs.trips import split_trips
 from hdev_jax.segments import Segments
 from hdev_jax.units import accepted
 
-__all__ = ["read_log"]
+__all__ = ["log_from_frame", "read_log"]
 
 _ROW = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
 
@@ -41,9 +41,39 @@ def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Ada
     ledger = Ledger()
     for name in companions:
         ledger = ledger.add("noted", "companion, joined to its log and no log itself", file=name)
-    pieces = []
-    for path in files:
-        pieces += [translate(raw, rules) for raw in read_raw(path, rules)]
+    raws = [raw for path in files for raw in read_raw(path, rules)]
+    return _assembled(raws, rules, ledger, tuple(p.name for p in files))
+
+
+def log_from_frame(frame: Any, *, name: str = "frame", adapter: str | Path | Adapter | None = None) -> Log:
+    """A log from a table in memory, by the same rules as from a file.
+
+    **Arguments:** `frame`, a pandas, polars or pyarrow table (whatever narwhals reads) or a mapping of names to arrays,
+    a row for each interval or sample, the unit part of each column's name; `name` stands for the file in messages, and
+    for the trip where there is no column `trip_id`; `adapter` as for `read_log`.
+
+    **Raises:** `InputError` for what a file would be refused for, `TypeError` for what is no table.
+    """
+    import narwhals as nw
+    import pandas as pd
+
+    rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
+    if isinstance(frame, Mapping):
+        lengths = {k: len(np.atleast_1d(np.asarray(v))) for k, v in frame.items()}
+        if len(set(lengths.values())) > 1:
+            raise InputError(f"{name}: columns of different lengths: {lengths}; one value a row is expected")
+        table = pd.DataFrame({str(k): np.atleast_1d(np.asarray(v)) for k, v in frame.items()})
+    else:
+        table = nw.from_native(frame, eager_only=True).to_pandas()
+    table = table.reset_index(drop=True)
+    if table.empty:
+        raise InputError(f"{name}: no rows")
+    return _assembled([Raw(name, table, name)], rules, Ledger(), (name,))
+
+
+def _assembled(raws: Sequence[Raw], rules: Adapter, ledger: Ledger, files: tuple[str, ...]) -> Log:
+    """One log from raw tables: columns in SI, rows checked, trips by name."""
+    pieces = [translate(raw, rules) for raw in raws]
     sampled = _require(pieces)
     rows = concatenate(pieces, ledger)
     measured = [c for c in MEASURED if c in rows.data]
@@ -54,7 +84,7 @@ def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Ada
             rows = replace(rows, data=left, ledger=rows.ledger.add("noted", "no value in any row, absent", column=c))
     rows = split_trips(check_rows(rows, sampled, measured), rules.edge_trim_s, sampled)
     columns = _columns(pieces)
-    return _log(rows, sampled, measured, columns, tuple(p.name for p in files))
+    return _log(rows, sampled, measured, columns, files)
 
 
 def _require(pieces: list[Piece]) -> bool:

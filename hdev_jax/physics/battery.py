@@ -5,14 +5,17 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.parameter import Choice, Shape, Size, Switch
 from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = [
     "BatteryResistance",
+    "EfficiencyScale",
     "FrictionBlending",
     "ModeChange",
     "RegenCutoff",
+    "RegenEfficiency",
     "RegenLimit",
     "StepChange",
     "TractionLimit",
@@ -34,18 +37,20 @@ class BatteryResistance(Effect):
     """Loss in the battery's resistance: R·P²/V²."""
 
     id: ClassVar = "battery_resistance"
+    label: ClassVar = "battery resistance"
     stage: ClassVar = "battery"
     equation: ClassVar = "R·P²/V²"
     source: ClassVar = "Plett, Battery Management Systems, vol. 1 (Rint model)"
-    needs: ClassVar = ("voltage_v",)
-    parameters: ClassVar = (Parameter("resistance_ohm", "Ω", 0.0, 0.1, 0.0, 2.0, least=1e-4),)
+    needs: ClassVar = ("voltage_v|nominal_voltage_v",)  # the latter a sheet's
+    # packs of vehicles have 0.03 to 0.3 Ω when warm, about three times that at −20 °C
+    parameters: ClassVar = (Size("resistance_ohm", "Ω", 0.0, 0.1, 0.0, 1.0, least=1e-4),)
     mistaken_for: ClassVar = ("copper_loss",)
     separated_by: ClassVar = "pulses of current at several states of charge"
     order: ClassVar = 50
     resistance_ohm: Any
 
     def power(self, row, car, point):
-        volts = jnp.maximum(jnp.abs(jnp.asarray(row.channels["voltage_v"])), 1.0)
+        volts = jnp.maximum(jnp.abs(jnp.asarray(car.voltage(row))), 1.0)
         return self.resistance_ohm * (point.power_w / volts) ** 2
 
 
@@ -53,16 +58,16 @@ class VoltageDependence(Effect):
     """Consumption that follows the voltage: P·k·(V − V₀)."""
 
     id: ClassVar = "voltage_dependence"
+    label: ClassVar = "dependence on the battery's voltage"
     stage: ClassVar = "battery"
     equation: ClassVar = "P·k·(V − V₀)"
     source: ClassVar = "inverter efficiency against DC voltage"
     needs: ClassVar = ("voltage_v",)
     parameters: ClassVar = (
-        Parameter("per_v", "1/V", 0.0, 5e-4, -0.02, 0.02, least=1e-6),
+        # an inverter's efficiency moves by a few percent over 100 V
+        Size("per_v", "1/V", 0.0, 5e-4, -5e-3, 5e-3, least=1e-6, label="per volt"),
         # where the sheet's efficiencies hold; far off it is a gain of the power, which they may not be able to absorb
-        Parameter(
-            "at_v", "V", 650.0, 50.0, 200.0, 1000.0, kind="shape", grid=(350.0, 550.0, 600.0, 650.0, 700.0, 800.0)
-        ),
+        Shape("at_v", "V", 650.0, 50.0, 200.0, 1000.0, grid=(350.0, 550.0, 600.0, 650.0, 700.0, 800.0)),
     )
     mistaken_for: ClassVar = ("battery_resistance",)
     separated_by: ClassVar = "long trips from full to empty"
@@ -74,17 +79,61 @@ class VoltageDependence(Effect):
         return point.power_w * self.per_v * (row.channels["voltage_v"] - self.at_v)
 
 
+class EfficiencyScale(Effect):
+    """The declared efficiency is off by as much in both directions: s·|P| lost, P what comes from the drive.
+
+    With an efficiency that is estimated it is that efficiency under another name; with one that is known, or a map, it
+    is `gear_efficiency` where the vehicle has one gear.
+    """
+
+    id: ClassVar = "efficiency_scale"
+    label: ClassVar = "scale of the efficiency"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "s·|P|"
+    source: ClassVar = "paper 1, eq. 5 (η); paper 2, eq. 6, 10 and 11"
+    parameters: ClassVar = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    mistaken_for: ClassVar = ("gear_efficiency", "copper_loss", "inverter_loss")
+    separated_by: ClassVar = "driving and braking at the same power, at several torques"
+    order: ClassVar = -10  # before the loads: at the entry to the battery
+    scale: Any
+
+    def power(self, row, car, point):
+        return self.scale * jnp.abs(point.power_w)
+
+
+class RegenEfficiency(Effect):
+    """Of the braking energy another share is recovered than the sheet says: s·max(−P, 0) is lost.
+
+    With a regenerating efficiency that is estimated it is that one under another name.
+    """
+
+    id: ClassVar = "regen_efficiency"
+    label: ClassVar = "efficiency of regeneration"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "s·max(−P, 0)"
+    source: ClassVar = "paper 2, eq. 7-9 (η_rg)"
+    parameters: ClassVar = (Size("share", "1", 0.0, 0.1, -0.3, 1.0, least=0.005),)
+    mistaken_for: ClassVar = ("friction_blending", "mass_scale", "power_gain", "mode_change")
+    separated_by: ClassVar = "coasting and braking on the flat, and the balance of charge"
+    order: ClassVar = 25
+    share: Any
+
+    def power(self, row, car, point):
+        return self.share * jnp.maximum(-point.power_w, 0.0)
+
+
 class FrictionBlending(Effect):
     """Braking power that the friction brakes take: s·|P| less recovered while the brake has pressure."""
 
     id: ClassVar = "friction_blending"
+    label: ClassVar = "blending of the friction brake"
     stage: ClassVar = "battery"
     equation: ClassVar = "−s·min(P, 0)·[p_brake > p₀]"
     source: ClassVar = "paper 2, eq. 7-9 (η_rg)"
     needs: ClassVar = ("brake_pressure_pa",)
     parameters: ClassVar = (
-        Parameter("share", "1", 0.0, 0.3, 0.0, 1.0, least=0.01),
-        Parameter("above_pa", "Pa", 2e4, 2e4, 0.0, 1e6, kind="choice", grid=(0.0, 2e4, 1e5)),
+        Size("share", "1", 0.0, 0.3, 0.0, 1.0, least=0.01),
+        Choice("above_pa", "Pa", 2e4, 2e4, 0.0, 1e6, grid=(0.0, 2e4, 1e5)),
     )
     mistaken_for: ClassVar = ("regen_cutoff", "regen_limit")
     separated_by: ClassVar = "braking with and without pressure at one speed"
@@ -98,36 +147,40 @@ class FrictionBlending(Effect):
 
 
 class RegenLimit(Effect):
-    """The battery takes no more than P_lim: + max(−P − P_lim, 0)."""
+    """The battery takes no more than P_lim, or only a part of what exceeds it: + s·max(−P − P_lim, 0).
+
+    s = 1 is a hard limit; brakes that blend act in part.
+    """
 
     id: ClassVar = "regen_limit"
+    label: ClassVar = "limit of regeneration"
     stage: ClassVar = "battery"
-    equation: ClassVar = "max(−P − P_lim, 0)"
+    equation: ClassVar = "s·max(−P − P_lim, 0)"
     source: ClassVar = "charge limit of the battery management"
     parameters: ClassVar = (
-        Parameter("power_w", "W", OFF_W, 5e3, 500.0, OFF_W, kind="limit",
-                  grid=_ladder(1e4, 3.5e5, 27)),
-    )  # fmt: skip
-    mistaken_for: ClassVar = ("friction_blending",)
+        Switch("power_w", "W", OFF_W, 5e3, 500.0, OFF_W, grid=_ladder(1e4, 3.5e5, 27)),
+        Choice("share", "1", 1.0, 0.3, 0.0, 1.0, grid=(1.0, 0.5)),
+    )
+    mistaken_for: ClassVar = ("friction_blending", "regen_efficiency")
     separated_by: ClassVar = "hard braking from speed, battery full"
     order: ClassVar = LIMITS
     power_w: Any
+    share: Any = 1.0
 
     def power(self, row, car, point):
-        return jnp.maximum(-point.power_w - self.power_w, 0.0)
+        return self.share * jnp.maximum(-point.power_w - self.power_w, 0.0)
 
 
 class RegenCutoff(Effect):
     """Nothing is recovered below v₀: −min(P, 0)·[v < v₀]."""
 
     id: ClassVar = "regen_cutoff"
+    label: ClassVar = "cut-off of regeneration at low speed"
     stage: ClassVar = "battery"
     equation: ClassVar = "−min(P, 0)·[v < v₀]"
     source: ClassVar = "blending out of regeneration at walking pace"
     parameters: ClassVar = (
-        Parameter(
-            "speed_mps", "m/s", 0.0, 1.0, 0.3, 12.0, kind="limit", grid=(1.0, 1.7, 2.5, 3.5, 4.5, 5.5, 6.5, 8.0, 10.0)
-        ),
+        Switch("speed_mps", "m/s", 0.0, 1.0, 0.3, 12.0, grid=(1.0, 1.7, 2.5, 3.5, 4.5, 5.5, 6.5, 8.0, 10.0)),
     )
     mistaken_for: ClassVar = ("friction_blending",)
     separated_by: ClassVar = "slow braking to standstill"
@@ -144,13 +197,12 @@ class TractionLimit(Effect):
     """The drive gives no more than P_lim: − max(P − P_lim, 0)."""
 
     id: ClassVar = "traction_limit"
+    label: ClassVar = "limit of traction power"
     stage: ClassVar = "battery"
     equation: ClassVar = "−max(P − P_lim, 0)"
     source: ClassVar = "derating of motor or battery"
     entries: ClassVar = ("road",)
-    parameters: ClassVar = (
-        Parameter("power_w", "W", OFF_W, 1e4, 5e3, OFF_W, kind="limit", grid=_ladder(3e4, 5e5, 12)),
-    )
+    parameters: ClassVar = (Switch("power_w", "W", OFF_W, 1e4, 5e3, OFF_W, grid=_ladder(3e4, 5e5, 12)),)
     mistaken_for: ClassVar = ("copper_loss",)
     separated_by: ClassVar = "full throttle uphill"
     order: ClassVar = LIMITS
@@ -164,14 +216,15 @@ class StepChange(Effect):
     """A change that stays, from trip k on: a load, a rolling resistance, or a loss in proportion to power."""
 
     id: ClassVar = "step_change"
+    label: ClassVar = "step change of a coefficient"
     stage: ClassVar = "battery"
     equation: ClassVar = "[trip ≥ k]·(ΔP + Δc·m·g·v + Δg·|P|)"
     source: ClassVar = "ageing, a service event, a fault"
     parameters: ClassVar = (
-        Parameter("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
-        Parameter("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
-        Parameter("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
-        Parameter("at_trip", "1", 0.0, 1.0, kind="choice", grid=()),  # every trip with three on either side
+        Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
+        Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
+        Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
+        Choice("at_trip", "1", 0.0, 1.0, grid=()),  # every trip with three on either side
     )
     variants: ClassVar = (("power_w",), ("c_rr",), ("loss",))
     mistaken_for: ClassVar = ("rolling_temperature", "mass_scale")
@@ -197,16 +250,17 @@ class ModeChange(Effect):
     """
 
     id: ClassVar = "mode_change"
+    label: ClassVar = "change of operating mode"
     stage: ClassVar = "battery"
     equation: ClassVar = "z·(ΔP + Δc·m·g·v + Δg·|P| + Δr·max(−P, 0)), z of each trip 0 or 1"
     source: ClassVar = "limp mode, weak regeneration, a second driver's setting"
     parameters: ClassVar = (
-        Parameter("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
-        Parameter("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
-        Parameter("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
-        Parameter("regeneration", "1", 0.0, 0.1, -0.9, 0.9, least=0.005),
-        Parameter("share", "1", 0.5, 0.2, 0.0, 1.0, kind="choice"),
-        Parameter("in_mode", "1", float("nan"), 1.0, 0.0, 1.0, kind="choice"),
+        Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
+        Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
+        Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
+        Size("regeneration", "1", 0.0, 0.1, -0.9, 0.9, least=0.005),
+        Choice("share", "1", 0.5, 0.2, 0.0, 1.0),
+        Choice("in_mode", "1", float("nan"), 1.0, 0.0, 1.0),
     )
     # a load that is there in some trips only could be anything: it may be declared, but is not looked for
     variants: ClassVar = (("regeneration",), ("loss",), ("c_rr",))

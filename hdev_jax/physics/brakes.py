@@ -5,7 +5,8 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from hdev_jax.physics.across import TIME_SINCE_BRAKING, time_since_braking
-from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.parameter import Shape, Size
 
 __all__ = ["BrakeDrag", "FrictionBrake", "StandstillHold"]
 
@@ -16,14 +17,16 @@ class BrakeDrag(Effect):
     """Pads that do not let go: F·exp(−t/τ), t since the brake was released."""
 
     id: ClassVar = "brake_drag"
+    label: ClassVar = "brake drag"
     stage: ClassVar = "road"  # at the wheel: the driveline carries it
     equation: ClassVar = "F·exp(−t_release/τ)"
     source: ClassVar = "Breuer and Bill, Bremsenhandbuch (residual torque)"
     needs: ClassVar = ("brake_pressure_pa",)
     entries: ClassVar = ROAD
     parameters: ClassVar = (
-        Parameter("force_n", "N", 0.0, 300.0, 0.0, 2e4, least=5.0),
-        Parameter("tau_s", "s", 30.0, 20.0, 2.0, 600.0, kind="shape", grid=(10.0, 30.0, 90.0)),
+        # a residual torque of 1 to 5 Nm at each brake of a car, ten times that of a truck; 10 kN brake 10 t
+        Size("force_n", "N", 0.0, 300.0, 0.0, 1e4, least=5.0),
+        Shape("tau_s", "s", 30.0, 20.0, 2.0, 600.0, grid=(10.0, 30.0, 90.0), label="time constant"),
     )
     mistaken_for: ClassVar = ("tyre_warmup",)
     separated_by: ClassVar = "cruising just after braking and long after"
@@ -49,12 +52,24 @@ class FrictionBrake(Effect):
     """
 
     id: ClassVar = "friction_brake"
+    label: ClassVar = "friction brake"
     stage: ClassVar = "road"
     equation: ClassVar = "+k·brake"
     source: ClassVar = "paper 2, eq. 7-9 (share of braking that is not regenerated)"
     needs: ClassVar = ("brake_pressure_pa|brake_pedal_pct",)
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("n_per_unit", "N per unit of the brake signal", 0.0, 1.0, 0.0, 1e4, least=1e-6),)
+    parameters: ClassVar = (
+        Size(
+            "n_per_unit",
+            "N per unit of the brake signal",
+            0.0,
+            1.0,
+            0.0,
+            1e4,
+            least=1e-6,
+            label="force per unit of the signal",
+        ),
+    )
     mistaken_for: ClassVar = ("mass_scale", "friction_blending")
     separated_by: ClassVar = "braking hard and lightly"
     n_per_unit: Any
@@ -71,11 +86,12 @@ class StandstillHold(Effect):
     """
 
     id: ClassVar = "standstill_hold"
+    label: ClassVar = "brakes that hold at rest"
     stage: ClassVar = "road"
     equation: ClassVar = "−s·ΣF·[v < 0.1 m/s]"
     source: ClassVar = "statics: a force that does not move is carried by the brakes"
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("share", "1", 0.0, 0.5, 0.0, 1.2, least=0.05),)
+    parameters: ClassVar = (Size("share", "1", 0.0, 0.5, 0.0, 1.2, least=0.05),)
     mistaken_for: ClassVar = ("rolling_speed",)
     separated_by: ClassVar = "standing on a slope, with and without the brake"
     order: ClassVar = 90

@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from hdev_jax.physics.parameter import as_array
 from hdev_jax.segments import Segments
 
 __all__ = ["GEAR_PROBABILITY", "WHEEL_RADIUS_M", "Driveline", "EfficiencyMap"]
@@ -31,10 +32,10 @@ class EfficiencyMap(eqx.Module):
     A gear between two of the map takes the nearest.
     """
 
-    gears: Float[Array, " gear"]
-    speeds_radps: Float[Array, " speed"]
-    torques_nm: Float[Array, " torque"]
-    values: Float[Array, "gear speed torque"]
+    gears: Float[Array, " gear"] = eqx.field(converter=as_array)
+    speeds_radps: Float[Array, " speed"] = eqx.field(converter=as_array)
+    torques_nm: Float[Array, " torque"] = eqx.field(converter=as_array)
+    values: Float[Array, "gear speed torque"] = eqx.field(converter=as_array)
 
     def __check_init__(self) -> None:
         axes = (self.gears, self.speeds_radps, self.torques_nm)
@@ -115,17 +116,20 @@ class Driveline(eqx.Module):
     **Arguments:** `efficiency`, a number in (0, 1] or an `EfficiencyMap`; `gear_ratios` by gear from the first,
     `final_drive` and `wheel_radius_m` where known: without them torques and speeds are those of a wheel of
     `WHEEL_RADIUS_M`. `covers_machine`: the efficiency reaches from the wheel to the battery, as η in paper 1.
+    `regenerating_efficiency`: of braking, where that is another; the output is divided by the one and multiplied by the
+    other.
 
     Rows that have `GEAR_PROBABILITY` are in no one gear: their ratio is Σ p·i and their efficiency Σ p·η, each η at the
     motor speed and torque of its own gear (paper 1, section 3.1, with the classifier's probabilities in place of its
     choice). With a probability of 1 that is the gear itself, to the last bit.
     """
 
-    efficiency: Any
-    gear_ratios: Float[Array, " gear"] | None = None
-    final_drive: Any = 1.0
-    wheel_radius_m: Any = WHEEL_RADIUS_M
+    efficiency: Any = eqx.field(converter=as_array, default=1.0)
+    gear_ratios: Float[Array, " gear"] | None = eqx.field(converter=as_array, default=None)
+    final_drive: Any = eqx.field(converter=as_array, default=1.0)
+    wheel_radius_m: Any = eqx.field(converter=as_array, default=WHEEL_RADIUS_M)
     covers_machine: bool = eqx.field(static=True, default=True)
+    regenerating_efficiency: Any = eqx.field(converter=as_array, default=None)
 
     def ratio_radpm(self, row: Segments) -> Any:
         """Motor speed over vehicle speed [rad/m], by the row's gear."""

@@ -1,55 +1,33 @@
 """What an effect is: one small class at one stage of the vehicle, its equation for one row, and its parameters."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field
+from typing import Any, ClassVar, Literal, Protocol, get_origin, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from hdev_jax.physics.parameter import Parameter, as_array
 from hdev_jax.segments import Segments
 
-if TYPE_CHECKING:
-    from hdev_jax.physics.vehicle import Vehicle
-
-__all__ = ["KINDS", "STAGES", "Effect", "Grouped", "Parameter", "Point", "Real", "Stage", "resolve"]
+__all__ = [
+    "STAGES",
+    "Car",
+    "Effect",
+    "Grouped",
+    "Point",
+    "Real",
+    "Stage",
+    "resolve",
+]
 
 Stage = Literal["sensors", "road", "driveline", "machine", "battery"]
 STAGES: tuple[Stage, ...] = ("sensors", "road", "driveline", "machine", "battery")
-Kind = Literal["size", "shape", "limit", "choice"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 Real = Float[Array, ""]
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number of an effect: its name, unit, null value and what a plausible one looks like.
-
-    `kind` says how it acts at the null: a `size` has a derivative there (the column is one `jvp`); a `shape` (a time
-    constant, a threshold) matters only once a size is not null and is tried on `grid`; a `limit` (a switch) has zero
-    derivative at the null, so its column is a difference for each value of `grid`; a `choice` is a shape that is only
-    ever one of its grid.
-
-    `lower` and `upper` bound the plausible range (a drag cannot help); `scale` is a typical size, for conditioning and
-    for the weak prior of a found effect. `least` is the smallest size worth naming.
-    """
-
-    name: str
-    unit: str
-    null: float
-    scale: float
-    lower: float = -float("inf")
-    upper: float = float("inf")
-    kind: Kind = "size"
-    grid: tuple[float, ...] = ()
-    least: float = 0.0
-    by: Literal["", "gear", "road_surface"] = ""
-    whole: bool = False  # sought in the commonest group too (nothing declared stands for it), and without groups in all
-    smooth: bool = False  # a limit whose difference grows about in proportion: a fraction of a grid step is as good
-    of: str = ""  # a shape's: the only size that it acts on
-    in_rows: bool = False  # `grid` and `scale` count rows of the log; multiplied by its median duration
 
 
 class Point(eqx.Module):
@@ -64,7 +42,7 @@ class Point(eqx.Module):
 class Grouped(eqx.Module):
     """A coefficient with one value for each vehicle, trip, gear or kind of surface, looked up by the row's id."""
 
-    values: Float[Array, "*row group"]
+    values: Float[Array, "*row group"] = eqx.field(converter=as_array)
     by: str = eqx.field(static=True)
 
     def at(self, row: Segments) -> Real:
@@ -79,6 +57,66 @@ def resolve(tree: Any, row: Segments) -> Any:
     return jax.tree.map(lambda x: x.at(row) if is_grouped(x) else x, tree, is_leaf=is_grouped)
 
 
+def _numbers(x: Any) -> np.ndarray:
+    """One number, or one of each group."""
+    return np.atleast_1d(np.asarray(x.values if isinstance(x, Grouped) else x, dtype=float))
+
+
+def _is_class_variable(annotation: Any) -> bool:
+    """Also where annotations are kept as text."""
+    if isinstance(annotation, str):
+        return annotation.removeprefix("typing.").startswith("ClassVar")
+    return annotation is ClassVar or get_origin(annotation) is ClassVar
+
+
+@runtime_checkable
+class Ratios(Protocol):
+    """What effects read of the driveline."""
+
+    def ratio_radpm(self, row: Segments) -> Any:
+        """Motor speed over vehicle speed [rad/m]."""
+        ...
+
+
+@runtime_checkable
+class Car(Protocol):
+    """What effects read of the vehicle that they are in, its groups resolved for the row."""
+
+    @property
+    def effects(self) -> "tuple[Effect, ...]":
+        """All of them, in the order of the chain."""
+        ...
+
+    @property
+    def driveline(self) -> Ratios:
+        """For the ratio between motor and road."""
+        ...
+
+    def has(self, effect_id: str) -> bool:
+        """Whether the vehicle has this effect."""
+        ...
+
+    def effect(self, effect_id: str) -> Any:
+        """The effect of that id."""
+        ...
+
+    def mass(self, row: Segments) -> Any:
+        """Total mass [kg]."""
+        ...
+
+    def rolling(self) -> Any:
+        """c_rr of the declared rolling resistance."""
+        ...
+
+    def drag(self, row: Segments) -> Any:
+        """½ρ·C_d·A of the declared drag [N/(m/s)²]."""
+        ...
+
+    def voltage(self, row: Segments) -> Any:
+        """Voltage of the battery [V]."""
+        ...
+
+
 class Effect(eqx.Module):
     """One named cause of consumption. A subclass overrides the hook of its stage and no other.
 
@@ -87,23 +125,65 @@ class Effect(eqx.Module):
     (channels of its own), `across` (corrected measurements) or `observe` (the predicted column), all by trip and
     differentiable in their parameters.
 
-    Class attributes: `id` as in the contract, `stage`, `equation`, `source`; `needs`, the channels it reads, each an
-    alternative of names joined by `|`; `mistaken_for` and `separated_by`, ids and the drive that tells them apart.
+    Class attributes: `id` as in the contract, `label` as a report calls it, `stage`, `equation`, `source`; `needs`, the
+    channels it reads, each an alternative of names joined by `|`; `mistaken_for` and `separated_by`, ids and the drive
+    that tells them apart; `goes_with`, what its force is in proportion to. Nothing of an effect is kept elsewhere.
     """
 
     id: ClassVar[str]
+    label: ClassVar[str] = ""
     stage: ClassVar[Stage]
     equation: ClassVar[str]
     source: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]] = ()
     lacks: ClassVar[tuple[str, ...]] = ()  # channels whose presence makes the effect pointless
+    instead: ClassVar[str] = ""  # why it does, in a phrase; default: the log has the channel itself
     entries: ClassVar[tuple[str, ...]] = ("road", "wheel", "shaft")  # where the chain may be entered for it to act
     parameters: ClassVar[tuple[Parameter, ...]] = ()
+    ordered: ClassVar[tuple[tuple[str, str], ...]] = ()  # pairs of parameters of which the first is the lower
     variants: ClassVar[tuple[tuple[str, ...], ...]] = ()  # sets of sizes tried together; default: all of them
     mistaken_for: ClassVar[tuple[str, ...]] = ()
     separated_by: ClassVar[str] = ""
     order: ClassVar[int] = 0  # limits come after what they limit
+    of_battery: ClassVar[bool] = False  # says nothing of a force or a torque
+    goes_with: ClassVar[Literal["", "weight", "air"]] = ""
+    declared: ClassVar[Mapping[str, str]] = {}  # fields of a declared term with their keys in a sheet
     searched: ClassVar[str] = ""  # where it is looked for, if its columns are not known before it is found
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Every field that is declared without saying more holds a number (see `as_array`)."""
+        super().__init_subclass__(**options)
+        for name, kind in inspect.get_annotations(cls).items():
+            default = cls.__dict__.get(name, MISSING)
+            if not _is_class_variable(kind) and not isinstance(default, Field):
+                given: dict[str, Any] = {} if default is MISSING else {"default": default}
+                setattr(cls, name, eqx.field(converter=as_array, **given))
+
+    @classmethod
+    def reads(cls) -> frozenset[str]:
+        """Every channel that it may read, for itself or for the groups of its sizes."""
+        return frozenset(n for need in cls.needs for n in need.split("|")) | {p.by for p in cls.parameters if p.by}
+
+    @classmethod
+    def implausible(cls, values: Mapping[str, Any]) -> str:
+        """Why these values make no sense, in one phrase; empty where they do.
+
+        **Arguments:** numbers by name, also one for each group (`Grouped`, arrays); what is left out, `None` or NaN is
+        not judged. Of a switch or a size the null is plausible: the effect is not there.
+
+        **Raises:** `KeyError` for a name that is none of its parameters.
+        """
+        by_name = {p.name: p for p in cls.parameters}
+        given = {k: _numbers(v) for k, v in values.items() if v is not None}
+        for name, found in given.items():
+            p = by_name[name]
+            out = found[((found < p.lower) | (found > p.upper)) & ~(p.has_column & (found == p.null))]
+            if len(out):
+                return f"{name} is {out[0]:.4g} {p.unit}, outside of {p.lower:g} to {p.upper:g}"
+        for low, high in cls.ordered:
+            if low in given and high in given and np.any(given[low] >= given[high]):
+                return f"{low} is {given[low].max():.4g} {by_name[low].unit}, not below {high}, {given[high].min():.4g}"
+        return ""
 
     def derive(self, segments: Segments) -> Segments:
         """The same measurements with the channels that this effect computes by trip (distance since the start, …)."""
@@ -113,19 +193,26 @@ class Effect(eqx.Module):
         """Measurements as this effect says they should have been, by trip."""
         return segments
 
-    def sense(self, row: Segments, car: "Vehicle") -> Segments:
+    def sense(self, row: Segments, car: Car) -> Segments:
         """One row's measurements, corrected."""
         return row
 
-    def force(self, row: Segments, car: "Vehicle") -> Real | float:
+    def force(self, row: Segments, car: Car) -> Real | float:
         """Force that the road asks for besides [N]."""
         return 0.0
 
-    def drive(self, row: Segments, car: "Vehicle", point: Point) -> Real | float:
+    def split(self, row: Segments, car: Car) -> tuple[Real | float, Real | float]:
+        """Of its force the parts that go with the weight and with the air [N]."""
+        if not self.goes_with:
+            return 0.0, 0.0
+        force = self.force(row, car)
+        return (force, 0.0) if self.goes_with == "weight" else (0.0, force)
+
+    def drive(self, row: Segments, car: Car, point: Point) -> Real | float:
         """Loss in the driveline as a force at the wheel [N]."""
         return 0.0
 
-    def power(self, row: Segments, car: "Vehicle", point: Point) -> Real | float:
+    def power(self, row: Segments, car: Car, point: Point) -> Real | float:
         """Power besides, at the machine or the battery [W]."""
         return 0.0
 

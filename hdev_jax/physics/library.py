@@ -7,7 +7,8 @@ import numpy as np
 
 from hdev_jax.physics import battery, brakes, loads, losses, road, sensors, tyres
 from hdev_jax.physics.across import with_bounds
-from hdev_jax.physics.effect import STAGES, Effect
+from hdev_jax.physics.effect import STAGES, Effect, Grouped
+from hdev_jax.physics.parameter import GROUPS
 from hdev_jax.segments import Segments
 
 __all__ = [
@@ -46,7 +47,7 @@ def library(extra: Iterable[type[Effect]] = ()) -> dict[str, type[Effect]]:
     return found
 
 
-def most_group(segments: Segments, channels: tuple[str, ...] = ("gear", "road_surface")) -> int:
+def most_group(segments: Segments, channels: tuple[str, ...] = GROUPS) -> int:
     """The highest id in the channels that coefficients may be grouped by (gears, kinds of surface); at least 1."""
     seen = [np.asarray(segments.channels[k], dtype=float) for k in channels if segments.has(k)]
     finite = [x[np.isfinite(x)] for x in seen]
@@ -61,8 +62,6 @@ def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
     values = {}
     for p in effect.parameters:
         if p.by:
-            from hdev_jax.physics.effect import Grouped
-
             values[p.name] = Grouped(jnp.full(gears + 1, p.null), p.by)
         else:
             values[p.name] = np.asarray(p.null, dtype=float)
@@ -79,14 +78,17 @@ def derived(segments: Segments) -> Segments:
     return segments
 
 
-def unavailable(effect: type[Effect], segments: Segments, entry: str) -> str | None:
-    """Why this log cannot show the effect, in one phrase; None where it can."""
+def unavailable(effect: type[Effect], segments: Segments, entry: str, stands_in: Iterable[str] = ()) -> str | None:
+    """Why this log cannot show the effect, in one phrase; None where it can.
+
+    `stands_in`: what the vehicle has in the place of a channel (`Vehicle.stands_in`).
+    """
     if entry not in effect.entries:
         where = {"road": "road", "wheel": "measured traction force", "shaft": "measured motor torque"}[entry]
-        return f"acts before the {where} where the chain is entered"
+        return f"cannot act where the chain is entered at the {where}"
     for need in effect.needs:
-        if not any(segments.has(n) for n in need.split("|")):
+        if not any(segments.has(n) or n in stands_in for n in need.split("|")):
             return f"needs a channel that the log lacks: {need.replace('|', ' or ')}"
     if present := [n for n in effect.lacks if segments.has(n)]:
-        return f"the log has {present[0]} itself"
+        return effect.instead or f"the log has {present[0]} itself"
     return None

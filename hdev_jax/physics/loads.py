@@ -5,7 +5,8 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.parameter import Choice, Shape, Size
 
 __all__ = [
     "Auxiliary",
@@ -26,9 +27,11 @@ class Auxiliary(Effect):
     """The declared auxiliary load of the sheet, `[battery] auxiliary_w`."""
 
     id: ClassVar = "auxiliary"
+    label: ClassVar = "declared auxiliary load"
     stage: ClassVar = "battery"
     equation: ClassVar = "P_aux"
     source: ClassVar = "paper 1, section 3.2 (loads)"
+    declared: ClassVar = {"auxiliary_w": "battery.auxiliary_w"}
     auxiliary_w: Any
 
     def power(self, row, car, point):
@@ -39,10 +42,12 @@ class AuxiliaryPower(Effect):
     """A constant load besides the declared one."""
 
     id: ClassVar = "auxiliary_power"
+    label: ClassVar = "constant auxiliary load"
     stage: ClassVar = "battery"
     equation: ClassVar = "P₀"
     source: ClassVar = "paper 2, section III-A (loads left out there)"
-    parameters: ClassVar = (Parameter("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=5.0),)
+    # electric heaters of articulated buses have 40 to 60 kW
+    parameters: ClassVar = (Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=5.0, constant=True),)
     mistaken_for: ClassVar = ("power_gain", "inverter_loss")
     separated_by: ClassVar = "standing still with the vehicle on, and with it off"
     power_w: Any
@@ -55,22 +60,25 @@ class HvacPower(Effect):
     """Heating below one temperature and cooling above another: k₁·max(T₁−T, 0) + k₂·max(T−T₂, 0)."""
 
     id: ClassVar = "hvac_power"
+    label: ClassVar = "cabin heating and cooling"
     stage: ClassVar = "battery"
     equation: ClassVar = "k₁·max(T₁−T, 0) + k₂·max(T−T₂, 0)"
     source: ClassVar = "Basma et al., Energy 207 (2020) (bus cabin, steady state)"
     needs: ClassVar = ("ambient_temp_c",)
     parameters: ClassVar = (
-        Parameter("below_w_per_k", "W/K", 0.0, 100.0, 0.0, 5e3, least=1.0),
-        Parameter("above_w_per_k", "W/K", 0.0, 100.0, 0.0, 5e3, least=1.0),
-        Parameter(
-            "heat_c", "°C", HEATING_BELOW_C, 4.0, -5.0, 26.0, kind="shape", grid=(10.0, 14.0, 18.0, 22.0),
-            of="below_w_per_k",
+        # an articulated bus loses about 1 kW/K through its skin and its doors
+        Size("below_w_per_k", "W/K", 0.0, 100.0, 0.0, 3e3, least=1.0, label="below the heating limit"),
+        Size("above_w_per_k", "W/K", 0.0, 100.0, 0.0, 3e3, least=1.0, label="above the cooling limit"),
+        Shape(
+            "heat_c", "°C", HEATING_BELOW_C, 4.0, -5.0, 26.0, grid=(10.0, 14.0, 18.0, 22.0),
+            of="below_w_per_k", label="heating limit"
         ),
-        Parameter(
-            "cool_c", "°C", COOLING_ABOVE_C, 4.0, 14.0, 34.0, kind="shape", grid=(18.0, 22.0, 26.0),
-            of="above_w_per_k",
+        Shape(
+            "cool_c", "°C", COOLING_ABOVE_C, 4.0, 14.0, 34.0, grid=(18.0, 22.0, 26.0),
+            of="above_w_per_k", label="cooling limit"
         ),
     )  # fmt: skip
+    ordered: ClassVar = (("heat_c", "cool_c"),)
     variants: ClassVar = (("below_w_per_k",), ("above_w_per_k",), ("below_w_per_k", "above_w_per_k"))
     mistaken_for: ClassVar = ("rolling_temperature", "air_density")
     separated_by: ClassVar = "standing still on hot and cold days"
@@ -92,11 +100,14 @@ class PassengerHeat(Effect):
     """
 
     id: ClassVar = "passenger_heat"
+    label: ClassVar = "warmth of the passengers"
     stage: ClassVar = "battery"
     equation: ClassVar = "h·N·([T > T₂] − [T < T₁])"
     source: ClassVar = "Basma et al., Energy 207 (2020) (occupants in the cabin's heat balance)"
     needs: ClassVar = ("passengers", "ambient_temp_c")
-    parameters: ClassVar = (Parameter("w_per_passenger", "W", 0.0, 50.0, 0.0, 150.0, least=1.0),)
+    parameters: ClassVar = (
+        Size("w_per_passenger", "W", 0.0, 50.0, 0.0, 150.0, least=1.0, label="power per passenger"),
+    )
     mistaken_for: ClassVar = ("hvac_power", "mass_scale")
     separated_by: ClassVar = "an hour at standstill, full and empty"
     order: ClassVar = 10
@@ -118,12 +129,13 @@ class CabinWarmup(Effect):
     """A load that dies away after the start: P·exp(−t/t₀)."""
 
     id: ClassVar = "cabin_warmup"
+    label: ClassVar = "cabin warm-up"
     stage: ClassVar = "battery"
     equation: ClassVar = "P·exp(−t/t₀)"
     source: ClassVar = "Basma et al., Energy 207 (2020) (cabin transient)"
     parameters: ClassVar = (
-        Parameter("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
-        Parameter("tau_s", "s", 900.0, 600.0, 60.0, 7200.0, kind="shape", grid=(300.0, 900.0, 2400.0)),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
+        Shape("tau_s", "s", 900.0, 600.0, 60.0, 7200.0, grid=(300.0, 900.0, 2400.0), label="time constant"),
     )
     mistaken_for: ClassVar = ("tyre_warmup",)
     separated_by: ClassVar = "standing still early and late"
@@ -143,14 +155,15 @@ class PeriodicLoad(Effect):
     """
 
     id: ClassVar = "periodic_load"
+    label: ClassVar = "periodic load"
     stage: ClassVar = "battery"
     equation: ClassVar = "P·[cos 2π(t/T + φ) > cos πD], φ by trip"
     source: ClassVar = "thermostat with hysteresis"
     parameters: ClassVar = (
-        Parameter("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
-        Parameter("period_s", "s", 900.0, 300.0, 20.0, 7200.0, kind="shape", grid=(600.0, 1200.0, 1500.0)),
-        Parameter("duty", "1", 0.5, 0.2, 0.05, 0.95, kind="shape", grid=(0.3, 0.5, 0.7)),
-        Parameter("phase", "1", float("nan"), 0.25, -1.0, 1.0, kind="choice"),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
+        Shape("period_s", "s", 900.0, 300.0, 20.0, 7200.0, grid=(600.0, 1200.0, 1500.0)),
+        Shape("duty", "1", 0.5, 0.2, 0.05, 0.95, grid=(0.3, 0.5, 0.7)),
+        Choice("phase", "1", float("nan"), 0.25, -1.0, 1.0),
     )
     searched: ClassVar = "spectrum"
     mistaken_for: ClassVar = ("standstill_load",)
@@ -183,12 +196,13 @@ class StandstillLoad(Effect):
     """A load while standing still: P·[v = 0], all of the time or only while the doors are open."""
 
     id: ClassVar = "standstill_load"
+    label: ClassVar = "load at standstill"
     stage: ClassVar = "battery"
     equation: ClassVar = "P·[v < 0.1 m/s]·(1 − d + d·door)"
     source: ClassVar = "PTO, doors and kneeling of city buses"
     parameters: ClassVar = (
-        Parameter("power_w", "W", 0.0, 1000.0, 0.0, 1e5, least=10.0),
-        Parameter("by_door", "1", 0.0, 1.0, 0.0, 1.0, kind="choice", grid=(0.0, 1.0)),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 1e5, least=10.0),
+        Choice("by_door", "1", 0.0, 1.0, 0.0, 1.0, grid=(0.0, 1.0)),
     )
     mistaken_for: ClassVar = ("auxiliary_power", "periodic_load")
     separated_by: ClassVar = "parked, the load on and off"
@@ -204,13 +218,15 @@ class CoolingPower(Effect):
     """Cooling of the battery: k·max(T_batt − T₀, 0)."""
 
     id: ClassVar = "cooling_power"
+    label: ClassVar = "cooling power"
     stage: ClassVar = "battery"
     equation: ClassVar = "k·max(T_batt − T₀, 0)"
     source: ClassVar = "thermostat of a battery chiller"
     needs: ClassVar = ("battery_temp_c",)
     parameters: ClassVar = (
-        Parameter("w_per_k", "W/K", 0.0, 100.0, 0.0, 5e3, least=1.0),
-        Parameter("start_c", "°C", 25.0, 4.0, 5.0, 45.0, kind="shape", grid=(20.0, 25.0, 30.0)),
+        # chillers of batteries have 2 to 10 kW, reached within 5 to 10 K
+        Size("w_per_k", "W/K", 0.0, 100.0, 0.0, 2e3, least=1.0),
+        Shape("start_c", "°C", 25.0, 4.0, 5.0, 45.0, grid=(20.0, 25.0, 30.0)),
     )
     mistaken_for: ClassVar = ("hvac_power",)
     separated_by: ClassVar = "standing still after hard driving"

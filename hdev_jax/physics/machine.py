@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from hdev_jax.physics.parameter import as_array
+
 __all__ = ["Machine", "switch"]
 
 
@@ -22,5 +24,5 @@ def switch(output: Any, driving: Any, braking: Any) -> Array:
 class Machine(eqx.Module):
     """Motor and inverter: P_e = P_m/η_mot driving, P_m·η_reg braking (paper 2, equations 5-12)."""
 
-    motoring_efficiency: Any
-    regenerating_efficiency: Any
+    motoring_efficiency: Any = eqx.field(converter=as_array, default=1.0)
+    regenerating_efficiency: Any = eqx.field(converter=as_array, default=1.0)

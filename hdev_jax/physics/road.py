@@ -4,8 +4,8 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from hdev_jax.physics.effect import Effect, Parameter
-from hdev_jax.physics.vehicle import Vehicle
+from hdev_jax.physics.effect import Car, Effect
+from hdev_jax.physics.parameter import Size
 from hdev_jax.segments import Segments
 from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
 
@@ -21,7 +21,7 @@ __all__ = [
     "RoadGrade",
     "Rolling",
     "RotatingMass",
-    "air_density",
+    "density_of_weather",
     "mean_square_speed",
 ]
 
@@ -37,7 +37,7 @@ def _slope(row: Segments) -> Any:
     return row.get("grade_rad", 0.0)
 
 
-def weight_on_road(row: Segments, car: Vehicle) -> Any:
+def weight_on_road(row: Segments, car: Car) -> Any:
     """m·g·cosθ [N]. A road is never upright, so cosθ = √(1 − sin²θ): the sine is there already."""
     return car.mass(row) * GRAVITY_MPS2 * jnp.sqrt(1.0 - jnp.sin(_slope(row)) ** 2)
 
@@ -49,10 +49,12 @@ class Inertia(Effect):
     """F_a = λ·m·a (paper 1, equation 3; λ of paper 2, equation 2)."""
 
     id: ClassVar = "inertia"
+    label: ClassVar = "acceleration"
     stage: ClassVar = "road"
     equation: ClassVar = "λ·m·a"
     source: ClassVar = "paper 1, eq. 3; paper 2, eq. 2"
     entries: ClassVar = ROAD
+    declared: ClassVar = {"rotating_mass_factor": "road.rotating_mass_factor"}
     rotating_mass_factor: Any
 
     def force(self, row, car):
@@ -63,6 +65,7 @@ class Grade(Effect):
     """F_g = m·g·sinθ (paper 1, equation 3)."""
 
     id: ClassVar = "grade"
+    label: ClassVar = "slope"
     stage: ClassVar = "road"
     equation: ClassVar = "m·g·sinθ"
     source: ClassVar = "paper 1, eq. 3"
@@ -76,10 +79,13 @@ class Rolling(Effect):
     """F_r = m·g·C_rr·cosθ (paper 1, equation 3)."""
 
     id: ClassVar = "rolling"
+    label: ClassVar = "rolling resistance"
     stage: ClassVar = "road"
     equation: ClassVar = "m·g·C_rr·cosθ"
     source: ClassVar = "paper 1, eq. 3"
     entries: ClassVar = ROAD
+    goes_with: ClassVar = "weight"
+    declared: ClassVar = {"c_rr": "road.c_rr"}
     c_rr: Any
 
     def force(self, row, car):
@@ -87,26 +93,27 @@ class Rolling(Effect):
 
 
 class Aero(Effect):
-    """F_d = ½·ρ₀·C_d·A·(v_i² + v_f²)/2 (paper 1, equation 4), ρ₀ the standard density."""
+    """F_d = ½·ρ·C_d·A·(v_i² + v_f²)/2 (paper 1, equation 4), ρ the log's density or, without one, the standard ρ₀."""
 
     id: ClassVar = "aero"
+    label: ClassVar = "air drag"
     stage: ClassVar = "road"
-    equation: ClassVar = "½·ρ₀·C_d·A·(v_i² + v_f²)/2"
+    equation: ClassVar = "½·ρ·C_d·A·(v_i² + v_f²)/2"
     source: ClassVar = "paper 1, eq. 4"
     entries: ClassVar = ROAD
+    goes_with: ClassVar = "air"
+    declared: ClassVar = {"cda_m2": "road.cda_m2"}
     cda_m2: Any
 
     def force(self, row, car):
-        return 0.5 * AIR_DENSITY_KGPM3 * self.cda_m2 * mean_square_speed(row)
+        return car.drag(row) * mean_square_speed(row)
 
 
 # --- air -------------------------------------------------------------------------------------------------------------
 
 
-def air_density(row: Segments) -> Any:
-    """Density of the air [kg/m³]: measured, else p/(R·T) with the pressure of ISO 2533 at the row's altitude."""
-    if row.has("air_density_kgpm3"):
-        return row.channels["air_density_kgpm3"]
+def density_of_weather(row: Segments) -> Any:
+    """Density of the air [kg/m³]: p/(R·T) with the pressure of ISO 2533 at the row's altitude."""
     pressure_pa = 101325.0 * (1.0 - 2.25577e-5 * row.get("altitude_m", 0.0)) ** 5.25588
     return pressure_pa / (287.05 * (row.get("ambient_temp_c", 15.0) + 273.15))
 
@@ -116,21 +123,23 @@ def _wind_along(row: Segments) -> Any:
     return row.channels["wind_speed_mps"] * jnp.cos(row.channels["wind_from_rad"] - row.channels["heading_rad"])
 
 
-def _extra_drag(row: Segments, car: Vehicle, wind_mps: Any) -> Any:
+def _extra_drag(row: Segments, car: Car, wind_mps: Any) -> Any:
     """Drag at air speed v + w less drag at v, with the sign of the air speed: the mean of both ends, as in `Aero`."""
     ends = [v + wind_mps for v in (row.speed_start_mps, row.speed_end_mps)]
-    return car.drag() * (0.5 * sum(air * jnp.abs(air) for air in ends) - mean_square_speed(row))
+    return car.drag(row) * (0.5 * sum(air * jnp.abs(air) for air in ends) - mean_square_speed(row))
 
 
 class ConstantHeadwind(Effect):
-    """The same wind against every row: ½ρ₀C_dA((v+w)² − v²)."""
+    """The same wind against every row: ½ρC_dA((v+w)² − v²)."""
 
     id: ClassVar = "constant_headwind"
+    label: ClassVar = "constant headwind"
     stage: ClassVar = "road"
-    equation: ClassVar = "½ρ₀·C_dA·((v+w)² − v²)"
+    equation: ClassVar = "½ρ·C_dA·((v+w)² − v²)"
     source: ClassVar = "paper 2, eq. 2"
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("speed_mps", "m/s", 0.0, 2.0, -15.0, 15.0, least=0.1),)
+    goes_with: ClassVar = "air"
+    parameters: ClassVar = (Size("speed_mps", "m/s", 0.0, 2.0, -15.0, 15.0, least=0.1),)
     mistaken_for: ClassVar = ("iron_loss", "driveline_drag")
     separated_by: ClassVar = "drive the same road out and back"
     speed_mps: Any
@@ -140,15 +149,17 @@ class ConstantHeadwind(Effect):
 
 
 class Headwind(Effect):
-    """Measured wind along the heading: ½ρ₀C_dA((v + s·w·cos(from − heading))² − v²)."""
+    """Measured wind along the heading: ½ρC_dA((v + s·w·cos(from − heading))² − v²)."""
 
     id: ClassVar = "headwind"
+    label: ClassVar = "headwind"
     stage: ClassVar = "road"
-    equation: ClassVar = "½ρ₀·C_dA·((v + s·w·cos δ)² − v²)"
+    equation: ClassVar = "½ρ·C_dA·((v + s·w·cos δ)² − v²)"
     source: ClassVar = "paper 2, eq. 2"
     needs: ClassVar = ("wind_speed_mps", "wind_from_rad", "heading_rad")
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("scale", "1", 0.0, 1.0, 0.0, 2.5, least=0.02),)
+    goes_with: ClassVar = "air"
+    parameters: ClassVar = (Size("scale", "1", 0.0, 1.0, 0.0, 2.5, least=0.02),)
     mistaken_for: ClassVar = ("constant_headwind", "crosswind")
     separated_by: ClassVar = "headings all around on one windy day"
     scale: Any
@@ -158,33 +169,41 @@ class Headwind(Effect):
 
 
 class AirDensity(Effect):
-    """Drag with the density of the day: s·(ρ/ρ₀ − 1)·½ρ₀C_dA·v²."""
+    """Drag with the density that temperature and altitude tell, where none is logged: s·(ρ/ρ₀ − 1)·½ρ₀C_dA·v²."""
 
     id: ClassVar = "air_density"
+    label: ClassVar = "air density"
     stage: ClassVar = "road"
     equation: ClassVar = "s·(ρ/ρ₀ − 1)·½ρ₀·C_dA·v²"
     source: ClassVar = "ISO 2533"
-    needs: ClassVar = ("air_density_kgpm3|ambient_temp_c|altitude_m",)
+    needs: ClassVar = ("ambient_temp_c|altitude_m",)
+    lacks: ClassVar = ("air_density_kgpm3",)
+    instead: ClassVar = "the declared drag uses the log's air density"
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("scale", "1", 0.0, 1.0, 0.0, 3.0, least=0.05),)
+    goes_with: ClassVar = "air"
+    parameters: ClassVar = (Size("scale", "1", 0.0, 1.0, 0.0, 3.0, least=0.05),)
     mistaken_for: ClassVar = ("rolling_temperature",)
     separated_by: ClassVar = "hot and cold days at motorway speed"
     scale: Any
 
     def force(self, row, car):
-        return self.scale * (air_density(row) / AIR_DENSITY_KGPM3 - 1.0) * car.drag() * mean_square_speed(row)
+        return self.scale * (density_of_weather(row) / AIR_DENSITY_KGPM3 - 1.0) * car.drag(row) * mean_square_speed(row)
 
 
 class Crosswind(Effect):
-    """Drag area that grows with the yaw angle ψ of the air: k·ψ²·½ρ₀C_dA·v²."""
+    """Drag area that grows with the yaw angle ψ of the air: k·ψ²·½ρC_dA·v²."""
 
     id: ClassVar = "crosswind"
+    label: ClassVar = "crosswind"
     stage: ClassVar = "road"
-    equation: ClassVar = "k·ψ²·½ρ₀·C_dA·v²"
+    equation: ClassVar = "k·ψ²·½ρ·C_dA·v²"
     source: ClassVar = "SAE J1252 (drag against yaw)"
     needs: ClassVar = ("wind_speed_mps", "wind_from_rad", "heading_rad")
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("drag_per_rad2", "1/rad²", 0.0, 2.0, 0.0, 20.0, least=0.05),)
+    goes_with: ClassVar = "air"
+    parameters: ClassVar = (
+        Size("drag_per_rad2", "1/rad²", 0.0, 2.0, 0.0, 20.0, least=0.05, label="drag per yaw squared"),
+    )
     mistaken_for: ClassVar = ("headwind",)
     separated_by: ClassVar = "headings across and along the wind"
     drag_per_rad2: Any
@@ -195,26 +214,28 @@ class Crosswind(Effect):
         # the speed that the drag has; the breath of 1 µm/s keeps the angle and its slope finite in still air
         speed = jnp.sqrt(mean_square_speed(row) + 1e-12)
         yaw = jnp.arctan2(jnp.abs(side), speed + row.channels["wind_speed_mps"] * jnp.cos(delta))
-        return self.drag_per_rad2 * yaw**2 * car.drag() * mean_square_speed(row)
+        return self.drag_per_rad2 * yaw**2 * car.drag(row) * mean_square_speed(row)
 
 
 class Drafting(Effect):
-    """Drag saved behind another vehicle: −r·½ρ₀C_dA·v²·exp(−gap/30 m)."""
+    """Drag saved behind another vehicle: −r·½ρC_dA·v²·exp(−gap/30 m)."""
 
     id: ClassVar = "drafting"
+    label: ClassVar = "drafting"
     stage: ClassVar = "road"
-    equation: ClassVar = "−r·exp(−gap/30 m)·½ρ₀·C_dA·v²"
+    equation: ClassVar = "−r·exp(−gap/30 m)·½ρ·C_dA·v²"
     source: ClassVar = "Hucho, Aerodynamik des Automobils (platoons)"
     needs: ClassVar = ("gap_m",)
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("reduction", "1", 0.0, 0.3, 0.0, 0.8, least=0.02),)
+    goes_with: ClassVar = "air"
+    parameters: ClassVar = (Size("reduction", "1", 0.0, 0.3, 0.0, 0.8, least=0.02),)
     mistaken_for: ClassVar = ("constant_headwind",)
     separated_by: ClassVar = "stretches with and without a leader"
     reduction: Any
 
     def force(self, row, car):
         near = jnp.exp(-jnp.maximum(row.channels["gap_m"], 0.0) / 30.0)
-        return -self.reduction * near * car.drag() * mean_square_speed(row)
+        return -self.reduction * near * car.drag(row) * mean_square_speed(row)
 
 
 # --- mass and slope --------------------------------------------------------------------------------------------------
@@ -224,11 +245,12 @@ class RotatingMass(Effect):
     """Inertia of what turns: f·m·a besides the declared one."""
 
     id: ClassVar = "rotating_mass"
+    label: ClassVar = "rotating mass"
     stage: ClassVar = "road"
     equation: ClassVar = "f·m·a"
     source: ClassVar = "paper 2, eq. 2 (λ)"
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("factor", "1", 0.0, 0.05, 0.0, 0.6, least=0.002),)
+    parameters: ClassVar = (Size("factor", "1", 0.0, 0.05, 0.0, 0.6, least=0.002),)
     mistaken_for: ClassVar = ("mass_scale",)
     separated_by: ClassVar = "accelerating on the flat, and climbing at a steady speed"
     factor: Any
@@ -241,13 +263,14 @@ class RoadGrade(Effect):
     """Slope that the log lacks, from an accelerometer that feels gravity: s·m·(accelerometer − dv/dt)."""
 
     id: ClassVar = "road_grade"
+    label: ClassVar = "road slope"
     stage: ClassVar = "road"
     equation: ClassVar = "s·m·(a_sensor − dv/dt)"
     source: ClassVar = "paper 2, eq. 2, slope from the specific force"
     needs: ClassVar = ("accel_mps2",)
     lacks: ClassVar = ("grade_rad",)
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("scale", "1", 0.0, 1.0, 0.0, 2.0, least=0.02),)
+    parameters: ClassVar = (Size("scale", "1", 0.0, 1.0, 0.0, 2.0, least=0.02),)
     mistaken_for: ClassVar = ("mass_scale",)
     separated_by: ClassVar = "hills"
     scale: Any

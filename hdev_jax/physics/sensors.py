@@ -6,12 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from hdev_jax.physics.across import later_slope, low_pass, neighbours, shifted
-from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.parameter import Choice, Size, Switch
 
 __all__ = [
     "AccelerometerBias",
     "GradeBias",
     "GradeLag",
+    "GradeScale",
     "MassScale",
     "PowerGain",
     "SamplingFilter",
@@ -25,11 +27,12 @@ class MassScale(Effect):
     """The mass is another than logged: m·(1 + s)."""
 
     id: ClassVar = "mass_scale"
+    label: ClassVar = "payload error"
     stage: ClassVar = "sensors"
     equation: ClassVar = "m → m·(1 + s)"
     source: ClassVar = "paper 1, section 5 (mass as future work)"
     entries: ClassVar = ("road",)
-    parameters: ClassVar = (Parameter("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.002),)
+    parameters: ClassVar = (Size("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.002),)
     mistaken_for: ClassVar = ("rotating_mass",)
     separated_by: ClassVar = "the same road empty and loaded"
     scale: Any
@@ -42,12 +45,13 @@ class GradeBias(Effect):
     """The slope has an offset: θ + b. The same as rolling resistance on every log that is not out and back."""
 
     id: ClassVar = "grade_bias"
+    label: ClassVar = "slope bias"
     stage: ClassVar = "sensors"
     equation: ClassVar = "θ → θ + b"
     source: ClassVar = "mounting of an inclinometer"
     needs: ClassVar = ("grade_rad",)
     entries: ClassVar = ("road",)
-    parameters: ClassVar = (Parameter("bias_rad", "rad", 0.0, 2e-3, -0.05, 0.05, least=5e-5),)
+    parameters: ClassVar = (Size("bias_rad", "rad", 0.0, 2e-3, -0.05, 0.05, least=5e-5),)
     mistaken_for: ClassVar = ("rolling",)
     separated_by: ClassVar = "the same road out and back"
     bias_rad: Any
@@ -56,17 +60,39 @@ class GradeBias(Effect):
         return row.with_channels(grade_rad=row.channels["grade_rad"] + self.bias_rad)
 
 
+class GradeScale(Effect):
+    """The slope is read too steep or too flat, as from heights that were smoothed: θ·(1 + s)."""
+
+    id: ClassVar = "grade_scale"
+    label: ClassVar = "scale of the slope"
+    stage: ClassVar = "sensors"
+    equation: ClassVar = "θ → θ·(1 + s)"
+    source: ClassVar = "differences of smoothed heights"
+    needs: ClassVar = ("grade_rad",)
+    entries: ClassVar = ("road",)
+    # a slope whose noise counts as slope is attenuated to half; a percentage taken for degrees is another matter
+    parameters: ClassVar = (Size("scale", "1", 0.0, 0.1, -0.6, 1.0, least=0.002),)
+    mistaken_for: ClassVar = ("mass_scale", "grade_lag")
+    separated_by: ClassVar = "accelerating on the flat, and the same hills again"
+    order: ClassVar = -1  # before an offset
+    scale: Any
+
+    def sense(self, row, car):
+        return row.with_channels(grade_rad=row.channels["grade_rad"] * (1.0 + self.scale))
+
+
 class GradeLag(Effect):
     """The slope comes late: what is logged at t was the road at t − L."""
 
     id: ClassVar = "grade_lag"
+    label: ClassVar = "lag of the slope"
     stage: ClassVar = "sensors"
     equation: ClassVar = "θ(t) → θ(t + L)"
     source: ClassVar = "lag of a barometric altimeter"
     needs: ClassVar = ("grade_rad",)
     entries: ClassVar = ("road",)
     parameters: ClassVar = (
-        Parameter("lag_s", "s", 0.0, 1.0, -60.0, 60.0, kind="limit", in_rows=True, smooth=True, least=0.05,
+        Switch("lag_s", "s", 0.0, 1.0, -60.0, 60.0, in_rows=True, smooth=True, least=0.05,
                   grid=(-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0)),
     )  # fmt: skip
     mistaken_for: ClassVar = ("grade_bias",)
@@ -81,11 +107,12 @@ class SpeedScale(Effect):
     """Speed and distance are off by a factor, as by a wrong wheel radius: v·(1 + s)."""
 
     id: ClassVar = "speed_scale"
+    label: ClassVar = "scale of the speed signal"
     stage: ClassVar = "sensors"
     equation: ClassVar = "v → v·(1 + s), d → d·(1 + s)"
     source: ClassVar = "wear and pressure of tyres"
     entries: ClassVar = ("road",)
-    parameters: ClassVar = (Parameter("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    parameters: ClassVar = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
     mistaken_for: ClassVar = ("mass_scale", "rotating_mass")
     separated_by: ClassVar = "a position by satellite"
     scale: Any
@@ -103,13 +130,14 @@ class AccelerometerBias(Effect):
     """The accelerometer is tilted: a_sensor − b. Matters where the slope comes from it."""
 
     id: ClassVar = "accelerometer_bias"
+    label: ClassVar = "bias of the accelerometer"
     stage: ClassVar = "sensors"
     equation: ClassVar = "a_sensor → a_sensor − b"
     source: ClassVar = "mounting tilt"
     needs: ClassVar = ("accel_mps2",)
     lacks: ClassVar = ("grade_rad",)
     entries: ClassVar = ("road",)
-    parameters: ClassVar = (Parameter("bias_mps2", "m/s²", 0.0, 0.05, -1.0, 1.0, least=0.002),)
+    parameters: ClassVar = (Size("bias_mps2", "m/s²", 0.0, 0.05, -1.0, 1.0, least=0.002),)
     mistaken_for: ClassVar = ("rolling",)
     separated_by: ClassVar = "standing still on the flat"
     bias_mps2: Any
@@ -122,14 +150,15 @@ class TorqueOffset(Effect):
     """The torque signal has an offset and a gain: τ·(1 + g) + τ₀."""
 
     id: ClassVar = "torque_offset"
+    label: ClassVar = "offset or gain of the torque signal"
     stage: ClassVar = "sensors"
     equation: ClassVar = "τ → τ·(1 + g) + τ₀"
     source: ClassVar = "torque estimated from currents"
     needs: ClassVar = ("motor_torque_nm",)
     entries: ClassVar = ("shaft",)
     parameters: ClassVar = (
-        Parameter("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.02),
-        Parameter("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
+        Size("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.02),
+        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
     )
     variants: ClassVar = (("offset_nm",), ("gain",), ("offset_nm", "gain"))
     mistaken_for: ClassVar = ("iron_loss", "driveline_drag")
@@ -145,14 +174,16 @@ class PowerGain(Effect):
     """The power sensor has a gain and an offset: P·(1 + g) + P₀."""
 
     id: ClassVar = "power_gain"
+    label: ClassVar = "offset or gain of the power signal"
     stage: ClassVar = "sensors"
     equation: ClassVar = "P → P·(1 + g) + P₀"
     source: ClassVar = "current sensor"
+    of_battery: ClassVar = True
     parameters: ClassVar = (
-        Parameter("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
-        Parameter("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=5.0),
+        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
+        Size("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=5.0, constant=True),
     )
-    variants: ClassVar = (("gain",), ("offset_w",), ("gain", "offset_w"))
+    variants: ClassVar = (("gain",), ("gain", "offset_w"))  # an offset alone is auxiliary_power by another name
     mistaken_for: ClassVar = ("auxiliary_power",)
     separated_by: ClassVar = "the balance of charge over a trip"
     order: ClassVar = 10
@@ -167,13 +198,14 @@ class TimeSkew(Effect):
     """The target's clock is late: P(t − s); positive where the target lags the other channels."""
 
     id: ClassVar = "time_skew"
+    label: ClassVar = "time skew between channels"
     stage: ClassVar = "sensors"
     equation: ClassVar = "P(t) → P(t − s)"
     source: ClassVar = "messages of several control units on one bus"
     parameters: ClassVar = (
-        Parameter("skew_s", "s", 0.0, 0.5, -30.0, 30.0, kind="limit", in_rows=True, smooth=True, least=0.005,
-                  grid=(-4.0, -2.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0)),
-        Parameter("cubic", "1", 0.0, 1.0, 0.0, 1.0, kind="choice", grid=(0.0, 1.0)),
+        Switch("skew_s", "s", 0.0, 0.5, -30.0, 30.0, in_rows=True, smooth=True, least=0.005,
+                  grid=(-4.0, -2.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0), label="skew"),
+        Choice("cubic", "1", 0.0, 1.0, 0.0, 1.0, grid=(0.0, 1.0)),
     )  # fmt: skip
     mistaken_for: ClassVar = ("sampling_filter", "rotating_mass")
     separated_by: ClassVar = "steps of the pedal"
@@ -191,14 +223,24 @@ class SamplingFilter(Effect):
     """
 
     id: ClassVar = "sampling_filter"
+    label: ClassVar = "filter of the measured signal"
     stage: ClassVar = "sensors"
     equation: ClassVar = "P → P + Σ cⱼ·(P₋ⱼ − 2P + P₊ⱼ), or τ·dP/dt + P"
     source: ClassVar = "Proakis and Manolakis, Digital Signal Processing (symmetric FIR; first-order lag)"
     parameters: ClassVar = (
-        Parameter("tap_1", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
-        Parameter("tap_2", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
-        Parameter(
-            "tau_s", "s", 0.0, 1.0, 0.0, 120.0, kind="limit", in_rows=True, smooth=True, grid=(0.5, 1.0, 2.0, 5.0)
+        Size("tap_1", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
+        Size("tap_2", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
+        Switch(
+            "tau_s",
+            "s",
+            0.0,
+            1.0,
+            0.0,
+            120.0,
+            in_rows=True,
+            smooth=True,
+            grid=(0.5, 1.0, 2.0, 5.0),
+            label="time constant",
         ),
     )
     variants: ClassVar = (("tap_1",), ("tap_1", "tap_2"), ("tau_s",))

@@ -5,10 +5,11 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
-from hdev_jax.physics.effect import Effect, Parameter
+from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.parameter import Shape, Size
 from hdev_jax.physics.road import ROAD, mean_square_speed, weight_on_road
 
-__all__ = ["Cornering", "RoadSurface", "RollingSpeed", "RollingTemperature", "TyreWarmup", "WetRoad"]
+__all__ = ["Cornering", "RoadSurface", "RollingLinear", "RollingSpeed", "RollingTemperature", "TyreWarmup", "WetRoad"]
 
 REFERENCE_TEMP_C = 20.0  # where a tabular c_rr is measured (ISO 28580: 25 °C in the laboratory; 20 °C on the road)
 
@@ -17,11 +18,13 @@ class RollingSpeed(Effect):
     """Rolling resistance that grows with speed: m·g·cosθ·k·v²."""
 
     id: ClassVar = "rolling_speed"
+    label: ClassVar = "rolling resistance that grows with speed"
     stage: ClassVar = "road"
     equation: ClassVar = "m·g·cosθ·k·v²"
     source: ClassVar = "ISO 28580; Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge"
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("per_mps2", "s²/m²", 0.0, 3e-6, 0.0, 3e-5, least=1e-7),)
+    goes_with: ClassVar = "weight"
+    parameters: ClassVar = (Size("per_mps2", "s²/m²", 0.0, 3e-6, 0.0, 3e-5, least=1e-7, label="per speed squared"),)
     mistaken_for: ClassVar = ("constant_headwind",)
     separated_by: ClassVar = "a sweep of speed, loaded and empty"
     per_mps2: Any
@@ -30,16 +33,42 @@ class RollingSpeed(Effect):
         return self.per_mps2 * weight_on_road(row, car) * mean_square_speed(row)
 
 
+class RollingLinear(Effect):
+    """A force linear in speed, the B of a road load: b·v.
+
+    Oil in hubs and gears. Where the motor's speed goes with the vehicle's it is nearly iron loss in ω², and over a
+    narrow range of speeds the linear part of a headwind.
+    """
+
+    id: ClassVar = "rolling_linear"
+    label: ClassVar = "force linear in speed"
+    stage: ClassVar = "road"
+    equation: ClassVar = "b·v"
+    source: ClassVar = "SAE J1263; UN GTR 15, annex 4 (f₁ of a coast-down)"
+    entries: ClassVar = ROAD
+    # f₁ of cars is up to some 15 N·s/m, of a 40 t truck some ten times that
+    parameters: ClassVar = (Size("n_per_mps", "N·s/m", 0.0, 10.0, 0.0, 200.0, least=0.2, label="force per speed"),)
+    mistaken_for: ClassVar = ("iron_loss", "driveline_drag", "constant_headwind")
+    separated_by: ClassVar = "a coast-down from high speed in neutral and in gear"
+    n_per_mps: Any
+
+    def force(self, row, car):
+        return self.n_per_mps * row.speed_mps
+
+
 class RollingTemperature(Effect):
     """Rolling resistance by temperature: m·g·cosθ·k·(T − 20 °C); k is negative, cold tyres roll worse."""
 
     id: ClassVar = "rolling_temperature"
+    label: ClassVar = "rolling resistance by temperature"
     stage: ClassVar = "road"
     equation: ClassVar = "m·g·cosθ·k·(T − 20 °C)"
     source: ClassVar = "ISO 28580, temperature correction"
     needs: ClassVar = ("ambient_temp_c",)
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("per_k", "1/K", 0.0, -5e-5, -6e-4, 6e-4, least=1e-6),)
+    goes_with: ClassVar = "weight"
+    # −0.6 to −0.8 % of c_rr for each kelvin (ISO 28580, truck tyres); no tyre rolls worse when warm
+    parameters: ClassVar = (Size("per_k", "1/K", 0.0, -5e-5, -6e-4, 0.0, least=1e-6, label="per kelvin"),)
     mistaken_for: ClassVar = ("air_density", "hvac_power")
     separated_by: ClassVar = "hot and cold days at several speeds"
     per_k: Any
@@ -52,13 +81,16 @@ class TyreWarmup(Effect):
     """Cold tyres at the start: m·g·cosθ·C_rr·e·exp(−d/d₀), d the distance since the start of the trip."""
 
     id: ClassVar = "tyre_warmup"
+    label: ClassVar = "tyre warm-up"
     stage: ClassVar = "road"
     equation: ClassVar = "m·g·cosθ·C_rr·e·exp(−d/d₀)"
     source: ClassVar = "SAE J2452 (warm-up)"
     entries: ClassVar = ROAD
+    goes_with: ClassVar = "weight"
     parameters: ClassVar = (
-        Parameter("excess", "1", 0.0, 0.3, 0.0, 3.0, least=0.01),
-        Parameter("distance_m", "m", 1e4, 5e3, 500.0, 6e4, kind="shape", grid=(2e3, 5e3, 1e4, 2e4)),
+        # a tyre at −20 °C rolls at about twice its warm resistance (SAE J2452)
+        Size("excess", "1", 0.0, 0.3, 0.0, 2.0, least=0.01),
+        Shape("distance_m", "m", 1e4, 5e3, 500.0, 6e4, grid=(2e3, 5e3, 1e4, 2e4)),
     )
     mistaken_for: ClassVar = ("cabin_warmup",)
     separated_by: ClassVar = "a restart after a short stop"
@@ -76,17 +108,19 @@ class TyreWarmup(Effect):
 
 
 class WetRoad(Effect):
-    """Water on the road: m·g·cosθ·C_rr·e·wet, and spray, ½ρ₀C_dA·s·wet·v²."""
+    """Water on the road: m·g·cosθ·C_rr·e·wet, and spray, ½ρC_dA·s·wet·v²."""
 
     id: ClassVar = "wet_road"
+    label: ClassVar = "wet road"
     stage: ClassVar = "road"
-    equation: ClassVar = "wet·(m·g·cosθ·C_rr·e + s·½ρ₀·C_dA·v²)"
+    equation: ClassVar = "wet·(m·g·cosθ·C_rr·e + s·½ρ·C_dA·v²)"
     source: ClassVar = "Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge"
     needs: ClassVar = ("wet_road",)
     entries: ClassVar = ROAD
+    goes_with: ClassVar = "weight"
     parameters: ClassVar = (
-        Parameter("excess", "1", 0.0, 0.2, 0.0, 4.0, least=0.01),
-        Parameter("spray", "1", 0.0, 0.2, 0.0, 2.0, least=0.01),
+        Size("excess", "1", 0.0, 0.2, 0.0, 4.0, least=0.01),
+        Size("spray", "1", 0.0, 0.2, 0.0, 2.0, least=0.01),
     )
     variants: ClassVar = (("excess",), ("spray",), ("excess", "spray"))
     mistaken_for: ClassVar = ("rolling_temperature",)
@@ -95,27 +129,28 @@ class WetRoad(Effect):
     spray: Any
 
     def force(self, row, car):
-        return self.rolling(row, car) + self.spraying(row, car)
+        return sum(self.split(row, car))
 
-    def rolling(self, row, car):
-        """The part that goes with the weight [N]."""
-        return row.channels["wet_road"] * self.excess * car.rolling() * weight_on_road(row, car)
-
-    def spraying(self, row, car):
-        """The part that goes with the drag area [N]."""
-        return row.channels["wet_road"] * self.spray * car.drag() * mean_square_speed(row)
+    def split(self, row, car):
+        # Spray is a share of the drag area at the square of the speed, whatever the vehicle weighs: the source has the
+        # resistance of displaced water go with the tyres' width and the speed, not with their load.
+        wet = row.channels["wet_road"]
+        rolling = wet * self.excess * car.rolling() * weight_on_road(row, car)
+        return rolling, wet * self.spray * car.drag(row) * mean_square_speed(row)
 
 
 class RoadSurface(Effect):
     """Rolling resistance by kind or place of the road: m·g·cosθ·C_rr·e[surface], against the commonest of the log."""
 
     id: ClassVar = "road_surface"
+    label: ClassVar = "road surface by place"
     stage: ClassVar = "road"
     equation: ClassVar = "m·g·cosθ·C_rr·e[surface]"
     source: ClassVar = "Sandberg, Rolling resistance: basic information and state of the art, MIRIAM (2011)"
     needs: ClassVar = ("road_surface",)  # whole numbers from 0: kinds of surface, or stretches of road
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("excess", "1", 0.0, 0.2, -0.6, 3.0, least=0.01, by="road_surface"),)
+    goes_with: ClassVar = "weight"
+    parameters: ClassVar = (Size("excess", "1", 0.0, 0.2, -0.6, 3.0, least=0.01, by="road_surface"),)
     mistaken_for: ClassVar = ("grade_bias", "wet_road")
     separated_by: ClassVar = "the same surfaces up and down, and at several loads"
     excess: Any
@@ -128,12 +163,15 @@ class Cornering(Effect):
     """Cornering resistance: c·m·v⁴·κ² (slip angles that turn lateral force into drag)."""
 
     id: ClassVar = "cornering"
+    label: ClassVar = "cornering resistance"
     stage: ClassVar = "road"
     equation: ClassVar = "c·m·v⁴·κ²"
     source: ClassVar = "Mitschke and Wallentowitz, Dynamik der Kraftfahrzeuge (curve resistance)"
     needs: ClassVar = ("curvature_1pm",)
     entries: ClassVar = ROAD
-    parameters: ClassVar = (Parameter("coefficient", "s²/m", 0.0, 0.02, 0.0, 1.0, least=1e-4),)
+    goes_with: ClassVar = "weight"
+    # the mass over the cornering stiffness of all tyres: 0.01 to 0.03 s²/m; more where axles scrub
+    parameters: ClassVar = (Size("coefficient", "s²/m", 0.0, 0.02, 0.0, 0.3, least=1e-4),)
     mistaken_for: ClassVar = ("rolling_speed",)
     separated_by: ClassVar = "heading rate: straight and winding roads at one speed"
     coefficient: Any

@@ -1,6 +1,6 @@
 """The vehicle: a sum of effects along one chain, road → driveline → machine → battery, entered where it is measured."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -11,13 +11,16 @@ from jaxtyping import Array, Float
 from hdev_jax.physics.driveline import Driveline
 from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
+from hdev_jax.physics.parameter import as_array
+from hdev_jax.physics.road import mean_square_speed, weight_on_road
 from hdev_jax.segments import Segments
+from hdev_jax.targets import Target, target_of
 from hdev_jax.units import AIR_DENSITY_KGPM3, J_PER_WH
 
-__all__ = ["Entry", "Target", "Vehicle"]
+__all__ = ["Entry", "Vehicle", "coefficients_that_hold"]
 
+_SLOW_MPS = 0.1  # below, the drag area would be a ratio of next to nothing
 Entry = Literal["road", "wheel", "shaft"]
-Target = Literal["energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n"]
 
 
 class _Chain(NamedTuple):
@@ -33,33 +36,39 @@ class Vehicle(eqx.Module):
     """A sum of effects. Nothing is changed in place: `plus` and `minus` return new vehicles.
 
     **Arguments:** `effects` in any order (they are kept by stage); `mass_kg` where the log has no `mass_kg`;
-    `driveline` and `machine`, the efficiencies of the chain; `entry`, the measured quantity where the chain begins:
-    `road` (nothing measured), `wheel` (`traction_force_n`), `shaft` (`motor_torque_nm`, `motor_speed_radps`).
+    `driveline` and `machine`, the efficiencies of the chain (default: no losses; a driveline's efficiency reaches from
+    the wheel to the battery unless it says otherwise); `entry`, the measured quantity where the chain begins: `road`
+    (nothing measured), `wheel` (`traction_force_n`), `shaft` (`motor_torque_nm`; a motor speed that is not logged is
+    that of the wheels times the ratio); `nominal_voltage_v` where the log has no `voltage_v`.
     """
 
     effects: tuple[Effect, ...]
-    mass_kg: Real
+    mass_kg: Real = eqx.field(converter=as_array)
+    nominal_voltage_v: Real | None = eqx.field(converter=as_array)
     driveline: Driveline
     machine: Machine
     entry: Entry = eqx.field(static=True)
 
     def __init__(
         self,
-        effects: tuple[Effect, ...],
+        effects: Iterable[Effect],
         *,
         mass_kg: Any,
-        driveline: Driveline,
-        machine: Machine,
+        driveline: Driveline | None = None,
+        machine: Machine | None = None,
         entry: Entry = "road",
+        nominal_voltage_v: Any = None,
     ):
+        effects = tuple(effects)
         ids = [e.id for e in effects]
         if len(set(ids)) < len(ids):
             raise ValueError(f"each effect once in a vehicle, found {ids}; use minus() before plus() to replace one")
         self.effects = tuple(sorted(effects, key=lambda e: (STAGES.index(e.stage), e.order)))
         self.mass_kg = mass_kg
-        self.driveline = driveline
-        self.machine = machine
+        self.driveline = Driveline() if driveline is None else driveline
+        self.machine = Machine() if machine is None else machine
         self.entry = entry
+        self.nominal_voltage_v = nominal_voltage_v
 
     # --- the sum -----------------------------------------------------------------------------------------------
 
@@ -87,7 +96,10 @@ class Vehicle(eqx.Module):
         raise KeyError(effect_id)
 
     def _with(self, effects: tuple[Effect, ...]) -> "Vehicle":
-        return Vehicle(effects, mass_kg=self.mass_kg, driveline=self.driveline, machine=self.machine, entry=self.entry)
+        return Vehicle(
+            effects, mass_kg=self.mass_kg, driveline=self.driveline, machine=self.machine, entry=self.entry,
+            nominal_voltage_v=self.nominal_voltage_v,
+        )  # fmt: skip
 
     # --- what effects read of the vehicle ------------------------------------------------------------------------
 
@@ -99,9 +111,23 @@ class Vehicle(eqx.Module):
         """c_rr of the declared rolling resistance, 0 where there is none."""
         return self.effect("rolling").c_rr if self.has("rolling") else 0.0
 
-    def drag(self) -> Any:
-        """½ρ₀·C_d·A of the declared drag [N/(m/s)²], 0 where there is none."""
-        return 0.5 * AIR_DENSITY_KGPM3 * self.effect("aero").cda_m2 if self.has("aero") else 0.0
+    def drag(self, row: Segments) -> Any:
+        """½ρ·C_d·A of the declared drag [N/(m/s)²], 0 where there is none; ρ is the log's, else the standard ρ₀."""
+        density = row.get("air_density_kgpm3", AIR_DENSITY_KGPM3)
+        return 0.5 * density * self.effect("aero").cda_m2 if self.has("aero") else 0.0
+
+    def voltage(self, row: Segments) -> Any:
+        """Voltage of the battery [V]: the log's, else the sheet's nominal one."""
+        if row.has("voltage_v"):
+            return row.channels["voltage_v"]
+        if self.nominal_voltage_v is None:
+            raise ValueError("the log has no voltage_v and the vehicle no nominal_voltage_v; one of them is expected")
+        return self.nominal_voltage_v
+
+    @property
+    def stands_in(self) -> tuple[str, ...]:
+        """What the vehicle has in the place of a channel of the log."""
+        return () if self.nominal_voltage_v is None else ("nominal_voltage_v",)
 
     # --- one row ---------------------------------------------------------------------------------------------------
 
@@ -127,7 +153,8 @@ class Vehicle(eqx.Module):
         if self.entry == "road":
             speed = row.get("motor_speed_radps", v * ratio)
             eta = car.driveline.efficiency_at(row, speed, force / ratio)
-            force = switch(force, eta, eta)
+            back = car.driveline.regenerating_efficiency
+            force = switch(force, eta, eta if back is None else back)
             added["driveline"] = (force - wheel) * v
             for e in car.effects:
                 if e.overrides("drive"):
@@ -137,7 +164,7 @@ class Vehicle(eqx.Module):
                     force = force + f
         drive = force
         if self.entry == "shaft":
-            torque, speed = row.channels["motor_torque_nm"], row.channels["motor_speed_radps"]
+            torque, speed = row.channels["motor_torque_nm"], row.get("motor_speed_radps", v * ratio)
             power = torque * speed
             added["traction"] = power
         else:
@@ -200,9 +227,9 @@ class Vehicle(eqx.Module):
         held = _in_motion if self.entry == "road" else lambda _, torque: torque
         return self._observed(self._rows(segments, lambda c, row: held(row, c.point.torque_nm)), segments)
 
-    def predict(self, segments: Segments, target: Target) -> Float[Array, " row"]:
-        """The target's column in the target's unit."""
-        match target:
+    def predict(self, segments: Segments, target: str | Target) -> Float[Array, " row"]:
+        """The target's column in the target's unit; the target by its name or its record."""
+        match target_of(target).name:
             case "energy_wh":
                 return self.energy(segments)
             case "battery_power_kw":
@@ -211,7 +238,6 @@ class Vehicle(eqx.Module):
                 return self.torque(segments)
             case "traction_force_n":
                 return self.force(segments)
-        raise ValueError(f"unknown target {target!r}; one of {Target}")
 
     def breakdown(self, segments: Segments) -> dict[str, Float[Array, " row"]]:
         """Energy of each effect by row [Wh]. The entries add up to `energy` to rounding.
@@ -238,3 +264,24 @@ def _in_motion(row: Segments, x: Any) -> Any:
 
 def _is_sensor(e: Effect) -> bool:
     return e.overrides("across") or e.overrides("sense") or e.overrides("observe")
+
+
+def coefficients_that_hold(car: Vehicle, row: Segments) -> tuple[Real, Real]:
+    """c_rr and C_d·A [m²] with which rolling resistance and drag alone are the force of all effects that go with the
+    weight or with the air, in one row; the channels that these derive by trip must be there.
+
+    Where the vehicle does not move (for C_d·A: is slower than 0.1 m/s) it is the declared coefficient. **Raises:**
+    `KeyError` for a vehicle without rolling resistance or drag.
+    """
+    car = resolve(car, row)
+    parts = [e.split(row, car) for e in car.effects]
+    weight: Any = sum(w for w, _ in parts)
+    air: Any = sum(a for _, a in parts)
+    square = mean_square_speed(row)
+    moves = row.distance_m > 0
+    fast = moves & (square > _SLOW_MPS**2)
+    pressure = 0.5 * row.get("air_density_kgpm3", AIR_DENSITY_KGPM3) * jnp.where(fast, square, 1.0)
+    return (
+        jnp.where(moves, weight / weight_on_road(row, car), car.effect("rolling").c_rr),
+        jnp.where(fast, air / pressure, car.effect("aero").cda_m2),
+    )

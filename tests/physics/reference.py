@@ -85,6 +85,8 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
     m, theta = r["mass_kg"], r["grade_rad"]
     if p := effects.get("mass_scale"):
         m = m * (1 + p["scale"])
+    if p := effects.get("grade_scale"):
+        theta = theta + p["scale"] * theta
     if p := effects.get("grade_bias"):
         theta = theta + p["bias_rad"]
     if p := effects.get("speed_scale"):
@@ -105,6 +107,8 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
         force += m * G * math.cos(theta) * car["c_rr"] * p["excess"] * math.exp(-r["gone_m"] / p["distance_m"])
     if p := effects.get("road_surface"):
         force += m * G * math.cos(theta) * car["c_rr"] * p["excess"][int(r["road_surface"])]
+    if p := effects.get("rolling_linear"):
+        force += p["n_per_mps"] * v
     if p := effects.get("cornering"):
         force += p["coefficient"] * m * (square * r["curvature_1pm"]) ** 2
     if (p := effects.get("brake_drag")) and r["since_s"] is not None and v > 0.1:
@@ -126,6 +130,8 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
         power += p["w_per_nm2"] * torque**2
     if p := effects.get("iron_loss"):
         power += p["w_per_radps"] * abs(omega) + p["w_per_radps2"] * omega**2
+    if p := effects.get("efficiency_scale"):
+        power += p["scale"] * abs(power)
     power += car["auxiliary_w"]
     if p := effects.get("auxiliary_power"):
         power += p["power_w"]
@@ -139,12 +145,14 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
         power += p["w_per_passenger"] * r["passengers"] * (cooled - heated)
     if p := effects.get("cabin_warmup"):
         power += p["power_w"] * math.exp(-(r["time_s"] + dt / 2) / p["tau_s"])
+    if (p := effects.get("regen_efficiency")) and power < 0:
+        power -= p["share"] * power
     if (p := effects.get("friction_blending")) and r["brake_pressure_pa"] > p["above_pa"] and power < 0:
         power -= p["share"] * power
     if p := effects.get("battery_resistance"):
         power += p["resistance_ohm"] * (power / r["voltage_v"]) ** 2
     if p := effects.get("regen_limit"):
-        power = max(power, -p["power_w"])
+        power += p["share"] * (max(power, -p["power_w"]) - power)
     return power
 
 

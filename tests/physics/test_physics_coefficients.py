@@ -9,8 +9,7 @@ import numpy as np
 import physics_rows as made
 import pytest
 
-from hdev_jax.physics import Vehicle, coefficients_that_hold, derived
-from hdev_jax.physics.coefficients import WITH_AIR, WITH_WEIGHT
+from hdev_jax.physics import LIBRARY, Vehicle, coefficients_that_hold, derived
 from hdev_jax.segments import Segments
 
 
@@ -21,7 +20,7 @@ def held(car: Vehicle, log: Segments) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_they_have_the_force_of_all_the_effects_in_the_kernel() -> None:
-    added = [i for i in (*WITH_WEIGHT, *WITH_AIR, "wet_road") if i not in ("rolling", "aero")]
+    added = [i for i, c in LIBRARY.items() if c.goes_with]
     plain = made.baseline()
     car = plain.plus(*(made.typical(i) for i in added))
     log = made.drives(*made.LENGTHS)

@@ -13,7 +13,7 @@ import physics_rows as made
 import pytest
 from jax.test_util import check_grads
 
-from hdev_jax.physics import LIBRARY, Vehicle, library
+from hdev_jax.physics import LIBRARY, Choice, Grouped, Parameter, Shape, Size, Switch, Vehicle, library
 from hdev_jax.physics.effect import STAGES, Effect
 from hdev_jax.physics.library import DECLARED, unavailable
 from hdev_jax.segments import Segments
@@ -64,22 +64,79 @@ def test_parameters(effect_id: str) -> None:
     effect = LIBRARY[effect_id]
     names = [p.name for p in effect.parameters]
     assert [f.name for f in dataclasses.fields(effect)] == names
-    sizes = {p.name for p in effect.parameters if p.kind in ("size", "limit")}
+    sizes = {p.name for p in effect.parameters if p.has_column}
     assert sizes, "nothing to find"
     for chosen in effect.variants:
         assert set(chosen) <= sizes
     for p in effect.parameters:
         assert p.unit
-        assert p.scale != 0
-        assert p.lower < p.upper
-        assert all(p.lower <= g <= p.upper for g in p.grid) or p.kind == "choice" or p.in_rows
-        if p.kind == "size":
-            assert p.lower <= p.null <= p.upper
+        if isinstance(p, Size):
             assert 0 < p.least < abs(p.scale)
-        if p.kind == "limit":
-            assert p.grid
-        if p.kind == "shape":
+        if isinstance(p, Shape):
             assert p.lower < p.null < p.upper
+            assert p.of in ("", *sizes)
+
+
+REFUSED = {
+    "no kind": (lambda: Parameter("x", "1", 0.0, 1.0), "Size, Switch, Shape, Choice"),
+    "no typical size": (lambda: Size("x", "1", 0.0, 0.0), "scale is 0"),
+    "an empty range": (lambda: Size("x", "1", 0.0, 1.0, 2.0, 1.0), "lower is 2 and upper 1"),
+    "no number": (lambda: Size("x", "1", 0.0, 1.0, float("nan")), "are numbers"),
+    "a size without a null": (lambda: Size("x", "1", float("nan"), 1.0), "are numbers"),
+    "a null outside": (lambda: Size("x", "1", 0.0, 1.0, 1.0, 2.0), "null is 0"),
+    "an unknown group": (lambda: Size("x", "1", 0.0, 1.0, by="axle"), "by is 'axle'"),
+    "whole without groups": (lambda: Size("x", "1", 0.0, 1.0, whole=True), "whole"),
+    "a switch that is never tried": (lambda: Switch("x", "1", 0.0, 1.0, grid=()), "a Switch without a grid"),
+    "a shape that is never tried": (lambda: Shape("x", "1", 0.0, 1.0, grid=()), "a Shape without a grid"),
+    "a grid beyond the range": (lambda: Shape("x", "1", 1.0, 1.0, 0.0, 2.0, grid=(1.0, 3.0)), "grid has 3"),
+}
+
+
+@pytest.mark.parametrize(("make", "words"), REFUSED.values(), ids=REFUSED)
+def test_a_parameter_that_could_never_be_fitted_or_tried(make: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("kind", "field"),
+    [(Size, "grid"), (Size, "of"), (Size, "smooth"), (Switch, "by"), (Switch, "of"), (Shape, "least"), (Shape, "by"),
+     (Choice, "least"), (Choice, "of"), (Choice, "in_rows")],
+)  # fmt: skip
+def test_a_parameter_has_only_the_fields_of_its_kind(kind: type[Parameter], field: str) -> None:
+    assert field not in {f.name for f in dataclasses.fields(kind)}
+    assert getattr(kind, field) == getattr(Parameter, field)  # and reads as nothing
+
+
+def test_what_is_typical_is_plausible(effect_id: str) -> None:
+    effect = LIBRARY[effect_id]
+    typical, null = made.typical(effect_id), made.null(effect_id)  # shapes are typical of trips of a few seconds
+    assert not effect.implausible({p.name: getattr(typical, p.name) for p in effect.parameters if p.has_column})
+    assert not effect.implausible({p.name: getattr(null, p.name) for p in effect.parameters})
+    for p in effect.parameters:
+        for beyond in (p.lower - abs(p.scale), p.upper + abs(p.scale)):
+            if np.isfinite(beyond) and beyond < 1e12 and beyond != p.null:
+                assert p.name in effect.implausible({p.name: beyond})
+    for low, high in effect.ordered:
+        assert {low, high} <= {p.name for p in effect.parameters}
+
+
+def test_limits_of_one_effect_are_in_order() -> None:
+    hvac = LIBRARY["hvac_power"]
+    assert not hvac.implausible({"heat_c": 17.0, "cool_c": 23.0})
+    assert "not below cool_c" in hvac.implausible({"heat_c": 23.0, "cool_c": 17.0})
+    assert "not below cool_c" in hvac.implausible({"heat_c": 20.0, "cool_c": 20.0})
+    assert not hvac.implausible({"heat_c": 23.0})
+    assert not hvac.implausible({"heat_c": 23.0, "cool_c": None})
+    assert not hvac.implausible({"heat_c": 23.0, "cool_c": float("nan")})
+
+
+def test_values_of_groups_are_judged_one_by_one() -> None:
+    drag = LIBRARY["driveline_drag"]
+    assert not drag.implausible({"torque_nm": Grouped([0.0, 5.0, 9.0], "gear")})
+    assert "-5" in drag.implausible({"torque_nm": Grouped([0.0, 5.0, -5.0], "gear")})
+    with pytest.raises(KeyError, match="torque"):
+        drag.implausible({"torque": 1.0})
 
 
 def test_needs_are_what_it_reads(effect_id: str) -> None:
@@ -187,7 +244,7 @@ def test_gradient_against_differences(effect_id: str) -> None:
     """Away from switches: no row of this log lies on one at the typical size. (That reverse is forward is above.)"""
     car, effect = made.without_effect(effect_id), made.typical(effect_id)
     log = made.log_for(effect_id, seed=3)
-    held = {p.name for p in effect.parameters if p.kind == "choice"}
+    held = {p.name for p in effect.parameters if isinstance(p, Choice)}
     flat, back = jax.flatten_util.ravel_pytree({k: v for k, v in vars(effect).items() if k not in held})
     scale = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
     largest = float(np.max(np.abs(car.energy(log))))

@@ -9,9 +9,9 @@ import physics_rows as made
 import pytest
 
 from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
-from hdev_jax.physics.battery import FrictionBlending, RegenCutoff, RegenLimit, TractionLimit
+from hdev_jax.physics.battery import BatteryResistance, FrictionBlending, RegenCutoff, RegenLimit, TractionLimit
 from hdev_jax.physics.machine import switch
-from hdev_jax.physics.road import Aero, ConstantHeadwind, Grade, Headwind, Inertia, Rolling
+from hdev_jax.physics.road import Aero, AirDensity, ConstantHeadwind, Grade, Headwind, Inertia, Rolling
 from hdev_jax.segments import Segments
 
 M, G, RHO = 24e3, 9.80665, 1.225
@@ -112,6 +112,53 @@ def test_paper_2_equations_7_and_8() -> None:
     blended = car.plus(FrictionBlending(share=made.arr(0.3), above_pa=made.arr(2e4)))
     same(blended.power(braking), 0.7 * car.power(braking))
     same(blended.power(released), car.power(released))
+
+
+@pytest.mark.parametrize("effect_id", ["aero", "headwind", "constant_headwind", "crosswind", "drafting", "wet_road"])
+def test_what_goes_with_the_air_goes_with_its_density(effect_id: str) -> None:
+    """½ρC_dA·v² with the ρ of the log, in every part that the declared drag is a factor of, once."""
+    log = made.drives(*made.LENGTHS)
+    dense = log.with_channels(air_density_kgpm3=np.linspace(0.9, 1.4, len(log)))
+    car = made.single(Aero(5.6)) if effect_id == "aero" else made.single(Aero(5.6)).plus(made.typical(effect_id))
+    factor = np.linspace(0.9, 1.4, len(log)) / RHO
+    same(car.force(dense), np.asarray(car.force(log)) * factor)
+
+
+def test_the_logs_density_leaves_nothing_to_the_effect_of_temperature() -> None:
+    """Where density is logged the declared drag is that of the effect at 1 on a log of that day's temperature."""
+    log = made.drives(*made.LENGTHS)
+    pressure = 101325.0 * (1 - 2.25577e-5 * log.channels["altitude_m"]) ** 5.25588
+    density = pressure / (287.05 * (log.channels["ambient_temp_c"] + 273.15))
+    told = made.single(Aero(5.6)).plus(AirDensity(1.0)).force(log)
+    same(made.single(Aero(5.6)).force(log.with_channels(air_density_kgpm3=density)), told)
+
+
+@pytest.mark.parametrize("force", [-5000.0, 5000.0])
+def test_braking_with_an_efficiency_of_its_own(force: float) -> None:
+    row = made.one_row(mass_kg=1000.0, speed_end_mps=10.0 + force / 100.0 * 0.1, speed_start_mps=10.0)
+    asked = float(made.single(Inertia(1.0)).force(row)[0])
+    line = Driveline(0.9, regenerating_efficiency=0.7)
+    car = Vehicle([Inertia(1.0)], mass_kg=1.0, driveline=line)
+    same(car.power(row), [asked * 10.0 / 0.9 if force > 0 else asked * 10.0 * 0.7])
+    same(Vehicle([Inertia(1.0)], mass_kg=1.0, driveline=Driveline(0.9)).power(row),
+         [asked * 10.0 / 0.9 if force > 0 else asked * 10.0 * 0.9])  # fmt: skip
+
+
+def test_the_log_has_the_last_word_on_voltage() -> None:
+    row = made.one_row(traction_force_n=5000.0)
+    car = Vehicle([BatteryResistance(0.1)], mass_kg=1.0, entry="wheel", nominal_voltage_v=500.0)
+    same(car.power(row), [5e4 + 0.1 * 100.0**2])
+    same(car.power(row.with_channels(voltage_v=np.array([250.0]))), [5e4 + 0.1 * 200.0**2])
+    with pytest.raises(ValueError, match="nominal_voltage_v"):
+        Vehicle([BatteryResistance(0.1)], mass_kg=1.0, entry="wheel").power(row)
+
+
+def test_torque_without_a_motor_speed_turns_with_the_wheels() -> None:
+    line = Driveline(1.0, [9.0, 4.0], final_drive=4.0, wheel_radius_m=0.5)
+    car = Vehicle([], mass_kg=1.0, driveline=line, machine=Machine(0.9, 0.8), entry="shaft")
+    row = made.one_row(motor_torque_nm=100.0, gear=2.0)
+    same(car.power(row), [100.0 * 10.0 * 4.0 * 4.0 / 0.5 / 0.9])
+    same(car.power(row.with_channels(motor_speed_radps=np.array([150.0]))), [100.0 * 150.0 / 0.9])
 
 
 def test_the_log_has_the_last_word_on_mass() -> None:
@@ -220,6 +267,15 @@ def test_limits_from_both_sides(effect: Any, power: float, slopes: tuple[float, 
     same(jax.grad(added)(jnp.asarray(power + 1.0)), slopes[1])
     assert min(slopes) <= jax.grad(added)(jnp.asarray(power)) <= max(slopes)
     assert jax.jacfwd(added)(jnp.asarray(power)) == jax.grad(added)(jnp.asarray(power))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_a_limit_of_regeneration_may_act_in_part(share: float) -> None:
+    """Of 50 kW of braking 20 kW are beyond the limit: all of that is lost, or a share of it."""
+    car = made.single(RegenLimit(3e4, share), entry="wheel")
+    same(car.power(made.one_row(traction_force_n=-5000.0)), [-5e4 + share * 2e4])
+    same(car.power(made.one_row(traction_force_n=-2000.0)), [-2e4])
+    same(made.single(RegenLimit(3e4), entry="wheel").power(made.one_row(traction_force_n=-5000.0)), [-3e4])
 
 
 def test_regen_cutoff_takes_all_below_and_nothing_above() -> None:

@@ -33,7 +33,7 @@ REFERENCED = (
     "headwind", "rolling_temperature", "tyre_warmup", "road_surface", "cornering", "brake_drag",
     "driveline_drag", "gear_efficiency",
     "copper_loss", "iron_loss", "auxiliary_power", "hvac_power", "passenger_heat", "cabin_warmup", "friction_blending",
-    "battery_resistance", "regen_limit",
+    "battery_resistance", "regen_limit", "rolling_linear", "grade_scale", "efficiency_scale", "regen_efficiency",
 )  # fmt: skip
 SEEDS = st.integers(0, 10_000)
 evaluate = eqx.filter_jit(lambda car, log: car.energy(log))
