@@ -1,46 +1,42 @@
-"""Calibration: Levenberg-Marquardt on the kernel with tabular priors, errors clustered by trip."""
+"""Calibration: Levenberg-Marquardt on the kernel's Jacobian with tabular priors, errors clustered by trip.
 
+The Jacobian and the prediction of a chunk of rows are one compiled program; the steps are taken on normal equations,
+which add up over chunks.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from hdev_jax.inference.clusters import Clusters, clustered
 from hdev_jax.inference.parameters import ParameterTable, insert
-from hdev_jax.physics import Vehicle, derived
-from hdev_jax.physics.vehicle import Target
-from hdev_jax.segments import Segments
+from hdev_jax.inference.rows import Chunk, Fit, Shapes, chunks_of_fit, padded, padded_rows
+from hdev_jax.physics import Vehicle
+from hdev_jax.segments import Segments, trip_slices
+from hdev_jax.targets import TargetName
 
 __all__ = [
-    "STUDENT_DF", "WEAK", "Calibration", "Fit", "calibrate", "inside", "jacobian", "padded", "padded_rows", "predict",
-    "tabular",
+    "STUDENT_DF", "WEAK", "Calibration", "Fit", "calibrate", "inside", "jacobian", "linearised", "padded",
+    "padded_rows", "predict", "tabular",
 ]  # fmt: skip
 
 STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
-
-
-Real = Float[Array, " row"] | Float[np.ndarray, " row"]
-
-
-class Fit(eqx.Module):
-    """The rows of one problem, padded to a shape that others share. Rows past the log have weight 0."""
-
-    segments: Segments
-    measured: Real
-    weight: Real
-    rows: int
+MOST_STEPS = 50
+SETTLED = 1e-3  # standard errors that a further step would move the estimate by
+LEAST_GAIN = 1e-5  # of a step, in log-likelihood
+UNBOUNDED = 1e9  # a bound beyond it is none
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a fit came to. `values`, `sd` and `covariance` follow `table.free`; `message` is the solver's own word."""
+    """What a fit came to. `values`, `sd` and `covariance` follow `table.free`; `message` says how the solver ended."""
 
     vehicle: Vehicle
     table: ParameterTable
@@ -53,6 +49,11 @@ class Calibration:
     converged: bool
     message: str
     steps: int
+
+    @property
+    def errors(self) -> Float[np.ndarray, " free"]:
+        """Standard errors; of coefficients known by generalised least squares no smaller than theirs."""
+        return np.maximum(self.sd, [c.known[1] if c.known else 0.0 for c in self.table.free])
 
     def prior_z(self) -> Float[np.ndarray, " free"]:
         """How far each coefficient moved from its table, in its tabular sd; NaN without one."""
@@ -69,105 +70,154 @@ def tabular(table: ParameterTable) -> tuple[Float[np.ndarray, " k"], Float[np.nd
     return np.array([value for value, _, _ in priors], dtype=float), np.array(sd, dtype=float)
 
 
-def padded_rows(n: int) -> int:
-    """The next of eight shapes per octave, so that logs of like length share one compilation."""
-    quantum = max(64, 2 ** max(int(np.ceil(np.log2(max(n, 1)))) - 3, 0))
-    return int(np.ceil(n / quantum) * quantum)
+def _jacobian_of(structure: Any, start: np.ndarray, scale: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """From the solver's space to the coefficients' supports: values, and their slopes dθ/dz.
 
-
-def padded(segments: Segments, measured: np.ndarray, size: int | None = None) -> Fit:
-    """Rows padded to `size` rows, by default to `padded_rows` of them. Raises `ValueError` where they do not fit."""
-    n = len(segments)
-    size = padded_rows(n) if size is None else size
-    if size < n:
-        raise ValueError(f"{n} rows do not fit into {size}; give a size of at least as many rows")
-    extra = size - n
-
-    def pad(x: Any, fill: Any = None) -> np.ndarray:
-        x = np.asarray(x)
-        return np.concatenate([x, np.full(extra, x[-1] if fill is None else fill, dtype=x.dtype)]) if extra else x
-
-    out = jax.tree.map(pad, segments)
-    # a trip of its own, standing still: finite everywhere, and no neighbour of a real row
-    out = eqx.tree_at(
-        lambda s: (s.trip, s.distance_m),
-        out,
-        (pad(segments.trip, fill=int(np.max(np.asarray(segments.trip))) + 1), pad(segments.distance_m, fill=0.0)),
-    )
-    out = jax.tree.map(np.asarray, derived(out))
-    return Fit(out, pad(measured, fill=0.0), np.r_[np.ones(n), np.zeros(extra)], n)
-
-
-def _to_support(z: Array, start: Any, scale: Any, structure: Any) -> Array:
-    """From the solver's space to the coefficient's support; z = 0 is the start, slope `scale` there."""
-    out = []
+    z = 0 is the start, with slope `scale` there; a coefficient bounded on one side moves by its logarithm, one that is
+    bounded on both by its logit.
+    """
+    theta, slope = np.empty(len(z)), np.empty(len(z))
     for k, (_, _, lower, upper) in enumerate(structure):
         x0, s = start[k], scale[k]
         if np.isinf(lower) and np.isinf(upper):
-            out.append(x0 + s * z[k])
-        elif np.isinf(upper) or upper > 1e9:
-            out.append(lower + (x0 - lower) * jnp.exp(s * z[k] / (x0 - lower)))
+            theta[k], slope[k] = x0 + s * z[k], s
+        elif np.isinf(upper) or upper > UNBOUNDED:
+            theta[k] = lower + (x0 - lower) * np.exp(np.clip(s * z[k] / (x0 - lower), -50.0, 50.0))
+            slope[k] = s * (theta[k] - lower) / (x0 - lower)
         else:
-            u = (x0 - lower) / (upper - lower)
-            logit = jnp.log(u) - jnp.log1p(-u)
-            out.append(lower + (upper - lower) * jax.nn.sigmoid(logit + s * z[k] / ((upper - lower) * u * (1 - u))))
-    return jnp.stack(out)
+            width, u = upper - lower, (x0 - lower) / (upper - lower)
+            rate = s / (width * u * (1 - u))
+            share = 1.0 / (1.0 + np.exp(-np.clip(np.log(u) - np.log1p(-u) + rate * z[k], -50.0, 50.0)))
+            theta[k], slope[k] = lower + width * share, width * share * (1 - share) * rate
+    return theta, slope
 
 
 @eqx.filter_jit
-def _solve(
-    vehicle: Vehicle,
-    structure: Any,
-    target: Target,
-    segments: Segments,
-    measured: Any,
-    weight: Any,
-    start: Any,
-    scale: Any,
-    prior: Any,
-    prior_sd: Any,
-) -> Any:
-    def residuals(z: Array, args: Any) -> Array:
-        vehicle, segments, measured, weight = args
-        theta = _to_support(z, start, scale, structure)
-        r = weight * (insert(vehicle, structure, theta).predict(segments, target) - measured)
-        return jnp.concatenate([r, (theta - prior) / prior_sd])
+def _linearised(
+    vehicle: Vehicle, structure: Any, target: TargetName, segments: Segments, theta: Any
+) -> tuple[Array, Array]:
+    def column(x: Array) -> tuple[Array, Array]:
+        y = insert(vehicle, structure, x).predict(segments, target)
+        return y, y
 
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
-    z0 = jnp.zeros_like(start)
-    args = (vehicle, segments, measured, weight)
-    sol = optx.least_squares(residuals, solver, z0, args=args, max_steps=50, throw=False)
-    theta = _to_support(sol.value, start, scale, structure)
-    predicted = insert(vehicle, structure, theta).predict(segments, target)
-    return theta, predicted, sol.result, sol.stats["num_steps"]
+    slope, value = jax.jacfwd(column, has_aux=True)(theta)
+    return value, slope
 
 
-@eqx.filter_jit
-def _jacobian(vehicle: Vehicle, structure: Any, target: Target, segments: Segments, theta: Any) -> Array:
-    def column(x: Array) -> Array:
-        return insert(vehicle, structure, x).predict(segments, target)
-
-    return jax.jacfwd(column)(theta)
+def linearised(
+    vehicle: Vehicle, table: ParameterTable, segments: Segments, target: TargetName, theta: Any = None
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]:
+    """The prediction and its derivative in the free coefficients, at their present values or at `theta`."""
+    if not table.free:
+        return np.asarray(predict(vehicle, segments, target)), np.zeros((len(segments), 0))
+    at = table.values(vehicle) if theta is None else theta
+    value, slope = _linearised(vehicle, table.structure, target, segments, jnp.asarray(at))
+    return np.asarray(value), np.asarray(slope)
 
 
 def jacobian(
-    vehicle: Vehicle, table: ParameterTable, segments: Segments, target: Target
+    vehicle: Vehicle, table: ParameterTable, segments: Segments, target: TargetName
 ) -> Float[np.ndarray, "row free"]:
     """∂ predicted / ∂θ of the free coefficients at their present values."""
-    if not table.free:
-        return np.zeros((len(segments), 0))
-    return np.asarray(_jacobian(vehicle, table.structure, target, segments, jnp.asarray(table.values(vehicle))))
+    return linearised(vehicle, table, segments, target)[1]
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Where the solver stands: coefficients, the rows' predictions and Jacobian there."""
+
+    theta: Float[np.ndarray, " free"]
+    predicted: Float[np.ndarray, " row"]
+    slopes: Float[np.ndarray, "row free"]
+
+    @property
+    def finite(self) -> bool:
+        return bool(np.all(np.isfinite(self.predicted)) and np.all(np.isfinite(self.slopes)))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """What stays the same while the solver moves."""
+
+    vehicle: Vehicle
+    table: ParameterTable
+    chunks: Sequence[Chunk]
+    target: TargetName
+    measured: Float[np.ndarray, " row"]
+    prior: Float[np.ndarray, " free"]
+    prior_sd: Float[np.ndarray, " free"]
+    scale: Float[np.ndarray, " free"]
+
+    def at(self, theta: Float[np.ndarray, " free"]) -> _Point:
+        """The rows linearised at these coefficients."""
+        predicted = np.empty(len(self.measured))
+        slopes = np.empty((len(self.measured), len(theta)))
+        for chunk in self.chunks:
+            value, slope = linearised(self.vehicle, self.table, chunk.segments, self.target, theta)
+            predicted[chunk.at], slopes[chunk.at] = value[: chunk.rows], slope[: chunk.rows]
+        return _Point(theta, predicted, slopes)
+
+    def cost(self, point: _Point, weight: Float[np.ndarray, " row"]) -> float:
+        """Half the sum of squares, of rows and of the prior."""
+        rows = weight * (self.measured - point.predicted)
+        return 0.5 * float(rows @ rows) + 0.5 * float(np.sum(((point.theta - self.prior) / self.prior_sd) ** 2))
+
+    def solve(self, point: _Point, weight: Float[np.ndarray, " row"]) -> tuple[_Point, bool, str, int]:
+        """Levenberg-Marquardt (Marquardt, SIAM J. Appl. Math. 11, 1963) from a point.
+
+        **Returns:** where it ends, whether it settled, a word on it, and the steps that it took.
+        """
+        structure, start = self.table.structure, point.theta.copy()
+        for k, (_, _, lower, upper) in enumerate(structure):
+            edge = 1e-9 * (upper - lower) if np.isfinite(upper - lower) and upper <= UNBOUNDED else 0.0
+            if not lower + edge < start[k] < upper - edge:  # where the round before ended the transform has no slope
+                start[k] = inside(start[k], lower, upper)
+        if np.any(start != point.theta):
+            point = self.at(start)
+        z, damping, growth, cost = np.zeros(len(start)), 1e-9, 10.0, self.cost(point, weight)
+        precision = 1.0 / self.prior_sd**2
+        for step in range(1, MOST_STEPS + 1):
+            _, slope = _jacobian_of(structure, start, self.scale, z)
+            weighed = weight[:, None] * point.slopes
+            hessian = (weighed.T @ weighed + np.diag(precision)) * np.outer(slope, slope)
+            pull = precision * (point.theta - self.prior)
+            gradient = slope * (weighed.T @ (weight * (self.measured - point.predicted)) - pull)
+            d = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+            scaled, right = hessian / np.outer(d, d), gradient / d
+            try:
+                newton = np.linalg.solve(scaled + 1e-12 * np.eye(len(d)), right)
+                # what a whole step would gain: in standard errors, the distance to the optimum
+                if np.sqrt(max(float(newton @ right), 0.0)) < SETTLED:
+                    return point, True, "converged", step - 1
+                move = np.linalg.solve(scaled + damping * np.eye(len(d)), right) / d
+            except np.linalg.LinAlgError:
+                return point, False, "the normal equations are singular; give the coefficients priors", step
+            expected = float(move @ gradient - 0.5 * move @ hessian @ move)
+            trial = self.at(_jacobian_of(structure, start, self.scale, z + move)[0])
+            gained = cost - self.cost(trial, weight) if trial.finite else -np.inf
+            if gained > 0:
+                ratio = gained / max(expected, 1e-300)
+                point, z, cost = trial, z + move, cost - gained
+                damping, growth = max(damping / 10.0 if ratio > 0.5 else damping, 1e-12), 10.0
+                if gained < max(LEAST_GAIN, 1e-13 * cost):  # at a kink a step never reaches the optimum of its line
+                    return point, True, "converged", step
+            else:
+                if expected < 1e-13 * cost:  # rounding: there is nothing left to gain
+                    return point, True, "converged", step
+                damping, growth = damping * growth, growth * 10.0
+        return point, False, f"stopped after {MOST_STEPS} steps; start nearer or give a prior", MOST_STEPS
 
 
 def calibrate(
     vehicle: Vehicle,
     table: ParameterTable,
     fit: Fit,
-    target: Target,
+    target: TargetName,
     clusters: Clusters,
     *,
     noise: Literal["normal", "student_t"] = "normal",
     weights: Float[np.ndarray, " row"] | None = None,
+    chunks: Sequence[Chunk] | None = None,
 ) -> Calibration:
     """Maximum a posteriori values of the table's free coefficients.
 
@@ -176,7 +226,8 @@ def calibrate(
     estimates. Standard errors are clustered (jackknife over clusters; MacKinnon, Nielsen and Webb 2023).
 
     **Arguments:** `fit` from `padded`; `clusters` of its real rows; `noise`: "student_t" reweights rows by a
-    t-distribution with 4 degrees of freedom, for logs with outliers; `weights` (real rows) multiply residuals.
+    t-distribution with 4 degrees of freedom, for logs with outliers; `weights` (real rows) multiply residuals;
+    `chunks`, the rows of `fit` in chunks, where they have been made already.
 
     **Returns:** a `Calibration`, whose `converged` and `message` its caller reads. Coefficients that are not free are
     kept.
@@ -185,60 +236,58 @@ def calibrate(
     base = np.ones(rows) if weights is None else np.asarray(weights, dtype=float)
     measured = np.asarray(fit.measured)[:rows]
     theta = table.values(vehicle)
-    if not free:
-        predicted = np.asarray(predict(vehicle, fit.segments, target))[:rows]
-        sigma = float(np.sqrt(np.mean((base * (measured - predicted)) ** 2)))
-        none = np.zeros((0, 0))
-        return Calibration(vehicle, table, theta, theta, none, predicted, sigma, 1.0, True, "nothing to estimate", 0)
-
+    if chunks is None:
+        longest = max(s.stop - s.start for _, s in trip_slices(np.asarray(fit.segments.trip)[:rows]))
+        chunks = list(chunks_of_fit(fit, Shapes(rows, longest)))
+    if free:
+        prior, prior_sd = tabular(table)
+        theta = np.array([inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
+    else:
+        prior = prior_sd = np.zeros(0)
     scale = np.array([c.scale for c in free])
-    prior, prior_sd = tabular(table)
-    theta = np.array([inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
-    structure = table.structure
-
-    sigma, inflation, tail = 1.0, 1.0, np.ones(rows)
-    message, converged, steps = "", False, 0
-    predicted = np.zeros(rows)
+    problem = _Problem(vehicle, table, chunks, target, measured, prior, prior_sd, scale)
+    point = problem.at(theta)
+    sigma = float(np.sqrt(np.mean((base * (measured - point.predicted)) ** 2)))
+    if not free:
+        none = np.zeros((0, 0))
+        return Calibration(
+            vehicle, table, theta, theta, none, point.predicted, sigma, 1.0, True, "nothing to estimate", 0
+        )
+    sigma += 1e-12
+    inflation, tail, steps = 1.0, np.ones(rows), 0
+    message, converged = "left the finite numbers; start nearer or give a prior", False
     covariance = np.diag(prior_sd**2)  # of a fit that ends before it has looked
-    for sweep in range(8 if noise == "student_t" else 3):
-        if sweep == 0:  # the first sweep only looks for σ: the prior weighs as against a perfect log
-            p = np.asarray(predict(insert(vehicle, structure, jnp.asarray(theta)), fit.segments, target))[:rows]
-            sigma = float(np.sqrt(np.mean((base * (measured - p)) ** 2))) + 1e-12
-        row_weight = np.zeros(np.shape(fit.weight)[0])
-        row_weight[:rows] = base * np.sqrt(tail / inflation) / sigma
-        rows_of = (fit.segments, fit.measured, row_weight)  # not `fit`, whose number of real rows would be compiled in
-        start = jnp.asarray(theta)
-        new, p, result, taken = _solve(vehicle, structure, target, *rows_of, start, scale, prior, prior_sd)
-        if not (np.isfinite(sigma) and np.all(np.isfinite(new)) and np.all(np.isfinite(p))):
-            message, converged = "left the finite numbers; start nearer or give a prior", False
+    for _ in range(8 if noise == "student_t" else 3):
+        if not (np.isfinite(sigma) and point.finite):
             break
-        predicted, steps = np.asarray(p)[:rows], steps + int(taken)
-        converged = bool(result == optx.RESULTS.successful)
-        message = "converged" if converged else str(optx.RESULTS[result]).strip() or "did not converge"
-        change = np.max(np.abs(np.asarray(new) - theta) / scale)
-        theta = np.asarray(new)
-        r = base * (measured - predicted)
+        before = point.theta
+        point, converged, message, taken = problem.solve(point, base * np.sqrt(tail / inflation) / sigma)
+        steps += taken
+        change = np.max(np.abs(point.theta - before) / scale)
+        r = base * (measured - point.predicted)
         if noise == "student_t":
             tail = (STUDENT_DF + 1.0) / (STUDENT_DF + (r / sigma) ** 2)
             new_sigma = float(np.sqrt(np.mean(tail * r**2))) + 1e-12
         else:
             new_sigma = float(np.sqrt(np.mean(r**2))) + 1e-12
-        jac = np.asarray(_jacobian(vehicle, structure, target, fit.segments, jnp.asarray(theta)))[:rows]
-        w = np.sqrt(tail)[:, None] * base[:, None]
-        grams, scores = clusters.grams(w * jac), clusters.sums(w * jac * (np.sqrt(tail) * r)[:, None])
+        weighed = (np.sqrt(tail) * base)[:, None] * point.slopes
+        grams, scores = clusters.grams(weighed), clusters.sums(weighed * (np.sqrt(tail) * r)[:, None])
         covariance, new_inflation = clustered(grams, scores, new_sigma, prior_sd)
         if noise == "student_t":
             settled = abs(np.log(new_sigma / sigma)) < 1e-3 and change < 1e-4
         else:  # new weights of the likelihood move the optimum only as far as the prior pulls on it
-            pull = np.abs(1.0 - (sigma**2 * inflation) / (new_sigma**2 * new_inflation)) * (theta - prior) / prior_sd**2
+            pull = np.abs(1.0 - (sigma**2 * inflation) / (new_sigma**2 * new_inflation))
+            pull = pull * (point.theta - prior) / prior_sd**2
             settled = bool(np.all(np.abs(covariance @ pull) < 0.01 * np.sqrt(np.diag(covariance))))
         sigma, inflation = new_sigma, new_inflation
         if settled:
             break
 
-    fitted = table.insert(vehicle, jnp.asarray(theta))
+    fitted = table.insert(vehicle, jnp.asarray(point.theta))
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return Calibration(fitted, table, theta, sd, covariance, predicted, sigma, inflation, converged, message, steps)
+    return Calibration(
+        fitted, table, point.theta, sd, covariance, point.predicted, sigma, inflation, converged, message, steps
+    )
 
 
 def inside(x: float, lower: float, upper: float) -> float:
@@ -252,6 +301,6 @@ def inside(x: float, lower: float, upper: float) -> float:
 
 
 @eqx.filter_jit
-def predict(vehicle: Vehicle, segments: Segments, target: Target) -> Array:
+def predict(vehicle: Vehicle, segments: Segments, target: TargetName) -> Array:
     """The target's column on every row of `segments`, in its unit; one compiled program for each padded shape."""
     return vehicle.predict(segments, target)

@@ -18,8 +18,8 @@ __all__ = [
 ]
 
 FEW_TRIPS = 8  # below this many training trips a trip is too coarse a unit (design, step 5)
-MOST_CLUSTERS = 256  # tell a variance to 9 %; each more costs a Gram matrix of all candidates
-LEAST_RATIO = 0.1  # of a clustered to the naive variance: less is too few clusters, or rounding where rows tell nothing
+MOST_CLUSTERS = 256  # give a variance to 9 %; each more costs a Gram matrix of all candidates
+LEAST_RATIO = 0.1  # of a clustered to the naive variance: less is too few clusters, or rounding of no information
 BLOCK_S = 300.0  # the shortest block, longer than what correlates errors on the road
 
 
@@ -95,9 +95,9 @@ def clustered(
     moves = np.linalg.solve(information + ridge - (1 - 1e-6) * grams, scores[:, :, None])[:, :, 0]
     robust = (g - 1) / g * moves.T @ moves if g > 1 else sigma**2 * bread
     naive = sigma**2 * bread
-    told = np.diag(information) > 0.5  # a column of zeros has nothing to be clustered
-    ratio = np.diag(robust)[told] / np.maximum(np.diag(naive)[told], 1e-300)
-    inflation = max(1.0, float(np.mean(ratio))) if told.any() else 1.0
+    informed = np.diag(information) > 0.5  # a column of zeros has nothing to be clustered
+    ratio = np.diag(robust)[informed] / np.maximum(np.diag(naive)[informed], 1e-300)
+    inflation = max(1.0, float(np.mean(ratio))) if informed.any() else 1.0
     # the clustered likelihood, as a normal around its own maximum, times the prior
     precision = np.linalg.inv(_no_surer(robust, naive) + 1e-300 * np.eye(len(d)))
     prior = np.diag(1.0 / (prior_sd * d) ** 2)
@@ -107,8 +107,8 @@ def clustered(
 def _no_surer(robust: Float[np.ndarray, "k k"], naive: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
     """`robust` with at least `LEAST_RATIO` of the naive variance in every direction.
 
-    Where rows tell nothing the naive variance is without bound and clusters have nothing to disagree about: their
-    agreement is no knowledge, and the prior has the word.
+    Where rows hold no information the naive variance is unbounded and the clusters agree at 0: there the prior
+    decides.
     """
     values, vectors = np.linalg.eigh(naive)
     root = vectors * np.sqrt(np.maximum(values, 1e-300))

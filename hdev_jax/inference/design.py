@@ -15,15 +15,15 @@ from hdev_jax.inference.clusters import clustered
 from hdev_jax.inference.linear import LEAST_ROWS, Posterior, Prior, Statistics, posterior, statistics
 from hdev_jax.inference.parameters import ParameterTable, insert, insert_by
 from hdev_jax.physics import Vehicle
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = ["GROUP", "LinearFit", "Rows", "design", "linear_fit", "supported", "tabular"]
 
 GROUP = "coefficient_group"  # the channel that says which group's coefficients hold for a row
 PASSES = 8  # a kernel that is linear needs two, the second to see that it is
 ROBUST_PASSES = 24  # an outlier's weight falls by a factor a pass, with the noise that it is measured by
-LEAST_NOISE = 1e-5  # of what a usual change of the coefficient that tells most changes in a row
+LEAST_NOISE = 1e-5  # of what a usual change of the most influential coefficient changes in a row
 SETTLED = 0.01  # relative change of the noise
 ENOUGH = 0.02  # posterior sds: a step that is shorter changes nothing that anyone would report
 
@@ -103,7 +103,7 @@ class LinearFit:
 
 
 @eqx.filter_jit
-def _design(vehicle: Vehicle, structure: Any, target: Target, segments: Segments, theta: Any, group: Any) -> Any:
+def _design(vehicle: Vehicle, structure: Any, target: TargetName, segments: Segments, theta: Any, group: Any) -> Any:
     def column(step: Array) -> tuple[Array, Array]:
         if group is None:
             predicted = insert(vehicle, structure, theta + step).predict(segments, target)
@@ -116,7 +116,7 @@ def _design(vehicle: Vehicle, structure: Any, target: Target, segments: Segments
 
 
 def design(
-    vehicle: Vehicle, table: ParameterTable, segments: Segments, target: Target, theta: Any, group: Any = None
+    vehicle: Vehicle, table: ParameterTable, segments: Segments, target: TargetName, theta: Any, group: Any = None
 ) -> tuple[Float[Array, "row k"], Float[Array, " row"]]:
     """∂ predicted / ∂θ of each row's own coefficients, and what is predicted there.
 
@@ -130,7 +130,7 @@ def linear_fit(
     vehicle: Vehicle,
     table: ParameterTable,
     read: Callable[[], Iterable[Rows]],
-    target: Target,
+    target: TargetName,
     *,
     clusters: int = 0,
     groups: int = 0,
@@ -144,7 +144,7 @@ def linear_fit(
     The kernel is linearised at the tables' values, then at the posterior's mean, until the mean stays: once for a
     kernel that is linear in them, a few times where an efficiency is free or its switch is crossed.
 
-    **Arguments:** `read()` begins the log anew and gives its pieces. `clusters`: how many there are; errors inside one
+    **Arguments:** `read()` starts the log again and gives its pieces. `clusters`: how many there are; errors inside one
     are correlated, so each row counts for 1/`inflation` of one, as in `calibrate` (0: rows are independent). `groups`:
     a set of coefficients for each of so many groups (vehicles, trips), each with the same table (0: one set for all).
     `noise` of a row, where it is known about (counts for `LEAST_ROWS` rows); without it the residual's after the fit.
@@ -197,7 +197,7 @@ def linear_fit(
 
 
 def _of_piece(
-    vehicle: Vehicle, table: ParameterTable, target: Target, piece: Rows, at: np.ndarray, scale: np.ndarray,
+    vehicle: Vehicle, table: ParameterTable, target: TargetName, piece: Rows, at: np.ndarray, scale: np.ndarray,
     cells: int, grouped: bool, tail: float | None,
 ) -> Statistics:  # fmt: skip
     """A piece's statistics by cluster, or by group."""
@@ -220,7 +220,7 @@ def _no_perfect_log(
     summed: Statistics, scale: Float[np.ndarray, " k"], unit: Float[np.ndarray, " k"]
 ) -> Statistics:  # fmt: skip
     """Rows with the noise that computed ones have: without any, the table's own width would go to 0 with the noise's,
-    also of what the rows do not tell.
+    also of what the rows do not determine.
     """
     effect = jnp.einsum("...kk,k->...k", summed.gram, jnp.asarray(unit / scale) ** 2)
     least = (

@@ -12,7 +12,7 @@ from hdev_jax.inference.linear import Statistics, least_squares
 __all__ = ["OUTLIER", "caveats"]
 
 WEAK_INFORMATION = 0.25  # what the log says of a direction, over what the table says of it: less is as good as nothing
-NOTHING = 1e-4  # of the best told direction of columns of one size: less is one column twice
+NOTHING = 1e-4  # of the best determined direction of columns of one size: less is one column twice
 TAKES_PART = 0.3  # of a direction of length 1, from which on a coefficient is named
 CONTRADICTS = 3.0  # standard deviations of table and log together
 OUTLIER = 10.0  # times the noise of all other rows
@@ -20,7 +20,7 @@ FEW_ROWS = 10
 
 
 def caveats(fit: LinearFit) -> list[str]:
-    """Sentences on what the fit's numbers do not say by themselves; none where the log tells every coefficient.
+    """Sentences on what the fit's numbers do not say by themselves; none where the log determines every coefficient.
 
     One set of coefficients. Of several groups, `caveats` of each are prefixed with its number.
     """
@@ -38,8 +38,8 @@ def _leaves(s: Statistics) -> tuple:
     return s.gram, s.moment, s.square, s.rows, s.driving, s.largest
 
 
-def _untold(gram: Float[np.ndarray, "k k"]) -> set[int]:
-    """Coefficients that take part in a direction of which the log, whatever the tables say, tells nothing."""
+def _undetermined(gram: Float[np.ndarray, "k k"]) -> set[int]:
+    """Coefficients that take part in a direction that the log does not determine, whatever the tables say."""
     d = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram / np.outer(d, d))
     empty = {k for k in range(len(d)) if gram[k, k] <= 0}
@@ -55,29 +55,29 @@ def _of_one(
         return ["there are no rows: every coefficient is the table's"]
     out = []
     if rows < FEW_ROWS:
-        out.append(f"{rows:.0f} rows: the noise is mostly believed, not measured")
+        out.append(f"{rows:.0f} rows: the noise is mostly its prior, not measured")
     if float(data.driving) <= 0:
-        out.append("every row gives energy back: this log does not identify what driving costs")
+        out.append("every row gives energy back: this log does not identify the cost of driving")
     gram = np.asarray(data.gram)
     sd = fit.tabular_sd / fit.scale
     noise = float(np.mean(np.asarray(fit.posterior.sigma)))
     values, vectors = np.linalg.eigh(gram * np.outer(sd, sd) / noise**2)
-    untold = _untold(gram)
+    undetermined = _undetermined(gram)
     for value, v in zip(values, vectors.T, strict=True):
         members = [k for k in range(len(v)) if abs(v[k]) > TAKES_PART]
         if value >= WEAK_INFORMATION:
             continue
         which = " and ".join(names[k] for k in members)
-        if not untold & set(members):
-            out.append(f"{which}: the tables are far surer than this log is, and theirs is the word")
+        if not undetermined & set(members):
+            out.append(f"{which}: the tables are far more certain than this log, so the values are the tables'")
         elif len(members) == 1:
             out.append(f"{names[members[0]]} is not identified by this log: its value is the table's")
         else:
-            out.append(f"{which} cannot be told apart by this log: how they share what is known is the tables' word")
+            out.append(f"this log cannot separate {which}: their values beside each other are the tables'")
     out = list(dict.fromkeys(out))  # two directions of the same members are one sentence
     step, covariance, _ = least_squares(data)
-    told = [k for k in range(len(step)) if k not in untold]
-    for k in told:
+    determined = [k for k in range(len(step)) if k not in undetermined]
+    for k in determined:
         spread = float(np.sqrt(sd[k] ** 2 + np.asarray(covariance)[k, k]))
         if abs(float(step[k]) - table[k]) > CONTRADICTS * spread and fit.table.free[k].sd is not None:
             says = at[k] + fit.scale[k] * float(step[k])

@@ -199,8 +199,8 @@ def least_squares(data: Statistics) -> tuple[Float[Array, " k"], Float[Array, "k
     k = data.moment.shape[-1]
     d = jnp.sqrt(jnp.maximum(jnp.diagonal(data.gram), 1e-300))
     values, vectors = jnp.linalg.eigh(data.gram / (d[:, None] * d[None, :]))
-    told = values > 1e-12 * jnp.maximum(values[-1], 1e-300)
-    inverse = jnp.where(told, 1.0 / jnp.where(told, values, 1.0), 0.0)
+    determined = values > 1e-12 * jnp.maximum(values[-1], 1e-300)
+    inverse = jnp.where(determined, 1.0 / jnp.where(determined, values, 1.0), 0.0)
     step = (vectors * inverse[None, :]) @ (vectors.T @ (data.moment / d)) / d
     left = jnp.maximum(data.square - step @ (2.0 * data.moment - data.gram @ step), 0.0)
     variance = left / jnp.maximum(data.rows - k, 1.0)
@@ -212,7 +212,7 @@ def update(
 ) -> Statistics:
     """One row more, after what was there has faded by `forgetting` (1: nothing does; then it is the sum of all rows).
 
-    The table does not fade: standing still, which tells nothing, leads back to it and never to an open covariance.
+    The table does not fade: standing still, without information, leads back to it and never to an open covariance.
     """
     r = jnp.asarray(r)
     one = Statistics(
@@ -238,5 +238,5 @@ def follow(
         return (state, after), (x @ before.mean, wide, after.mean)
 
     begin = (state, posterior(prior, state))
-    (last, _), told = jax.lax.scan(step, begin, (jnp.asarray(x), jnp.asarray(r)))
-    return last, told
+    (last, _), by_row = jax.lax.scan(step, begin, (jnp.asarray(x), jnp.asarray(r)))
+    return last, by_row

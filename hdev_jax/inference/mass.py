@@ -1,7 +1,7 @@
 """Total mass by trip, or by stop where doors or passengers change it: a posterior from the same kernel in closed form.
 
-Mass enters inertia, slope and rolling resistance, drag it does not: hills and stops tell it from everything else. c_rr
-and drag area are known from the vehicle's calibration, give or take their sds, and every trip says what it can of them.
+Mass enters inertia, slope and rolling resistance, not drag: hills and stops separate it from everything else. c_rr and
+drag area are known from the vehicle's calibration within their sds, and every trip adds its own information on them.
 """
 
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from hdev_jax.inference.design import LinearFit, Rows, linear_fit
 from hdev_jax.inference.identified import caveats
 from hdev_jax.inference.parameters import Coefficient, ParameterTable
 from hdev_jax.physics import Vehicle
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = ["MassFit", "loads", "mass_posterior", "with_sd"]
 
 
 @dataclass(frozen=True)
 class MassFit:
-    """Mass of each group [kg] with its sd, distance [km], and what the log does not tell of it."""
+    """Mass of each group [kg] with its sd, distance [km], and what the log leaves open of it."""
 
     mass_kg: Float[np.ndarray, " group"]
     sd_kg: Float[np.ndarray, " group"]
@@ -48,7 +48,7 @@ def mass_posterior(
     table: ParameterTable,
     segments: Segments,
     measured: Float[np.ndarray, " row"],
-    target: Target,
+    target: TargetName,
     *,
     mass_kg: float,
     sd_kg: float,

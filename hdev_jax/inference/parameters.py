@@ -10,16 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.physics import Effect, Grouped, Vehicle
+from hdev_jax.physics import DECLARED, Effect, Grouped, Shape, Size, Vehicle
 
 __all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert", "insert_by"]
 
-_DECLARED = {  # path in the sheet → (effect that holds it, its field)
-    "road.c_rr": ("rolling", "c_rr"),
-    "road.cda_m2": ("aero", "cda_m2"),
-    "road.rotating_mass_factor": ("inertia", "rotating_mass_factor"),
-    "battery.auxiliary_w": ("auxiliary", "auxiliary_w"),
-}
+# path in the sheet → (effect that holds it, its field)
+_DECLARED = {path: (c.id, field) for c in DECLARED for field, path in c.declared.items()}
 
 
 @dataclass(frozen=True)
@@ -28,8 +24,8 @@ class Coefficient:
 
     `path` as in the sheet (`road.c_rr`, `effects.headwind.scale`); `group` is the place in a coefficient that has one
     value per vehicle or gear, `label` its name. `lower` and `upper` are the support; `scale` conditions the solver.
-    `told`: value and sd that whitened rows of the same log say. A calibration on rows of equal weight takes them in
-    place of the table's (`prior`); evidence from whitened rows must not count them a second time.
+    `known`: value and standard error by generalised least squares on the same log. Ordinary least squares take them in
+    place of the table's (`prior`); evidence by generalised least squares must not count them a second time.
     """
 
     path: str
@@ -42,12 +38,12 @@ class Coefficient:
     free: bool = True
     group: int | None = None
     label: str = ""
-    told: tuple[float, float] | None = None
+    known: tuple[float, float] | None = None
 
     @property
     def prior(self) -> tuple[float, float | None]:
-        """Value and sd that a calibration starts from: what whitened rows told, or the table's."""
-        return self.told or (self.value, self.sd)
+        """Value and sd that a calibration starts from: by generalised least squares, or the table's."""
+        return self.known or (self.value, self.sd)
 
     @property
     def name(self) -> str:
@@ -155,7 +151,7 @@ def effect_coefficients(
         leaf = getattr(effect, p.name)
         if leaf is None or (isinstance(leaf, Grouped) and leaf.by == "trip"):  # what is chosen trip by trip is held
             continue
-        free = p.name in sizes or (shapes and p.kind == "shape" and bool(p.grid) and len(p.grid) > 1)
+        free = p.name in sizes or (shapes and isinstance(p, Shape) and len(p.grid) > 1)
         values = leaf.values if isinstance(leaf, Grouped) else [leaf]
         for g, value in enumerate(np.asarray(jax.device_get(values), dtype=float)):
             grouped = isinstance(leaf, Grouped)
@@ -163,11 +159,11 @@ def effect_coefficients(
                 Coefficient(
                     path=f"effects.{effect.id}.{p.name}",
                     unit=p.unit,
-                    value=p.null if p.kind == "shape" else float(value),
-                    sd=abs(p.scale) if p.kind == "shape" else None,
+                    value=p.null if isinstance(p, Shape) else float(value),
+                    sd=abs(p.scale) if isinstance(p, Shape) else None,
                     scale=abs(p.scale),
-                    lower=p.lower if p.kind != "size" else -np.inf,
-                    upper=p.upper if p.kind != "size" else np.inf,
+                    lower=-np.inf if isinstance(p, Size) else p.lower,
+                    upper=np.inf if isinstance(p, Size) else p.upper,
                     free=free and (not grouped or not groups or str(g) in groups),
                     group=g if grouped else None,
                     label=str(g) if grouped else "",

@@ -9,15 +9,15 @@ from scipy import optimize, special, stats
 
 from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, jacobian, tabular
 from hdev_jax.inference.clusters import LEAST_RATIO, Clusters, clusters_of
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = ["Spread", "covariance_root", "errors_left_out", "left_out", "spread_of", "sums_of"]
 
 FEW = 2  # trips from which on a total is judged by trips; a single one by its autocorrelation
-ENOUGH_ROWS = 20_000  # tell the shape of a row's noise; every so many of more
+ENOUGH_ROWS = 20_000  # show the shape of a row's noise; every so many of more
 MOST_FREEDOM = 200.0  # of a Student t that is a normal
-MOST_LAG = 20  # rows: enough to tell what is left of a correlation from a row's own noise
+MOST_LAG = 20  # rows: enough to separate what is left of a correlation from a row's own noise
 DECAYS = np.linspace(0.3, 0.99, 70)  # of the correlation, from a row to the next
 GROWS = 3.0  # least gain in log-likelihood, of rows worth independent ones, for a noise that grows
 FAULT = 6.0  # scales: where outliers are weighed down, a row beyond this is an instrument's fault and no trip's energy
@@ -77,7 +77,7 @@ def covariance_root(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "
 
 
 def left_out(
-    fit: Calibration, rows: Fit, target: Target, weight: Float[np.ndarray, " row"],
+    fit: Calibration, rows: Fit, target: TargetName, weight: Float[np.ndarray, " row"],
     noise: Literal["normal", "student_t"] = "normal",
 ) -> tuple[Spread, Clusters]:  # fmt: skip
     """The spread of a fit's errors on trips that it has not seen, from its own rows by leaving each trip out.
@@ -97,8 +97,8 @@ def left_out(
         error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])
     # of one row the coefficients leave next to nothing open beside its noise
     spread = spread_of(error, fit.predicted, weight, clusters, open_sd, np.zeros(n), row_s=row_s, robust=robust)
-    told = all(c.told for c in fit.table.free)  # by whitened rows, whose errors hold what goes together
-    if clusters.kind == "block" and not told:  # as the inflation of the fit's covariance, at their full length
+    by_gls = all(c.known for c in fit.table.free)  # standard errors that hold the autocorrelation already
+    if clusters.kind == "block" and not by_gls:  # as the inflation of the fit's covariance, at their full length
         lasting = _times(error / np.sqrt(_square(spread.scale, spread.growth, fit.predicted)), clusters)[0]
         spread = replace(spread, open_times=max(lasting / fit.inflation, 1.0))
     return spread, clusters
@@ -139,17 +139,18 @@ def spread_of(
     """
     scale, growth, freedom, loss = _of_rows(error, np.zeros(len(error)), open_row)
     grown = _of_rows(error, predicted, open_row)
-    # rows that go together tell less: in a short drive the noise is soon larger by chance where the energy is
+    # correlated rows hold less information: in a short drive the noise is soon larger by chance where the energy is
     if (loss - grown[3]) * len(error) / _times(error / scale, clusters)[0] > GROWS:
         scale, growth, freedom, _ = grown
     square = _square(scale, growth, predicted)
     if robust:
         error = np.clip(error, -FAULT * np.sqrt(square), FAULT * np.sqrt(square))
     z = error / np.sqrt(square)
-    # a scale that few trips have told is itself uncertain: tails of its own (Satterthwaite 1946, over trips)
-    told = clusters.sums(z**2)
-    known = 2.0 * np.sum(told) ** 2 / max(len(told) * float(np.var(told, ddof=1)), 1e-12) if len(told) > 1 else 2.1
-    freedom = 1.0 / (1.0 / freedom + 1.0 / max(float(known), 2.1))
+    # a scale estimated from few trips is itself uncertain: heavier tails (Satterthwaite 1946, over trips)
+    by_trip = clusters.sums(z**2)
+    few = len(by_trip) < 2
+    own = 2.1 if few else 2.0 * np.sum(by_trip) ** 2 / max(len(by_trip) * float(np.var(by_trip, ddof=1)), 1e-12)
+    freedom = 1.0 / (1.0 / freedom + 1.0 / max(float(own), 2.1))
     times, squares = _times(z, clusters)
     if clusters.kind == "block":
         worth = float(np.clip(len(z) / times, 1.0, clusters.count))

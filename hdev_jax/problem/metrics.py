@@ -5,20 +5,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["PER_KWH", "metrics", "sum_weight"]
+from hdev_jax.targets import TARGETS
 
-# of a weighed sum, by target: Wh, kW·s and N·m; a torque's sum is no energy
-PER_KWH = {"energy_wh": 1e3, "battery_power_kw": 3600.0, "traction_force_n": 3.6e6}
+__all__ = ["metrics", "sum_weight"]
 
 
 def sum_weight(target: str, duration_s: np.ndarray, distance_m: np.ndarray) -> Float[np.ndarray, " row"]:
-    """What a row weighs in a sum: power by duration, force and torque by distance, energy as it is.
-
-    A torque turns with the wheels: by distance its sum is work, of one gear, and standing still adds nothing.
-    """
-    if target == "energy_wh":
-        return np.ones(len(duration_s))
-    return np.asarray(duration_s if target == "battery_power_kw" else distance_m, dtype=float)
+    """What a row weighs in a sum (`Target.weight`)."""
+    weights = {"row": np.ones(len(duration_s)), "duration": duration_s, "distance": distance_m}
+    return np.asarray(weights[TARGETS[target].weight], dtype=float)
 
 
 def metrics(measured: np.ndarray, predicted: np.ndarray, weight: np.ndarray) -> dict[str, Any]:

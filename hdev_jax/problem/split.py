@@ -1,4 +1,4 @@
-"""Which trips calibrate and which only test."""
+"""Which trips are for training and which are held out for testing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -70,7 +70,7 @@ def _ids(log: Log, names: Sequence[str] | None, option: str) -> tuple[int, ...]:
 def _halves(log: Log) -> Log:
     """One trip in two parts: its first two thirds and its last third by time.
 
-    It stays one trip in the segments: what builds up since its start goes on in the second part.
+    It stays one trip in the segments: what depends on the time since its start continues in the second part.
     """
     seconds = np.cumsum(log.segments.duration_s)
     late = seconds > seconds[-1] * 2.0 / 3.0

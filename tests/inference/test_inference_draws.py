@@ -187,7 +187,7 @@ def test_rolling_that_drifts_along_the_route_is_held_by_its_posterior(tmp_path):
     """By temperature and as tyres warm up, sampled through the kernel under Student-t noise: what was planted within
     three sds, and a smaller error on trips that were not fitted than of one number for the whole route."""
     planted = {k: {n: v[0] for n, v in p.items()} for k, p in DRIFT.items()}
-    log = synthetic_log(seed=11, trips=10, rows_per_trip=150, effects=planted, noise="white", noise_level=0.05)
+    log = synthetic_log(seed=11, trips=10, rows_per_trip=100, effects=planted, noise="white", noise_level=0.05)
     files = log.write(tmp_path, truth=False)
     effects = [
         line for k, p in DRIFT.items()
@@ -196,9 +196,9 @@ def test_rolling_that_drifts_along_the_route_is_held_by_its_posterior(tmp_path):
     drifting = tmp_path / "drifting.toml"
     drifting.write_text("\n".join([files["sheet"].read_text(), *effects, ""]))
     told, rmse = {}, {}
-    for name, sheet in (("constant", files["sheet"]), ("drifting", drifting)):
+    for name, sheet, method in (("constant", files["sheet"], "map"), ("drifting", drifting, "nuts")):
         out = tmp_path / name
-        hdev_jax.calibrate([files["log"]], sheet, method="nuts", noise="student_t", out=out)
+        hdev_jax.calibrate([files["log"]], sheet, method=method, noise="student_t", out=out)
         found = json.loads((out / "calibration.json").read_text())
         told, rmse[name] = found["baseline"]["parameters"], found["before"]["test"]["rmse"]
     for k, parameters in planted.items():

@@ -159,7 +159,7 @@ def test_what_a_table_says_of_no_torque_does_not_touch_its_neighbours(floor):
 
 
 def test_rows_that_stand_say_nothing_of_a_map():
-    rows, truth = log(900), true_map()
+    rows, truth = log(450), true_map()
     energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(1).normal(size=len(rows))
     still = np.zeros(len(rows), bool)
     still[::3] = True

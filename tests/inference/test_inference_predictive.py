@@ -90,7 +90,7 @@ def test_a_total_is_known_less_where_trips_differ_in_variance(size, levels):
     assert float(np.median(found)) == pytest.approx(wanted, rel=0.5, abs=0.05)
 
 
-@pytest.mark.parametrize("count", [4, 8, 40])
+@pytest.mark.parametrize("count", [4, 40])
 def test_totals_of_trips_that_differ_in_variance_are_held(count):
     """Nine in ten of new trips, whose variance is as much by chance as those that the noise was told from."""
     rng, rows, hits, logs = np.random.default_rng(count), 40, 0, 400
@@ -113,7 +113,7 @@ def test_the_noise_of_a_row_has_its_size_growth_and_tails():
         assert np.mean(np.abs(e) < found.rows(level, np.zeros(len(e)), size)) == pytest.approx(level, abs=0.01)
 
 
-@pytest.mark.parametrize("count", [3, 6, 12])
+@pytest.mark.parametrize("count", [3, 12])
 @pytest.mark.parametrize("rho", [0.0, 0.9])
 def test_totals_of_new_trips_are_held(count, rho):
     """Worlds of one unknown coefficient: 90 % of totals that no fit has seen, however few trips there were."""
@@ -154,7 +154,7 @@ def test_the_second_half_of_a_single_drive_is_held(white):
     assert 0.855 <= held / worlds <= 0.945
 
 
-@pytest.mark.parametrize("rows", [12, 60, 360])
+@pytest.mark.parametrize("rows", [12, 360])
 def test_new_trips_may_be_shorter_and_longer(rows):
     """What all rows of a trip share grows with the trip, what each has of its own with its root."""
     rng = np.random.default_rng(6)

@@ -24,7 +24,6 @@ from hdev_jax.learn import (
 from hdev_jax.learn.narx.network import output
 from hdev_jax.learn.narx.normal import one_step, rows_of, simulated, windows_of
 from hdev_jax.learn.narx.selection import edge, folds, validated
-from hdev_jax.learn.robust import huber_fit
 from hdev_jax.learn.sequences import Scale, blocks, energy_kwh, lagged, trips_of
 
 STRUCTURES = {
@@ -148,16 +147,6 @@ def test_weights_leave_rows_out():
     x, y = model.regressors(half)
     z = np.c_[np.ones(rows // 2), x[: rows // 2]]
     np.testing.assert_allclose(fit.theta[1], np.linalg.lstsq(z, y[: rows // 2], rcond=None)[0], rtol=2e-3, atol=1e-5)
-
-
-def test_huber_fit_is_least_squares_without_a_corner_and_ignores_outliers_with_one():
-    rng = np.random.default_rng(0)
-    x = np.c_[np.ones(500), rng.normal(size=(500, 2))]
-    y = x @ [1.0, 2.0, -1.0] + rng.normal(0, 0.1, 500)
-    squares = huber_fit(x, y, corner=np.inf).beta
-    np.testing.assert_allclose(squares, np.linalg.lstsq(x, y, rcond=None)[0], rtol=1e-6)
-    y[:25] += 50.0
-    np.testing.assert_allclose(huber_fit(x, y).beta, [1.0, 2.0, -1.0], atol=0.05)
 
 
 def test_kernel_terms_are_the_machine_stage():

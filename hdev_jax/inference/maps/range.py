@@ -1,29 +1,30 @@
 """How a log lies to the efficiency map of its sheet: which rows are beyond the table, and gears that it lacks."""
 
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.errors import InputError
-from hdev_jax.inference.sheet.sheet import Sheet
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
 __all__ = ["read_against_map"]
 
 
-def read_against_map(sheet: Sheet, vehicle: Vehicle, segments: Segments) -> list[str]:
+def read_against_map(path: Path | None, vehicle: Vehicle, segments: Segments) -> list[str]:
     """A note with the share of the moving rows that lie beyond the map, where there are any.
 
-    Torques are those of the vehicle as declared. A map of one gear holds for all.
+    `path` is the map's file. Torques are those of the vehicle as declared. A map of one gear holds for all.
 
     **Raises:** `InputError` where the vehicle moves in a gear that the map does not have.
     """
     found = vehicle.driveline.efficiency
     assert isinstance(found, EfficiencyMap)
     moving = np.asarray(segments.distance_m) > 0
-    _check_gears(sheet, found, segments, moving)
+    _check_gears(path, found, segments, moving)
     speed, torque = _points(vehicle, segments)
     beyond = {
         "faster": speed > found.speeds_radps[-1], "slower": speed < found.speeds_radps[0],
@@ -36,11 +37,11 @@ def read_against_map(sheet: Sheet, vehicle: Vehicle, segments: Segments) -> list
     s, t = (f"{float(a[0]):.4g} to {float(a[-1]):.4g}" for a in (found.speeds_radps, found.torques_nm))
     return [
         f"the efficiency map is read beyond its edge in {100 * every.sum() / moving.sum():.2g} % of the moving rows, "
-        f"most often for {most}: there its edge holds (it has {s} rad/s and {t} Nm)"
+        f"most often for {most}: there the value at its edge is used (the map covers {s} rad/s and {t} Nm)"
     ]
 
 
-def _check_gears(sheet: Sheet, found: EfficiencyMap, segments: Segments, moving: np.ndarray) -> None:
+def _check_gears(path: Path | None, found: EfficiencyMap, segments: Segments, moving: np.ndarray) -> None:
     if len(found.gears) < 2 or not segments.has("gear"):
         return
     gear, known = np.asarray(segments.channels["gear"]), np.asarray(found.gears)
@@ -48,7 +49,7 @@ def _check_gears(sheet: Sheet, found: EfficiencyMap, segments: Segments, moving:
     if len(odd):
         has = ", ".join(f"{g:g}" for g in known)
         raise InputError(
-            f"efficiency map {sheet.map_path}: the log's row {odd[0] + 1} drives in gear {gear[odd[0]]:g}, and "
+            f"efficiency map {path}: the log's row {odd[0] + 1} drives in gear {gear[odd[0]]:g}, and "
             f"{len(odd) - 1} more rows are in a gear that the map lacks; it has gears {has}: add the gear to the map"
         )
 

@@ -150,7 +150,7 @@ def _mode(data: Sums, start: np.ndarray, width: np.ndarray) -> tuple[np.ndarray,
 
 
 def _width(data: Sums) -> Float[np.ndarray, " dim"]:
-    """About the posterior sds of (log τ, log σ²) where rows tell all coefficients."""
+    """About the posterior sds of (log τ, log σ²) where rows determine all coefficients."""
     vehicles, k = data.moment.shape
     return np.r_[np.full(k, 1.0 / np.sqrt(2.0 * vehicles + 2.0)), np.sqrt(2.0 / (data.rows + LEAST_ROWS))]
 
@@ -216,10 +216,10 @@ def fleet_draws(fit: LinearFit, *, key: Array, chains: int = 4, draws: int = 100
     own, scale = fit.table.free, fit.scale
     value = np.array([c.value for c in own])
     noise = float(np.median(np.asarray(fit.prior.noise)))  # as believed, which the prior of σ² is of
-    told = fit.statistics.about((value[None, :] - fit.at) / scale)  # of all from one point
-    gram, moment = np.asarray(told.gram) / noise**2, np.asarray(told.moment) / noise**2
-    rows = float(np.sum(np.asarray(told.rows)))
-    data = Sums(gram, moment, float(np.sum(np.asarray(told.square))) / noise**2, rows)
+    moments = fit.statistics.about((value[None, :] - fit.at) / scale)  # of all from one point
+    gram, moment = np.asarray(moments.gram) / noise**2, np.asarray(moments.moment) / noise**2
+    rows = float(np.sum(np.asarray(moments.rows)))
+    data = Sums(gram, moment, float(np.sum(np.asarray(moments.square))) / noise**2, rows)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     k = len(own)
     seen = np.asarray(fit.posterior.mean) + (fit.at - value) / scale

@@ -17,7 +17,7 @@ from hdev_jax.inference.posterior.hierarchy import fleet_draws
 from hdev_jax.inference.posterior.models import Model
 from hdev_jax.inference.posterior.nuts import sampled
 from hdev_jax.physics import Grouped, Vehicle
-from hdev_jax.physics.vehicle import Target
+from hdev_jax.targets import TargetName
 
 __all__ = ["METHODS", "Method", "Outcome", "calibrated", "is_linear", "one_of_each"]
 
@@ -44,7 +44,7 @@ def calibrated(
     vehicle: Vehicle,
     table: ParameterTable,
     fit: Fit,
-    target: Target,
+    target: TargetName,
     clusters: Clusters,
     method: Method,
     *,
@@ -75,8 +75,8 @@ def calibrated(
     notes = caveats(line)
     if outside:
         notes.append(
-            f"{', '.join(outside)}: the closed form, which knows no bounds, ends outside the range and is set to its "
-            "edge; compare with --method map, and look at the tables"
+            f"{', '.join(outside)}: the closed form, which has no bounds, ends outside the range and is set to its "
+            "edge; compare with --method map, and check the tables"
         )
     if not line.converged:
         notes.append(f"the closed form is not exact here: {found.message}; compare with --method map")
@@ -87,7 +87,7 @@ def calibrated(
 
 
 def _drawn(
-    vehicle: Vehicle, table: ParameterTable, fit: Fit, target: Target, line: LinearFit, found: Calibration,
+    vehicle: Vehicle, table: ParameterTable, fit: Fit, target: TargetName, line: LinearFit, found: Calibration,
     notes: list[str], noise: str, vehicles: int, seed: int, chains: int, draws: int,
 ) -> Outcome:  # fmt: skip
     """By drawing: the fleet's or the one vehicle's posterior, from statistics or from rows."""
@@ -97,7 +97,7 @@ def _drawn(
     if not pooled and any(c.group is not None and c.free for c in table.rows):
         notes = [
             *notes,
-            "some free coefficients are per vehicle and some are not: each has its own table, none is pooled",
+            "some free coefficients are per vehicle and some are not: each has its own prior, none is pooled",
         ]
     reach = 3.0 * line.sd  # draws of the closed form know no bounds
     free = all(c.lower < low and high < c.upper for c, low, high in
@@ -125,7 +125,7 @@ def _drawn(
         flat = np.swapaxes(theta, -1, -2).reshape(theta.shape[0] * theta.shape[1], -1)
         notes = [
             *(f"each vehicle by itself, before pooling: {note}" for note in notes),
-            f"coefficients of {vehicles} vehicles are pooled in part: each is drawn towards the fleet's mean",
+            f"coefficients of {vehicles} vehicles are partially pooled: each is shrunk towards the fleet's mean",
         ]
     elif straight:
         values, sigmas = line.draws(key, chains * draws)
@@ -151,7 +151,7 @@ def _drawn(
         found, vehicle=car, values=values, sd=spread, covariance=covariance, predicted=predicted,
         sigma=float(np.sqrt(np.mean(made.flat("variance")))), converged=not faults, message=message,
     )  # fmt: skip
-    bad = [f"these draws are no answer: {fault}" for fault in faults]
+    bad = [f"these draws are not usable: {fault}" for fault in faults]
     return Outcome(fitted, [made.how, *bad, *notes], made, not faults)
 
 
@@ -184,7 +184,7 @@ def _grouped(vehicle: Vehicle) -> list[Any]:
     return [x for x in leaves if isinstance(x, Grouped)]
 
 
-def is_linear(vehicle: Vehicle, table: ParameterTable, fit: Fit, target: Target, line: LinearFit) -> bool:
+def is_linear(vehicle: Vehicle, table: ParameterTable, fit: Fit, target: TargetName, line: LinearFit) -> bool:
     """Whether the prediction is a line over what the posterior leaves open: two sds along each of its axes, its error
     is under `BENT` of the noise, as the root of the mean over rows.
     """

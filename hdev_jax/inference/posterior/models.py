@@ -14,8 +14,8 @@ from hdev_jax.inference.linear import LEAST_ROWS
 from hdev_jax.inference.parameters import ParameterTable, insert, insert_by
 from hdev_jax.inference.posterior.draws import needs
 from hdev_jax.physics import Vehicle
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = ["GROWTH", "POOL_FREEDOM", "Model", "kernel_model", "log_density", "predicted_by"]
 
@@ -42,14 +42,14 @@ class Model(eqx.Module):
     worth: Array
     group: Array | None
     table: ParameterTable = eqx.field(static=True)
-    target: Target = eqx.field(static=True)
+    target: TargetName = eqx.field(static=True)
     groups: int = eqx.field(static=True, default=0)
     student: bool = eqx.field(static=True, default=True)
     grows: bool = eqx.field(static=True, default=True)
 
     @staticmethod
     def of(
-        vehicle: Vehicle, table: ParameterTable, fit: Fit, target: Target, *, noise: float, size: Any = None,
+        vehicle: Vehicle, table: ParameterTable, fit: Fit, target: TargetName, *, noise: float, size: Any = None,
         group: Any = None, groups: int = 0, student: bool = True, grows: bool = True, worth: float = 1.0,
     ) -> "Model":  # fmt: skip
         """From padded rows; `group` and `size` are of the real ones."""

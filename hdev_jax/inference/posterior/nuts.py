@@ -1,6 +1,6 @@
 """NUTS through the whole kernel, in coordinates in which its posterior is nearly a standard normal.
 
-Coefficients of a vehicle are set by what its own rows tell and what the fleet tells together: θ = m(μ, τ) + L(μ, τ)·u,
+Coefficients of a vehicle are estimated from its own rows and from the fleet together: θ = m(μ, τ) + L(μ, τ)·u,
 m and L the mean and the root of the covariance of the linearised kernel's conditional posterior (the statistics of
 `hdev_jax.inference.linear`). So u is nearly a standard normal whatever the fleet's mean μ and spread τ are, strong data
 or weak: neither the centred nor the non-centred form, but the one between that these data ask for. What is left (μ, τ,
@@ -29,11 +29,11 @@ TARGET_ACCEPTANCE = 0.65  # of whitened coordinates: longer steps, half as many
 
 
 class Coordinates(NamedTuple):
-    """From a near-standard normal `[dim]` to the model's sites, and the log of the volume; `told` of each group."""
+    """From a near-standard normal `[dim]` to the model's sites, and the log of the volume; `moments` of each group."""
 
     centre: Array
     root: Array
-    told: Statistics | None
+    moments: Statistics | None
     at: Array
 
 
@@ -50,11 +50,11 @@ def _unpacked(m: Model, c: Coordinates, q: Array) -> tuple[dict[str, Array], Arr
         sites["mean"], sites["spread"] = value + sd * z, sd * jnp.exp(log_spread)
         volume = volume + jnp.sum(log_spread)
         u = q[dim:].reshape(m.groups, k)
-        assert c.told is not None
+        assert c.moments is not None
         tight = jnp.exp(-2.0 * log_spread)
-        precision = c.told.gram + jnp.diag(tight)[None]
+        precision = c.moments.gram + jnp.diag(tight)[None]
         root = jnp.linalg.cholesky(precision)
-        right = c.told.moment + (tight * z)[None, :]
+        right = c.moments.moment + (tight * z)[None, :]
         half = jax.scipy.linalg.solve_triangular(root, right[..., None], lower=True)
         both = half + u[..., None]
         theta = jax.scipy.linalg.solve_triangular(jnp.swapaxes(root, -1, -2), both, lower=False)[..., 0]
@@ -78,7 +78,7 @@ def coordinates(m: Model, at: Any, *, noise: Any = None) -> Coordinates:
     """Coordinates from the kernel linearised `at` coefficients near the posterior's mean (`[k]` or `[group k]`)."""
     value, sd = (jnp.asarray(a) for a in tabular(m.table))
     k, at = value.shape[0], jnp.asarray(at)
-    told = None
+    moments = None
     noise = m.noise if noise is None else noise
     if m.groups:
         x, predicted = design(m.vehicle, m.table, m.segments, m.target, at, m.group)
@@ -87,8 +87,8 @@ def coordinates(m: Model, at: Any, *, noise: Any = None) -> Coordinates:
         if m.student:
             weight = weight * (STUDENT_DF + 1.0) / (STUDENT_DF + (r / noise) ** 2)
         assert m.group is not None
-        told = statistics(x * sd[None, :], r, m.measured, weight, m.group, m.groups)
-        told = told.about((value[None, :] - at) / sd[None, :])  # moments are of steps from the table
+        moments = statistics(x * sd[None, :], r, m.measured, weight, m.group, m.groups)
+        moments = moments.about((value[None, :] - at) / sd[None, :])  # moments are of steps from the table
     hyper = jnp.zeros(2 * k if m.groups else k)
     start = (jnp.mean(at, axis=0) if m.groups else at) - value
     hyper = hyper.at[:k].set(start / sd)
@@ -97,9 +97,9 @@ def coordinates(m: Model, at: Any, *, noise: Any = None) -> Coordinates:
     more = [2.0 * jnp.log(noise / m.noise), *([jnp.asarray(0.02)] if m.grows else [])]
     more += [jnp.log(jnp.asarray(8.0))] if m.student else []
     hyper = jnp.concatenate([hyper, jnp.stack([jnp.asarray(x) for x in more])])
-    plain = Coordinates(jnp.zeros_like(hyper), jnp.eye(len(hyper)), told, at)
+    plain = Coordinates(jnp.zeros_like(hyper), jnp.eye(len(hyper)), moments, at)
     centre, root = _laplace(m, plain, hyper)
-    return Coordinates(centre, root, told, at)
+    return Coordinates(centre, root, moments, at)
 
 
 def _laplace(m: Model, plain: Coordinates, h: Array) -> tuple[Array, Array]:

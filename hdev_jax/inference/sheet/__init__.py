@@ -2,7 +2,6 @@
 
 from hdev_jax.inference.sheet.build import Built, build
 from hdev_jax.inference.sheet.sheet import (
-    BATTERY_TARGETS,
     Sheet,
     choose_entry,
     read_sheet,
@@ -11,7 +10,6 @@ from hdev_jax.inference.sheet.sheet import (
 from hdev_jax.inference.sheet.text import augmented_sheet
 
 __all__ = [
-    "BATTERY_TARGETS",
     "Built",
     "Sheet",
     "augmented_sheet",

@@ -10,7 +10,7 @@ import numpy as np
 from hdev_jax.inference.maps.range import read_against_map
 from hdev_jax.inference.parameters import Coefficient, ParameterTable
 from hdev_jax.inference.sheet.schema import KEYS, SECTIONS, Declared, Key, effect_key
-from hdev_jax.inference.sheet.sheet import BATTERY_TARGETS, Sheet
+from hdev_jax.inference.sheet.sheet import Sheet
 from hdev_jax.physics import (
     Driveline,
     Effect,
@@ -26,23 +26,16 @@ from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
-from hdev_jax.physics.vehicle import Entry, Target
+from hdev_jax.physics.vehicle import Entry
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TARGETS, TargetName
 
 __all__ = ["Built", "build"]
 
-_ENTRIES = {
-    "traction_force_n": ("road",),
-    "motor_torque_nm": ("road", "wheel"),
-    "energy_wh": ("road", "wheel", "shaft"),
-    "battery_power_kw": ("road", "wheel", "shaft"),
-}
-
-_LAST_STAGE = {"traction_force_n": "road", "motor_torque_nm": "driveline"}  # of the chain up to the target
 _MEASURED = {
     "road": "neither traction force nor motor torque with motor speed is measured",
     "wheel": "the chain is entered at the measured traction force",
-    "shaft": "the chain is entered at the measured motor torque and speed",
+    "shaft": "the chain is entered at the measured motor torque",
 }
 
 
@@ -56,7 +49,7 @@ class Built:
 
 
 def build(
-    sheet: Sheet, segments: Segments, entry: Entry, target: Target, *, vehicle_names: Sequence[str] = ()
+    sheet: Sheet, segments: Segments, entry: Entry, target: TargetName, *, vehicle_names: Sequence[str] = ()
 ) -> Built:
     """The vehicle for this log, entry (see `choose_entry`) and target. Only the sections in use are needed.
 
@@ -66,16 +59,16 @@ def build(
     **Raises:** `InputError` for a key that is needed and missing, and a gear of the log that the sheet has no ratio
     for; `ValueError` for an entry behind the target.
     """
-    if entry not in _ENTRIES[target]:
-        raise ValueError(f"{target} cannot be computed from entry {entry!r}; use one of {_ENTRIES[target]}")
+    if entry not in (able := TARGETS[target].entries):
+        raise ValueError(f"{target} cannot be computed from entry {entry!r}; use one of {able}")
     return _Builder(sheet, segments, entry, target, tuple(vehicle_names)).build()
 
 
 class _Builder:
     """One `build`: what is used becomes a leaf and rows of the table, the rest a note."""
 
-    def __init__(self, sheet: Sheet, segments: Segments, entry: Entry, target: Target, names: tuple[str, ...]):
-        self.sheet, self.segments, self.target = sheet, segments, target
+    def __init__(self, sheet: Sheet, segments: Segments, entry: Entry, target: TargetName, names: tuple[str, ...]):
+        self.sheet, self.segments, self.target = sheet, segments, TARGETS[target]
         self.entry: Entry = entry
         count = max(len(names), int(np.max(np.asarray(segments.vehicle), initial=0)) + 1)
         self.names = (*names, *(str(k) for k in range(len(names), count)))
@@ -88,13 +81,17 @@ class _Builder:
         driveline, machine = self._efficiencies()
         effects: list[Effect] = self._road() if self.entry == "road" else []
         mass = self._mass()
-        if self.target in BATTERY_TARGETS:
+        if self.target.of_battery:
             effects.append(Auxiliary(self._take("battery.auxiliary_w", default=0.0)))
         effects += self._effects()
         self._unused()
-        vehicle = Vehicle(tuple(effects), mass_kg=mass, driveline=driveline, machine=machine, entry=self.entry)
+        self._measured()
+        vehicle = Vehicle(
+            effects, mass_kg=mass, driveline=driveline, machine=machine, entry=self.entry,
+            nominal_voltage_v=self.sheet.nominal_voltage_v,
+        )  # fmt: skip
         if self.entry == "road" and isinstance(driveline.efficiency, EfficiencyMap):
-            self.notes += read_against_map(self.sheet, vehicle, self.segments)
+            self.notes += read_against_map(self.sheet.map_path, vehicle, self.segments)
         return Built(vehicle, ParameterTable(tuple(self.rows)), self.notes)
 
     # --- one coefficient -----------------------------------------------------------------------------------------
@@ -125,8 +122,8 @@ class _Builder:
 
     def _road(self) -> list[Effect]:
         why = f"{_MEASURED['road']}, so the road forces are computed"
-        if self.target == "traction_force_n":
-            why = "the target traction_force_n is the sum of the road forces"
+        if self.target.last_stage == "road":
+            why = f"the target {self.target} is the sum of the road forces"
         return [
             Inertia(self._take("road.rotating_mass_factor", default=1.0)),
             Grade(),
@@ -148,17 +145,17 @@ class _Builder:
         """Driveline and machine: which of them covers what, by entry and target."""
         sheet, one = self.sheet, Machine(np.asarray(1.0), np.asarray(1.0))
         lossless = sheet.driveline(np.asarray(1.0))
-        if self.target == "traction_force_n":
+        if self.target.last_stage == "road":
             return lossless, one
-        if self.target == "motor_torque_nm":
-            why = "the target motor_torque_nm lies behind the driveline"
+        if self.target.last_stage == "driveline":
+            why = f"the target {self.target} lies behind the driveline"
             sheet.need_ratios(self.segments, why)
-            return (lossless if self.entry == "wheel" else sheet.driveline(self._driveline_efficiency(why))), one
+            return (lossless if self.entry == "wheel" else self._driveline(why)), one
         has_driveline = sheet.efficiency_map is not None or "driveline.efficiency" in sheet.declared
         has_machine = any(path.startswith("machine.") for path in sheet.declared)
         if self.entry == "road" and (has_driveline or not has_machine):
             why = f"{_MEASURED['road']}: it covers wheel to battery"
-            return sheet.driveline(self._driveline_efficiency(why), covers_machine=True), one
+            return self._driveline(why, covers_machine=True), one
         why = f"{_MEASURED[self.entry]}, and the machine takes it to the battery"
         if self.entry == "road":
             self.notes.append("[machine] covers wheel to battery: the sheet has no driveline.efficiency")
@@ -167,6 +164,11 @@ class _Builder:
             self.notes.append("[machine] covers wheel to battery: the traction force is measured")
         parts = [self._take(f"machine.{k}", why) for k in SECTIONS["machine"]]
         return lossless, Machine(*parts)
+
+    def _driveline(self, why: str, *, covers_machine: bool = False) -> Driveline:
+        efficiency, path = self._driveline_efficiency(why), "driveline.regenerating_efficiency"
+        back = self._take(path) if path in self.sheet.declared else None
+        return self.sheet.driveline(efficiency, regenerating=back, covers_machine=covers_machine)
 
     def _driveline_efficiency(self, why: str) -> Any:
         sheet = self.sheet
@@ -188,10 +190,10 @@ class _Builder:
         sheet, out = self.sheet, []
         for effect_id in dict.fromkeys(p.split(".")[1] for p in sheet.declared if p.startswith("effects.")):
             cls = sheet.library[effect_id]
-            reason = unavailable(cls, self.segments, self.entry)
-            last = _LAST_STAGE.get(self.target, "battery")
-            if reason is None and STAGES.index(cls.stage) > STAGES.index(last):
-                reason = f"acts behind the target {self.target}"
+            stands_in = () if sheet.nominal_voltage_v is None else ("nominal_voltage_v",)
+            reason = unavailable(cls, self.segments, self.entry, stands_in)
+            if reason is None and STAGES.index(cls.stage) > STAGES.index(self.target.last_stage):
+                reason = f"cannot act on the target {self.target}"
             grouped = [
                 p
                 for p in cls.parameters
@@ -230,19 +232,39 @@ class _Builder:
 
     # --- notes ---------------------------------------------------------------------------------------------------
 
+    def _measured(self) -> None:
+        """Notes on what of the log the declared model uses, and on what is taken from the sheet instead."""
+        has, sheet = self.segments.has, self.sheet
+        if self.entry == "road" and has("air_density_kgpm3"):
+            self.notes.append("the declared drag uses the log's air_density_kgpm3 in place of the standard density")
+        if self.entry == "shaft" and not has("motor_speed_radps"):
+            sheet.need_ratios(self.segments, "the log measures motor torque without motor speed")
+            self.notes.append("motor_speed_radps is not logged: it is speed · ratio / wheel radius")
+        ignored = self.target.of_battery and self.entry != "shaft" and has("motor_torque_nm")
+        if ignored and not (has("motor_speed_radps") or sheet.knows_ratio(self.segments)):
+            self.notes.append(
+                "motor_torque_nm is not used: the log has no motor_speed_radps, and the sheet no gear ratios (or "
+                "final_drive) and wheel_radius_m to derive it from the speed"
+            )
+        if self.target.of_battery and (volts := sheet.nominal_voltage_v) is not None:
+            self.notes.append(
+                "battery.nominal_voltage_v is not used: the log has voltage_v" if has("voltage_v") else
+                f"the log has no voltage_v: losses by current take the sheet's nominal {volts:g} V"
+            )  # fmt: skip
+
     def _unused(self) -> None:
         """A note for each section with coefficients that this entry and target leave aside."""
         sheet, used = self.sheet, {c.path for c in self.rows}
         idle = {p.split(".")[0] for p in sheet.declared if "." in p and p not in used} - {"effects"}
         if self.entry == "wheel" and sheet.efficiency_map is not None:
             idle.add("driveline")
-        if self.target == "traction_force_n" and not self.segments.has("traction_force_n"):
+        if self.target.last_stage == "road" and not self.segments.has(self.target.name):
             idle.discard("driveline")  # the target itself is derived with it (`traction_force_from_torque`)
         before = f"the target {self.target} lies before it"
         reasons = {
             "road": _MEASURED[self.entry],
-            "driveline": before if self.target == "traction_force_n" else _MEASURED[self.entry],
-            "machine": "driveline.efficiency covers wheel to battery" if self.target in BATTERY_TARGETS else before,
+            "driveline": before if self.target.last_stage == "road" else _MEASURED[self.entry],
+            "machine": "driveline.efficiency covers wheel to battery" if self.target.of_battery else before,
             "battery": before,
         }
         for section in (s for s in SECTIONS if s in idle):

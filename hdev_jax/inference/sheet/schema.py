@@ -7,7 +7,7 @@ from typing import Any, Literal, NoReturn
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import near
-from hdev_jax.physics import Effect, Parameter
+from hdev_jax.physics import Effect, Parameter, Shape, Size
 
 __all__ = ["KEYS", "SECTIONS", "Declared", "Key", "Prior", "effect_key", "parse"]
 
@@ -64,7 +64,7 @@ class Key:
 _POSITIVE = (0.0, math.inf)
 _EFFICIENCY = Key("coefficient", "1", 0.0, 1.0, above=True, support=_POSITIVE)
 _LENGTH = Key("number", "m", 0.0, above=True)
-# c_rr is a ratio of forces: 0.5 is beyond any road, and tells values in N/kN or kg/t (5 to 12) from it
+# c_rr is a ratio of forces: 0.5 is beyond any road, and separates values in N/kN or kg/t (5 to 12) from it
 SECTIONS: dict[str, dict[str, Key]] = {
     "": {
         "name": Key("text"),
@@ -79,21 +79,22 @@ SECTIONS: dict[str, dict[str, Key]] = {
     },
     "driveline": {
         "efficiency": _EFFICIENCY,
+        "regenerating_efficiency": _EFFICIENCY,
         "map": Key("file"),
         "gear_ratios": Key("numbers", "1", 0.0, above=True),
         "final_drive": Key("number", "1", 0.0, above=True),
         "wheel_radius_m": _LENGTH,
     },
     "machine": {"motoring_efficiency": _EFFICIENCY, "regenerating_efficiency": _EFFICIENCY},
-    "battery": {"auxiliary_w": Key("coefficient", "W")},
+    "battery": {"auxiliary_w": Key("coefficient", "W"), "nominal_voltage_v": Key("number", "V", 0.0, above=True)},
 }
 KEYS: dict[str, Key] = {f"{s}.{k}" if s else k: key for s, keys in SECTIONS.items() for k, key in keys.items()}
 _FIELDS = ("value", "sd", "per_vehicle", "estimated", "vehicles")
 
 
 def effect_key(effect: type[Effect], p: Parameter) -> Key:
-    """The key of an effect's parameter. A size may be anything; a shape or a limit keeps to its plausible range."""
-    bounds = (-math.inf, math.inf) if p.kind == "size" else (p.lower, p.upper)
+    """The key of an effect's parameter. A size may be anything; every other kind keeps to its plausible range."""
+    bounds = (-math.inf, math.inf) if isinstance(p, Size) else (p.lower, p.upper)
     across = effect.across is not Effect.across or effect.observe is not Effect.observe
     return Key("coefficient", p.unit, *bounds, support=bounds, by_gear=bool(p.by), across_rows=across or bool(p.by))
 
@@ -129,6 +130,10 @@ def parse(
             _unknown(where, name, name, (*SECTIONS[""], *(s for s in SECTIONS if s), "effects"))
     if "driveline.efficiency" in coefficients and "driveline.map" in others:
         raise InputError(f"{where}: driveline.efficiency and driveline.map are both there; one of them is accepted")
+    if "driveline.regenerating_efficiency" in coefficients and not {"driveline.efficiency", "driveline.map"} & {
+        *coefficients, *others
+    }:  # fmt: skip
+        raise InputError(f"{where}: driveline.regenerating_efficiency: found without an efficiency or map beside it")
     _say_something(where, coefficients, effects)
     return coefficients, others
 
@@ -269,9 +274,9 @@ def _effects(where: str, found: Any, effects: Mapping[str, type[Effect]]) -> lis
 
 
 def _say_something(where: str, coefficients: dict[str, Declared], effects: Mapping[str, type[Effect]]) -> None:
-    """Refuse an effect whose sizes and limits are all known to be null: it would be there in name only."""
+    """Refuse an effect whose sizes and switches are all known to be null: it would be there in name only."""
     for effect_id in dict.fromkeys(path.split(".")[1] for path in coefficients if path.startswith("effects.")):
-        sizes = [p for p in effects[effect_id].parameters if p.kind != "shape"]
+        sizes = [p for p in effects[effect_id].parameters if not isinstance(p, Shape)]
         priors = [
             (p, x)
             for p in sizes
@@ -283,5 +288,5 @@ def _say_something(where: str, coefficients: dict[str, Declared], effects: Mappi
             names = ", ".join(p.name for p in sizes)
             raise InputError(
                 f"{where}: effects.{effect_id}: found no value other than that of a vehicle without it; "
-                f"a size or limit ({names}) that is not {sizes[0].null:g}, or has an sd, is accepted"
+                f"a size or switch ({names}) that is not {sizes[0].null:g}, or has an sd, is accepted"
             )

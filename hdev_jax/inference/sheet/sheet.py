@@ -1,7 +1,6 @@
 """The vehicle sheet: read from TOML, where the chain is entered, and traction force from motor torque."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,55 +11,81 @@ from jaxtyping import Array, Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.maps.read import read_map
-from hdev_jax.inference.sheet.schema import Declared, parse
+from hdev_jax.inference.sheet.schema import parse
 from hdev_jax.physics import LIBRARY, Driveline, Effect, EfficiencyMap, most_group
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
-from hdev_jax.physics.vehicle import Entry, Target
+from hdev_jax.physics.vehicle import Entry
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TARGETS, TargetName
 from hdev_jax.textfiles import read_toml
 
-__all__ = ["BATTERY_TARGETS", "Sheet", "choose_entry", "read_sheet", "traction_force_from_torque"]
-
-BATTERY_TARGETS = ("energy_wh", "battery_power_kw")
+__all__ = ["Sheet", "choose_entry", "read_sheet", "traction_force_from_torque"]
 
 
-@dataclass(frozen=True, eq=False)
 class Sheet:
-    """A vehicle sheet as read. `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`).
+    """A vehicle sheet, from Python as from TOML (contract, section 2).
 
-    `gear_ratios` count from the first gear; `map_path` is where `efficiency_map` came from. `library` are the effects
-    that [effects.*] may name.
+    ```python
+    Sheet(name="rigid truck, 26 t", mass_kg=18e3, road={"c_rr": (0.006, 0.0008), "cda_m2": (5.6, 0.5)},
+          driveline={"efficiency": 0.91}, battery={"auxiliary_w": 2500.0})
+    ```
+
+    **Arguments:** `sections`, the keys of a sheet; a number is known, `(value, sd)` or `{"value": …, "sd": …}` a
+    tabular prior: it is estimated. `library`, the effects that `effects` may name; `path`, the file that it stands in,
+    beside which an efficiency map is sought.
+
+    **Fields:** `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`); `gear_ratios` count
+    from the first gear; `map_path` is where `efficiency_map` came from. **Raises:** `InputError`, one line with key,
+    what was found and what is accepted.
     """
 
-    name: str
-    path: Path
-    text: str
-    declared: Mapping[str, Declared]
-    gear_ratios: tuple[float, ...] | None = None
-    final_drive: float | None = None
-    wheel_radius_m: float | None = None
-    efficiency_map: EfficiencyMap | None = None
-    map_path: Path | None = None
-    source: str = ""
-    notes: str = ""
-    library: Mapping[str, type[Effect]] = field(default_factory=lambda: LIBRARY, repr=False)
+    def __init__(
+        self, *, library: Mapping[str, type[Effect]] = LIBRARY, path: str | Path | None = None, **sections: Any
+    ) -> None:
+        self.path = Path("sheet" if path is None else path)
+        where = "sheet" if path is None else f"sheet {path}"
+        self.declared, others = parse(where, _as_toml(sections), library)
+        self.library = library
+        self.name: str = others.get("name", self.path.stem)
+        self.gear_ratios: tuple[float, ...] | None = others.get("driveline.gear_ratios")
+        self.final_drive: float | None = others.get("driveline.final_drive")
+        self.wheel_radius_m: float | None = others.get("driveline.wheel_radius_m")
+        self.nominal_voltage_v: float | None = others.get("battery.nominal_voltage_v")
+        self.map_path = self.path.parent / others["driveline.map"] if "driveline.map" in others else None
+        self.efficiency_map: EfficiencyMap | None = None if self.map_path is None else read_map(self.map_path)
+        self.source: str = others.get("source", "")
+        self.notes: str = others.get("notes", "")
 
-    def driveline(self, efficiency: Any, *, covers_machine: bool = False) -> Driveline:
-        """The driveline with the sheet's ratios and this efficiency; what is not declared is the kernel's default."""
+    def __repr__(self) -> str:
+        free = [k for k, d in self.declared.items() if d.sd is not None or d.groups]
+        known = [k for k in self.declared if k not in free]
+        return (
+            f"Sheet({self.name!r}; estimated: {', '.join(free) or 'nothing'}; known: {', '.join(known) or 'nothing'})"
+        )
+
+    def driveline(self, efficiency: Any, *, regenerating: Any = None, covers_machine: bool = False) -> Driveline:
+        """The driveline with the sheet's ratios and these efficiencies; else the kernel's default."""
         return Driveline(
             efficiency,
             None if self.gear_ratios is None else jnp.asarray(self.gear_ratios, dtype=float),
             np.asarray(1.0 if self.final_drive is None else self.final_drive),
             np.asarray(WHEEL_RADIUS_M if self.wheel_radius_m is None else self.wheel_radius_m),
             covers_machine,
+            regenerating,
         )
 
     def fail(self, key: str, why: str) -> InputError:
         """The error for a key that is missing."""
         return InputError(f"sheet {self.path}: {key} is missing; it is needed because {why}")
 
+    def knows_ratio(self, segments: Segments) -> bool:
+        """Whether motor torque and wheel force can be separated in every row of the log."""
+        by_gear = self.gear_ratios is not None and len(self.gear_ratios) > 1
+        declared = self.wheel_radius_m is not None and (self.gear_ratios is not None or self.final_drive is not None)
+        return declared and (not by_gear or segments.has("gear"))
+
     def need_ratios(self, segments: Segments, why: str) -> None:
-        """Raise `InputError` unless motor torque and wheel force can be told from each other, row by row."""
+        """Raise `InputError` unless motor torque and wheel force can be separated, row by row."""
         if self.gear_ratios is None and self.final_drive is None:
             raise self.fail("driveline.gear_ratios (or final_drive)", why)
         if self.wheel_radius_m is None:
@@ -89,36 +114,30 @@ def read_sheet(path: str | Path, *, library: Mapping[str, type[Effect]] = LIBRAR
     **Raises:** `InputError`, one line with file, key, what was found and what is accepted, for whatever is wrong in it
     or in the efficiency map it names.
     """
-    path = Path(path)
-    where = f"sheet {path}"
-    table, text = read_toml(path, "sheet")
-    declared, others = parse(where, table, library)
-    map_path = None
-    if "driveline.map" in others:
-        map_path = path.parent / others["driveline.map"]
-    return Sheet(
-        name=others.get("name", path.stem),
-        path=path,
-        text=text,
-        declared=declared,
-        gear_ratios=others.get("driveline.gear_ratios"),
-        final_drive=others.get("driveline.final_drive"),
-        wheel_radius_m=others.get("driveline.wheel_radius_m"),
-        efficiency_map=None if map_path is None else read_map(map_path),
-        map_path=map_path,
-        source=others.get("source", ""),
-        notes=others.get("notes", ""),
-        library=library,
-    )
+    table, _ = read_toml(Path(path), "sheet")
+    if {"library", "path"} & {*table}:  # arguments here, unknown keys there
+        parse(f"sheet {path}", table, library)
+    return Sheet(library=library, path=path, **table)
 
 
-def choose_entry(segments: Segments, target: Target) -> Entry:
-    """Where the chain is entered: the measured quantity nearest the target, upstream of it."""
-    if target in BATTERY_TARGETS and segments.has("motor_torque_nm", "motor_speed_radps"):
-        return "shaft"
-    if target != "traction_force_n" and segments.has("traction_force_n"):
-        return "wheel"
-    return "road"
+def _as_toml(found: Any) -> Any:
+    """Values as TOML has them: `(value, sd)` as a table, arrays as lists."""
+    if isinstance(found, Mapping):
+        return {k: list(v) if k == "gear_ratios" and isinstance(v, tuple) else _as_toml(v) for k, v in found.items()}
+    if isinstance(found, tuple) and len(found) == 2:
+        return {"value": _as_toml(found[0]), "sd": _as_toml(found[1])}
+    return found.tolist() if isinstance(found, np.generic | np.ndarray) else found
+
+
+def choose_entry(segments: Segments, target: TargetName, sheet: Sheet) -> Entry:
+    """Where the chain is entered: the measured quantity nearest the target, upstream of it.
+
+    Torque alone is enough where the sheet gives the motor's speed from the vehicle's.
+    """
+    turns = segments.has("motor_speed_radps") or sheet.knows_ratio(segments)
+    shaft = segments.has("motor_torque_nm") and turns
+    measured = {"road": True, "wheel": segments.has("traction_force_n"), "shaft": shaft}
+    return next(e for e in reversed(TARGETS[target].entries) if measured[e])
 
 
 def traction_force_from_torque(segments: Segments, sheet: Sheet) -> Float[np.ndarray, " row"]:
@@ -132,13 +151,14 @@ def traction_force_from_torque(segments: Segments, sheet: Sheet) -> Float[np.nda
     if not segments.has("motor_torque_nm"):
         raise InputError("the log has neither traction_force_n nor motor_torque_nm; one of them is needed as target")
     sheet.need_ratios(segments, why)
-    efficiency = _declared_efficiency(sheet, why)
-    driveline = sheet.driveline(efficiency)
+    back = sheet.declared.get("driveline.regenerating_efficiency")
+    driveline = sheet.driveline(_declared_efficiency(sheet, why), regenerating=back and back.value)
 
     def force(row: Segments) -> Array:
         torque, ratio = row.channels["motor_torque_nm"], driveline.ratio_radpm(row)
         eta = driveline.efficiency_at(row, row.get("motor_speed_radps", row.speed_mps * ratio), torque)
-        return torque * ratio * jnp.where(torque > 0, eta, 1.0 / eta)
+        regenerating = driveline.regenerating_efficiency
+        return torque * ratio * jnp.where(torque > 0, eta, 1.0 / (eta if regenerating is None else regenerating))
 
     return np.asarray(jax.vmap(force)(jax.tree.map(jnp.asarray, segments)), dtype=float)
 

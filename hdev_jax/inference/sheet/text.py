@@ -86,6 +86,7 @@ def _write(sheet: Sheet, declared: Mapping[str, Declared], units: Mapping[str, s
         "driveline.gear_ratios": sheet.gear_ratios,
         "driveline.final_drive": sheet.final_drive,
         "driveline.wheel_radius_m": sheet.wheel_radius_m,
+        "battery.nominal_voltage_v": sheet.nominal_voltage_v,
     }
     if sheet.map_path is not None:
         others["driveline.map"] = map_file or str(sheet.map_path.resolve())

@@ -20,7 +20,7 @@ from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Column, Ids, Segments
-from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2
+from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = [
     "FEATURES",
@@ -157,12 +157,18 @@ def rows_of(
     )
     columns = [_feature(name, s, vehicle, sheet) for name in features]
     # a gear ratio of 1, so that ratio and efficiency are the row's own
+    back = vehicle.driveline.regenerating_efficiency
     line = Driveline(
-        sheet["efficiency"], None, sheet["ratio"] * WHEEL_RADIUS_M, np.full(n, WHEEL_RADIUS_M), covers_machine=True
+        sheet["efficiency"],
+        None,
+        sheet["ratio"] * WHEEL_RADIUS_M,
+        np.full(n, WHEEL_RADIUS_M),
+        covers_machine=True,
+        regenerating_efficiency=None if back is None else np.full(n, back),
     )
     wide = lambda x: np.broadcast_to(np.asarray(x, float), (n, *np.shape(x)))  # noqa: E731
     plain = Vehicle(
-        vehicle.effects, mass_kg=vehicle.mass_kg, driveline=Driveline(1.0), machine=vehicle.machine, entry="road"
+        vehicle.effects, mass_kg=vehicle.mass_kg, machine=vehicle.machine, nominal_voltage_v=vehicle.nominal_voltage_v
     )
     car = eqx.tree_at(lambda c: c.driveline, jax.tree.map(wide, plain), line)
     car = eqx.tree_at(lambda c: c.driveline.efficiency, car, sheet["efficiency"])
@@ -264,7 +270,7 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
         case _ if name == "kinetic":
             return (np.asarray(s.speed_end_mps) ** 2 - np.asarray(s.speed_start_mps) ** 2) / (2.0 * unit)
         case _ if name == "drag_over_weight":
-            return 0.5 * AIR_DENSITY_KGPM3 * cda * square / weight
+            return np.asarray(vehicle.drag(s)) * square / weight
         case _ if name == "specific_energy":
             return sheet["energy"] * 3600.0 / (weight * _REFERENCE_M)
         case _ if name == "duration":
