@@ -1,24 +1,30 @@
-"""The loop end to end on one log: from a sheet to what it misses, with the error before and after."""
+"""The method, step by step: from a log and a sheet to what the sheet lacks, with the error before and after."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.competition.search import search
-from hdev_jax.diagnosis.remainder.rest import told_apart
-from hdev_jax.diagnosis.result.memory import from_plain, to_plain
+from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
+from hdev_jax.diagnosis.competition.compete import compete, named_alone
+from hdev_jax.diagnosis.competition.refit import as_reported
+from hdev_jax.diagnosis.competition.state import State
+from hdev_jax.diagnosis.remainder.remainder import Formula, Remainder, remainder
+from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
+from hdev_jax.diagnosis.result.intervals import left_open
 from hdev_jax.diagnosis.result.next_drive import advise
-from hdev_jax.diagnosis.result.shapes import left_open
+from hdev_jax.diagnosis.result.path import path
 from hdev_jax.diagnosis.result.summary import parameters_of, summarise
-from hdev_jax.diagnosis.scores.look import Loop, Search
+from hdev_jax.diagnosis.settings import SETTINGS, Settings
+from hdev_jax.diagnosis.training import Training
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, cluster_rows, padded
 from hdev_jax.physics import Effect, Vehicle, most_group
 from hdev_jax.problem import Problem, Split
+from hdev_jax.targets import TARGETS
 
-__all__ = ["Diagnosis", "diagnose"]
+__all__ = ["Diagnosis", "diagnose", "training_of"]
 
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
@@ -44,53 +50,95 @@ def diagnose(
     split: Split,
     library: Mapping[str, type[Effect]],
     *,
-    fdr: float = 0.05,
+    settings: Settings = SETTINGS,
     seed: int = 0,
     tell: Tell = lambda _: None,
     checkpoint: Checkpoint = lambda _, compute: compute(),
 ) -> Diagnosis:
-    """Steps 1 to 6 of the loop. Test trips are looked at once, when everything has been chosen.
+    """What the declared vehicle lacks. Test trips are held out: they are used once, when everything has been chosen.
 
-    **Arguments:** `library`, the candidates by id; `fdr`, the level of false discoveries over all of them; `seed` of
-    placebos, resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
+    **Arguments:** `library`, the candidates by id; `settings`, every number that decides; `seed` of placebos,
+    resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
 
-    **Returns:** a `Diagnosis`; its `summary` keeps contract §4.
+    **Returns:** a `Diagnosis`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
     """
-    if problem.target != "energy_wh" and not np.all(np.isfinite(problem.measured)):
-        raise InputError("the target holds values that are no numbers; see the ledger of `hdev check`")
-    train = problem.rows(split.train)
-    rows = padded(problem.segments.take(train), problem.measured[train])
-    real = problem.segments.take(train)
-    gears = most_group(problem.segments)  # one that no training trip has is left without a size, as in the sheet
+    # 1. The training rows, and the effects that could act on this target
+    training, excluded = training_of(problem, split, library, settings)
 
-    def remember(step: int, compute: Callable[[], Search]) -> Search:
+    # 2. Calibrate the declared model, then let candidates compete until none is added, taken out or exchanged
+    def remember(step: int, compute: Callable[[], State]) -> State:
         plain = checkpoint(f"step-{step}", lambda: to_plain(compute()))
-        return from_plain(plain, problem.vehicle, library, gears)
+        return from_plain(plain, problem.vehicle, training)
 
-    excluded = []
-    if problem.target in ("traction_force_n", "motor_torque_nm") and "power_gain" in library:
-        library = {k: c for k, c in library.items() if k != "power_gain"}
-        excluded = [{"id": "power_gain", "why": "a power sensor's fault is none of a force's or a torque's"}]
-    effects = list(library.values())
-    state = search(
-        problem.vehicle, problem.table, rows, problem.target, effects,
-        fdr=fdr, seed=seed, gears=gears, tell=tell, remember=remember,
-    )  # fmt: skip
-    tell("error before and after on test trips")
-    loop = Loop(rows, problem.target, cluster_rows(real), effects, fdr, np.random.default_rng([seed, 999]), gears)
-    state, steps, predicted, left = told_apart(problem, split, state, loop, seed=seed, tell=tell, checkpoint=checkpoint)
-    base = steps[0]
-    leeway = {f.id: left_open(loop, state, f.score, steps[-1]) for f in state.found}
-    summary = summarise(problem, split, state, steps, predicted, left, leeway)
+    state = compete(training, problem.vehicle, problem.table, seed=seed, tell=tell, remember=remember)
+
+    # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing
+    tell("error before and after on the held-out test trips")
+    named = named_alone(training, state)
+    steps = path(training, problem, named)
+    predicted = [problem.predict(fit.vehicle) for fit in steps]
+
+    # 4. What remains: the term without a name, a flexible learner, cycles, change points, random intercepts of trips
+    described = _formula(problem, training, state, predicted[-1])
+    plain = checkpoint(
+        "remainder",
+        lambda: (
+            remainder(problem, split, predicted[-1], predicted[0], described, settings, seed=seed, tell=tell).__dict__
+        ),
+    )
+    left = Remainder(**plain)
+    if named.found and not left.significant:  # beside something unexplained, these weights would fit that
+        known = as_reported(training, named)
+        steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
+        test = problem.rows(split.test)
+        left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
+
+    # 5. Sizes with their intervals, classes, and the drives that separate the members of a class
+    leeway = {f.id: left_open(training, named, f.score, steps[-1]) for f in named.found}
+    summary = summarise(problem, split, named, steps, predicted, left, leeway, settings)
     summary["excluded"] = excluded
-    rivals = [(f.id, library[t]) for f in state.found for t in f.twins if t in library]
-    if rivals:
-        tell("what to measure next: drives that would tell the rest apart")
-        drives = checkpoint("next", lambda: [asdict(a) for a in advise(problem, state, rows, rivals)])
+    twins = [(f.id, library[t]) for f in named.found for t in f.alike[: settings.most_in_class] if t in library]
+    if twins:
+        tell("what to measure next: drives that separate the members of a class")
+        drives = checkpoint("next", lambda: [asdict(a) for a in advise(problem, named, training.rows, twins)])
         summary["next_drives"] = drives
-    # a sheet's numbers belong together: sizes as they are known at the shapes that it holds
-    sheet = {f.id: parameters_of(f, steps[-1], {}, summary["clusters"]["count"]) for f in state.found}
+    # a sheet's numbers belong together: sizes as estimated at the shapes that it holds
+    sheet = {f.id: parameters_of(f, steps[-1], {}, summary["clusters"]["count"]) for f in named.found}
     found = {k: {n: (p["value"], p["sd"], p["unit"]) for n, p in v.items()} for k, v in sheet.items()}
     return Diagnosis(
-        problem, split, summary, base.vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
+        problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
     )
+
+
+def training_of(
+    problem: Problem, split: Split, library: Mapping[str, type[Effect]], settings: Settings = SETTINGS
+) -> tuple[Training, list[dict[str, str]]]:
+    """The training rows with the effects that could act on the target; which were excluded, and why."""
+    if problem.target != "energy_wh" and not np.all(np.isfinite(problem.measured)):
+        raise InputError("the target has missing or infinite values; see the ledger of `hdev check`")
+    excluded = []
+    if not TARGETS[problem.target].of_battery:
+        other = [k for k, c in library.items() if c.of_battery]
+        library = {k: c for k, c in library.items() if k not in other}
+        excluded = [{"id": k, "why": "it acts on battery power, which this target does not depend on"} for k in other]
+    train = problem.rows(split.train)
+    real = problem.segments.take(train)
+    gears = most_group(problem.segments)  # one in no training trip has no size, as in the sheet
+    rows = padded(real, problem.measured[train])
+    return Training(rows, problem.target, cluster_rows(real), library, gears, settings), excluded
+
+
+def _formula(problem: Problem, training: Training, state: State, predicted: np.ndarray) -> Formula | None:
+    """The term without a name, if there is one that explains anything, with the prediction of the model that has it."""
+    if not state.terms or state.terms[0].values is not None:  # a cycle's mean: reported with what remains
+        return None
+    term = state.terms[0]
+    at = next(i for i, c in enumerate(state.fit.table.free) if c.path == f"effects.{Described.id}.k")
+    words = formula(term, float(state.fit.values[at]), float(state.fit.sd[at]), problem.target)
+    everything = problem.segments.with_channels(**{TERM: term.column(problem.segments)})
+    with_it = problem.predict(state.fit.vehicle, everything)
+    train = np.isin(np.asarray(problem.segments.trip), np.unique(training.trip))
+    before = float(np.mean((problem.measured - predicted)[train] ** 2))
+    if before - float(np.mean((problem.measured - with_it)[train] ** 2)) < training.settings.least_share * before:
+        return None  # significant perhaps, but it explains too little
+    return Formula(words, term.channels, with_it)

@@ -11,12 +11,11 @@ from jaxtyping import Float
 
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
-from hdev_jax.physics import Effect, Grouped, Parameter, Vehicle, at_null, unavailable
-from hdev_jax.physics.vehicle import Target
+from hdev_jax.physics import Choice, Effect, Grouped, Parameter, Switch, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = [
-    "FIXED",
     "Candidate",
     "Column",
     "Grids",
@@ -26,11 +25,11 @@ __all__ = [
     "beyond",
     "columns",
     "finer",
+    "in_order",
     "plan_of",
     "realised",
 ]
 
-FIXED = ("shape", "choice")  # what has no column of its own
 TOGETHER = 6  # effects in one program: more of them run slower, fewer take longer to compile
 
 
@@ -57,7 +56,7 @@ class Candidate:
     @property
     def freedoms(self) -> int:
         """How many numbers it fits, those chosen on a grid included."""
-        chosen = sum(len(p.grid) > 1 for p in self.effect.parameters if p.kind in FIXED and _matters(p, self.sizes))
+        chosen = sum(len(p.grid) > 1 for p in self.effect.parameters if not p.has_column and _matters(p, self.sizes))
         return len(self.columns) + chosen
 
     def only(self, kept: Sequence[bool] | np.ndarray) -> "Candidate | None":
@@ -72,7 +71,7 @@ class Candidate:
 
     @property
     def by_trip(self) -> dict[str, dict[int, float]]:
-        """Shapes that were sought for each trip, `phase[3]` among `shapes`: by name, then by the trip's id."""
+        """Shapes that were estimated for each trip, `phase[3]` among `shapes`: by name, then by the trip's id."""
         out: dict[str, dict[int, float]] = {}
         for key, value in self.shapes:
             name, bracket, trip = key.partition("[")
@@ -121,13 +120,15 @@ def _grid(p: Parameter, facts: Facts, grids: Grids) -> tuple[float, ...]:
 def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tuple[Any, ...]]:
     """`(sizes, groups, shapes, kind)` for each way to have the effect."""
     by_name = {p.name: p for p in effect.parameters}
-    sizes = tuple(p.name for p in effect.parameters if p.kind not in FIXED)
+    sizes = tuple(p.name for p in effect.parameters if p.has_column)
     for variant in effect.variants or (sizes,):
-        shapes = [p for p in effect.parameters if p.kind in FIXED and _matters(p, variant)]
+        shapes = [p for p in effect.parameters if not p.has_column and _matters(p, variant)]
         each = [[(p.name, g) for g in _grid(p, facts, grids)] for p in shapes]
         for at in product(*each):
+            if not in_order(effect, dict(at)):
+                continue
             first = by_name[variant[0]]
-            if first.kind == "limit":
+            if isinstance(first, Switch):
                 for g in _grid(first, facts, grids):
                     yield variant, (None,), (*at, (first.name, g)), "limit"
             elif first.by:
@@ -140,8 +141,13 @@ def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tup
                 yield variant, (None,) * len(variant), at, "size"
 
 
+def in_order(effect: type[Effect], values: Mapping[str, float]) -> bool:
+    """Whether limits of one effect are in order (heating below cooling), those of these values that it has."""
+    return all(values[a] < values[b] for a, b in effect.ordered if a in values and b in values)
+
+
 def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int = 7) -> dict[str, tuple[float, ...]]:
-    """Grids for the candidate's shapes and limits, `reach` of a step to either side of where it stands.
+    """Grids for the candidate's shapes and limits, `reach` of a step to either side of its present value.
 
     `row_s` is the median duration of a row [s].
     """
@@ -149,7 +155,7 @@ def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int
     for name, at in candidate.shapes:
         p = candidate.parameter(name)
         grid = [g * row_s if p.in_rows else g for g in p.grid]
-        if p.kind == "choice" or len(grid) < 2 or p.smooth:
+        if isinstance(p, Choice) or len(grid) < 2 or p.smooth:
             grids[name] = (at,)
             continue
         k = int(np.argmin(np.abs(np.array(grid) - at)))
@@ -202,7 +208,7 @@ class Plan:
 
     candidates: tuple[Candidate, ...]
     left_out: Mapping[str, str]
-    target: Target
+    target: TargetName
     programs: tuple[Program, ...]
     recipes: tuple[Recipe, ...]
 
@@ -217,21 +223,21 @@ class Plan:
 
 
 def plan_of(
-    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: Target, grids: Grids | None = None,
+    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: TargetName, grids: Grids | None = None,
     *, searched: bool = False,
 ) -> Plan:  # fmt: skip
     """Every candidate that a log of these facts allows beside what the vehicle has.
 
     Effects of one row share a vehicle, a few with all of them at their null value, so that one compiled `jvp` serves
     them all; what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name;
-    `searched` takes effects that are looked for otherwise too.
+    `searched` takes effects with a search of their own too.
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []
     for c in effects:
         if vehicle.has(c.id) or (c.searched and not searched):
             continue
-        if why := unavailable(c, facts.sample, vehicle.entry):
+        if why := unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in):
             left_out[c.id] = why
         else:
             nulls.append(as_seen(at_null(c, gears=facts.gears), facts))
@@ -239,7 +245,7 @@ def plan_of(
     groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
     groups += [(shared[k : k + TOGETHER], None) for k in range(0, len(shared), TOGETHER)]
     for e in (e for e in nulls if not _row_level(e)):
-        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.kind not in FIXED),):
+        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.has_column),):
             groups.append(([_only(e, sizes)], sizes))
 
     found: list[Candidate] = []
@@ -266,7 +272,7 @@ def columns(
     effects: Sequence[type[Effect]],
     segments: Segments,
     rows: int,
-    target: Target,
+    target: TargetName,
     grids: Grids | None = None,
 ) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
     """Every candidate's columns on the first `rows` rows of padded segments, all at once: for few rows or effects.
@@ -281,12 +287,12 @@ def columns(
 
 def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
     """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
-    idle = {p.name for p in effect.parameters if p.kind == "limit" and p.name not in sizes}
+    idle = {p.name for p in effect.parameters if isinstance(p, Switch) and p.name not in sizes}
     return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
 
 
 def as_seen(effect: Effect, facts: Facts) -> Effect:
-    """The effect with one number for all rows in place of groups that the log does not tell."""
+    """The effect with one number for all rows in place of groups that the log does not have."""
     one = {p.name: np.asarray(p.null, dtype=float) for p in effect.parameters if p.whole and not facts.seen(p.by)}
     return type(effect)(**({p.name: getattr(effect, p.name) for p in effect.parameters} | one)) if one else effect
 
@@ -305,9 +311,9 @@ def realised(candidate: Candidate, beta: Float[np.ndarray, " k"], *, gears: int 
     values.update({name: np.asarray(v, dtype=float) for name, v in candidate.shapes if "[" not in name})
     values.update({name: _grouped(by_trip) for name, by_trip in candidate.by_trip.items()})
     for p in candidate.effect.parameters:
-        if p.kind == "limit" and p.name not in candidate.sizes:
+        if isinstance(p, Switch) and p.name not in candidate.sizes:
             values[p.name] = None  # not part of it: the effect skips what it costs
-        if p.whole and None in candidate.groups:  # the log tells no groups
+        if p.whole and None in candidate.groups:  # the log has no groups
             values[p.name] = np.asarray(p.null, dtype=float)
     if candidate.kind == "limit" and candidate.parameter(candidate.sizes[0]).smooth:
         values[candidate.sizes[0]] = np.asarray(dict(candidate.shapes)[candidate.sizes[0]] * float(beta[0]))

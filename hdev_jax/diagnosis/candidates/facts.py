@@ -7,12 +7,11 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from hdev_jax.physics import most_group
+from hdev_jax.physics import GROUPS, most_group
 from hdev_jax.segments import Segments
 
-__all__ = ["GROUPS", "Facts", "facts_of", "merged", "thinned"]
+__all__ = ["Facts", "facts_of", "merged", "thinned"]
 
-GROUPS = ("gear", "road_surface")  # channels that a coefficient may be grouped by
 MOST_STEPS = 24  # places for a change that stays: beyond, every few trips, and refined about the best
 LEAST_SHARE = 0.02  # of the rows, for a group to have a coefficient of its own
 

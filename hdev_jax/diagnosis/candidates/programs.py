@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 
 from hdev_jax.inference import insert
 from hdev_jax.physics import Effect, Grouped, Vehicle
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = ["Program", "Recipe", "computed", "written"]
 
@@ -73,7 +73,7 @@ class Recipe:
     tangent: Float[np.ndarray, " parameter"] | None
 
 
-def computed(recipes: Sequence[Recipe], segments: Segments, target: Target) -> Iterator[Float[np.ndarray, " row"]]:
+def computed(recipes: Sequence[Recipe], segments: Segments, target: TargetName) -> Iterator[Float[np.ndarray, " row"]]:
     """The recipes' columns of padded segments, one after the other, as they are: not all need be numbers."""
     segments = jax.tree.map(jnp.asarray, segments)
     base: dict[int, np.ndarray] = {}
@@ -87,7 +87,7 @@ def computed(recipes: Sequence[Recipe], segments: Segments, target: Target) -> I
             yield np.asarray(_predict(p.car, p.structure, target, segments, r.values)) - base[id(p)]
 
 
-def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: Target) -> None:
+def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: TargetName) -> None:
     """Write the recipes' columns of padded segments into `out` [row, column]; what is no number counts as 0."""
     for k, column in enumerate(computed(recipes, segments, target)):
         out[:, k] = np.nan_to_num(column, posinf=0.0, neginf=0.0)
@@ -95,12 +95,14 @@ def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, targ
 
 # not `eqx.filter_jit`: every leaf is an array, and sorting them out takes longer than the column of a short log
 @partial(jax.jit, static_argnums=(1, 2))
-def _predict(car: Vehicle, structure: Structure, target: Target, segments: Segments, values: Any) -> Array:
+def _predict(car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any) -> Array:
     return insert(car, structure, jnp.asarray(values)).predict(segments, target)
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _slope(car: Vehicle, structure: Structure, target: Target, segments: Segments, values: Any, tangent: Any) -> Array:
+def _slope(
+    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any, tangent: Any
+) -> Array:
     def predict(x: Array) -> Array:
         return insert(car, structure, x).predict(segments, target)
 

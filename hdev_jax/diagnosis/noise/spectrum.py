@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special, stats
 
-from hdev_jax.diagnosis.noise.model import Noise, whiten, without_level
+from hdev_jax.diagnosis.noise.noise import Noise, whiten, without_level
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Clocked", "Period", "strongest_period"]
@@ -60,21 +60,21 @@ class Clocked:
         return [s for _, s in trip_slices(self.trip)]
 
     def whitened(self, columns: Float[np.ndarray, "row k"]) -> Float[np.ndarray, "row k"]:
-        """Columns as white noise of variance 1 would be met, without the level of each trip."""
+        """Columns for generalised least squares, without the intercept of each trip."""
         both = whiten(np.column_stack([columns, self.worth]), self.noise, self.trip, self.duration_s)
         return without_level(both[:, :-2], both[:, -2], self.slices)
 
 
 def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Period | None:
-    """The peak that stands out most of the noise around it; None where the trips are too short for a cycle.
+    """The most significant peak over the noise around it; None where the trips are too short for a cycle.
 
-    Periodograms of what a load of each frequency meets in the whitened residual, in windows of equal length, added up
+    Periodograms of the matched filter of the whitened residual, in windows of equal length, added up
     whatever the phase (Bartlett 1948): at each frequency a sum of as many exponential variables as there are windows,
-    times the level of the noise there, which its neighbours tell: the noise as estimated has the cycle in it, and is
+    times the level of the noise there, taken from its neighbours: the noise as estimated has the cycle in it, and is
     too high there.
     """
-    # An autoregression of a higher order predicts a strong cycle, and would take it out; so would levels of trips and
-    # of blocks a slow one. What one coefficient leaves of the noise's colour is smooth.
+    # An autoregression of a higher order predicts a strong cycle, and would take it out; so would intercepts of trips
+    # and of blocks a slow one. What one coefficient leaves of the noise's colour is smooth.
     noise = rows.noise
     first = {"coefficients": noise.coefficients[:2, :1], "scales": noise.scales[:2]}
     rows = replace(rows, noise=replace(noise, **first, level_sd=0.0, block_sd=0.0))
@@ -86,7 +86,7 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
     if window < 64 * step:
         return None
     signal, weight = _matched(rows.whitened(residual[:, None])[:, 0], rows)
-    size = 1 << int(np.ceil(np.log2(2 * window / step)))  # twice as fine as the window tells apart
+    size = 1 << int(np.ceil(np.log2(2 * window / step)))  # twice as fine as the window resolves
     power, count = np.zeros(size // 2 + 1), 0
     pieces = [w for s in rows.slices for w in _windows(rows.clock_s, s, window)]
     for piece in pieces:
@@ -115,8 +115,8 @@ def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Peri
 
 
 def _matched(white: np.ndarray, rows: Clocked) -> tuple[np.ndarray, np.ndarray]:
-    """What of each row a load meets: the load's products with it are those of its whitened column with `white`. Second,
-    what a row weighs.
+    """The matched filter of each row: its product with a load is that of the load's whitened column with `white`.
+    Second, what a row weighs.
 
     Rows differ in length, and whitening takes from each what the one before predicts: what is left of a slow load is
     mostly what a long row has more of it than a short one. First rows, which none predicts, would outweigh many others
@@ -148,7 +148,7 @@ def _floors(power: np.ndarray, at: np.ndarray, per: int, count: int) -> np.ndarr
 
 
 def _floor(power: np.ndarray, k: int, per: int, count: int) -> float:
-    """How high the noise stands at a place of the grid, two standard errors up, by independent frequencies around it.
+    """The noise level at a place of the grid plus two standard errors, from independent frequencies around it.
 
     A smooth spectrum, falling as a power of frequency at most: its logarithm is linear in that of frequency. The
     logarithm of a sum of `count` exponential variables is digamma(count) on the average.
@@ -167,7 +167,7 @@ def _floor(power: np.ndarray, k: int, per: int, count: int) -> float:
 def _refined(
     residual: np.ndarray, rows: Clocked, pieces: list[slice], frequency: float, width: float
 ) -> tuple[float, np.ndarray]:
-    """Period and amplitude in each window by least squares on whitened rows near a frequency."""
+    """Period and amplitude in each window by generalised least squares near a frequency."""
     white = rows.whitened(residual[:, None])[:, 0]
     best = (-1.0, 0.0, np.zeros(len(pieces)))
     for f in frequency + width * np.linspace(-1, 1, 9):

@@ -1,8 +1,8 @@
-"""What to measure next: the drive that would tell two causes apart which this log cannot, by Fisher information.
+"""What to measure next: the drive that separates two causes which this log cannot distinguish, by Fisher information.
 
-The kernel's Jacobian on a simulated drive says how much a kilometre of it adds to what the log knows of each
-coefficient. A drive tells a found effect from its rival when the found size, with the rival's free beside it, would
-stand `TOLD` standard errors from nothing.
+The kernel's Jacobian on a simulated drive gives the information that each kilometre of it adds on each coefficient. A
+drive separates a found effect from its rival when the found size, fitted together with the rival's, would be
+`SEPARATED` standard errors from 0.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import columns
-from hdev_jax.diagnosis.scores.look import Search
+from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.inference import Fit, jacobian, padded
 from hdev_jax.physics import Effect
 from hdev_jax.problem import Problem
@@ -21,13 +21,13 @@ from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = ["DRIVES", "Advice", "advise"]
 
-TOLD = 3.0
-MOST_REPEATS = 50.0  # of a drive; beyond it nobody would go
+SEPARATED = 3.0
+MOST_REPEATS = 50.0  # of a drive; more is not practical
 
 
 @dataclass(frozen=True)
 class Advice:
-    """One drive that would tell `effect` from `rival`: how much of it, and how well the log tells them now."""
+    """One drive that separates `effect` from `rival`: how much of it, and how well the log separates them now."""
 
     effect: str
     rival: str
@@ -64,7 +64,7 @@ def _town(**options: float) -> tuple[Part, ...]:
 
 
 DRIVES: dict[str, tuple[Part, ...]] = {
-    "standing still for half an hour with everything on": (Part((0.0, 0.0), 1800.0),),
+    "standing still for half an hour with all consumers on": (Part((0.0, 0.0), 1800.0),),
     "standing still for half an hour on a cold and on a hot day": (
         Part((0.0, 0.0), 1800.0, temperature_c=-5.0), Part((0.0, 0.0), 1800.0, temperature_c=32.0),
     ),
@@ -85,7 +85,7 @@ DRIVES: dict[str, tuple[Part, ...]] = {
 
 
 def simulate(parts: Sequence[Part], problem: Problem) -> Segments:
-    """The drive as rows like the log's own: the log's usual row, its channels at their medians but for what varies."""
+    """The drive as rows of the log's usual length, its channels at their medians except for what the drive varies."""
     s = problem.segments
     step = float(np.median(np.asarray(s.duration_s)))
     v0, v1, which = [], [], []
@@ -139,12 +139,12 @@ def simulate(parts: Sequence[Part], problem: Problem) -> Segments:
 
 
 def advise(
-    problem: Problem, state: Search, rows: Fit, pairs: Sequence[tuple[str, type[Effect]]], *, best: int = 2
+    problem: Problem, state: State, rows: Fit, pairs: Sequence[tuple[str, type[Effect]]], *, best: int = 2
 ) -> list[Advice]:
-    """The best drives for each pair of a found effect and a rival that the log cannot tell from it.
+    """The best drives for each pair of a found effect and a rival that the log cannot distinguish from it.
 
     **Arguments:** `pairs` of a found effect's id and the rival's class; `best`, how many drives for each pair.
-    **Returns:** advice, the shortest first; one with an empty `drive` for a pair that no drive here tells apart.
+    **Returns:** advice, the shortest first; one with an empty `drive` for a pair that no drive here separates.
     """
     out = []
     for found, rival in pairs:
@@ -152,7 +152,7 @@ def advise(
         logged = _information(problem, state, rows, rival)
         if not logged or not len(at):
             continue
-        # of the ways to have the rival, the one that is the hardest to tell from what was found
+        # of the rival's forms, the one that is hardest to separate from the found effect
         logged = [information + _prior(state) for information in logged]
         which = max(range(len(logged)), key=lambda k: _relative_sd(logged[k], size, at))
         now = _relative_sd(logged[which], size, at)
@@ -175,23 +175,23 @@ def advise(
 
 
 def _repeats(information: np.ndarray, extra: np.ndarray, size: np.ndarray, at: np.ndarray) -> float | None:
-    """How many times the drive has to be driven, at least once; None where even `MOST_REPEATS` do not do."""
+    """How many times the drive has to be driven, at least once; None where even `MOST_REPEATS` are not enough."""
 
-    def told(times: float) -> bool:
-        return _relative_sd(information + times * extra, size, at) <= 1.0 / TOLD
+    def separated(times: float) -> bool:
+        return _relative_sd(information + times * extra, size, at) <= 1.0 / SEPARATED
 
-    if told(1.0):
+    if separated(1.0):
         return 1.0
-    if not told(MOST_REPEATS):
+    if not separated(MOST_REPEATS):
         return None
     low, high = 1.0, MOST_REPEATS
     for _ in range(20):
         middle = float(np.sqrt(low * high))
-        low, high = (low, middle) if told(middle) else (middle, high)
+        low, high = (low, middle) if separated(middle) else (middle, high)
     return float(np.ceil(high))
 
 
-def _places(state: Search, found: str) -> tuple[np.ndarray, np.ndarray]:
+def _places(state: State, found: str) -> tuple[np.ndarray, np.ndarray]:
     """Where the found effect's sizes are among the free coefficients, and what they are."""
     sizes = next(f.score.candidate.sizes for f in state.found if f.id == found)
     paths = {f"effects.{found}.{n}" for n in sizes}
@@ -199,8 +199,8 @@ def _places(state: Search, found: str) -> tuple[np.ndarray, np.ndarray]:
     return at, np.asarray(state.fit.values)[at]
 
 
-def _information(problem: Problem, state: Search, rows: Fit, rival: type[Effect]) -> list[np.ndarray]:
-    """Fisher information of these rows on [free coefficients, rival's size], for each way to have the rival."""
+def _information(problem: Problem, state: State, rows: Fit, rival: type[Effect]) -> list[np.ndarray]:
+    """Fisher information of these rows on [free coefficients, rival's size], for each form of the rival."""
     fit = state.fit
     jac = jacobian(fit.vehicle, fit.table, rows.segments, problem.target)[: rows.rows]
     candidates, matrix, _ = columns(fit.vehicle, [rival], rows.segments, rows.rows, problem.target)
@@ -212,17 +212,17 @@ def _information(problem: Problem, state: Search, rows: Fit, rival: type[Effect]
     return out
 
 
-def _prior(state: Search) -> np.ndarray:
+def _prior(state: State) -> np.ndarray:
     """What the sheet's tables say of the coefficients, and nothing of the rival."""
     precision = [0.0 if c.sd is None else 1.0 / c.sd**2 for c in state.fit.table.free]
     return np.diag([*precision, 0.0])
 
 
 def _relative_sd(information: np.ndarray, size: np.ndarray, at: np.ndarray) -> float:
-    """Standard error over size of the found effect's best known size, everything else free beside it."""
+    """Standard error over value of the found effect's best known size, everything else fitted with it."""
     d = np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information / np.outer(d, d) + 1e-9 * np.eye(len(d))
-    with np.errstate(over="ignore"):  # of a size that no row tells anything of: infinite
+    with np.errstate(over="ignore"):  # of a size on which the rows hold no information: infinite
         variance = np.diag(np.linalg.inv(scaled))[at] / d[at] ** 2
     sd = np.sqrt(np.maximum(variance, 0.0))
     return float(np.min(np.divide(sd, np.abs(size), out=np.full(len(sd), np.inf), where=size != 0)))

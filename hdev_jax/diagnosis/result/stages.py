@@ -8,9 +8,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.errors import InputError
 from hdev_jax.physics import Effect
 from hdev_jax.problem import prepare
+from hdev_jax.targets import TARGETS
 
 __all__ = ["add_stages"]
 
@@ -19,7 +21,7 @@ def add_stages(
     result: Diagnosis,
     library: Mapping[str, type[Effect]],
     *,
-    fdr: float,
+    settings: Settings,
     seed: int,
     tell: Callable[[str], None] = lambda _: None,
     checkpoint: Callable[[str, Callable[[], Any]], Any] = lambda _, compute: compute(),
@@ -30,17 +32,23 @@ def add_stages(
     """
     problem, split, summary = result.problem, result.split, result.summary
     declares = any(name.startswith("road.c_rr") for name in problem.sheet.declared)
-    if problem.vehicle.entry == "road" or not declares or problem.target not in ("energy_wh", "battery_power_kw"):
+    if problem.vehicle.entry == "road" or not declares or not TARGETS[problem.target].of_battery:
         return
     try:
         road = prepare(split.log, problem.sheet, "traction_force_n")
     except InputError as e:
-        summary["notes"].append(f"the road's side is not diagnosed apart: {e}")
+        summary["notes"].append(f"the road stage is not diagnosed separately: {e}")
         return
     tell("the road's side: from the sheet to the force that was measured")
     other = diagnose(
-        road, split, library, fdr=fdr, seed=seed, tell=tell, checkpoint=lambda n, f: checkpoint(f"road-{n}", f)
-    )
+        road,
+        split,
+        library,
+        settings=settings,
+        seed=seed,
+        tell=tell,
+        checkpoint=lambda n, f: checkpoint(f"road-{n}", f),
+    )  # fmt: skip
     summary["stages"] = {
         "road": {
             **{k: other.summary[k]["test"] for k in ("before", "after")}, "unit": road.unit,
@@ -55,5 +63,5 @@ def add_stages(
     found = ", ".join(summary["stages"]["road"]["effects"]) or "nothing that could be named"
     summary["notes"].append(
         f"between the road and the wheels the declared model misses {found}: test RMSE {rmse[0]:.4g} to {rmse[1]:.4g} "
-        f"{road.unit}; it has no part in the error above, since the force is measured"
+        f"{road.unit}; the error above does not include it, since the force is measured"
     )

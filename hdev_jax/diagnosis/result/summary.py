@@ -6,24 +6,23 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.remainder.unexplained import Remainder
-from hdev_jax.diagnosis.result.shapes import Open
-from hdev_jax.diagnosis.scores.look import Found, Search, Verdict
-from hdev_jax.inference import Calibration, Coefficient, cluster_rows
-from hdev_jax.physics import Parameter
+from hdev_jax.diagnosis.competition.state import Found, State, Verdict
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
+from hdev_jax.diagnosis.remainder.remainder import Remainder
+from hdev_jax.diagnosis.result.intervals import Open
+from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.inference import Calibration, cluster_rows
+from hdev_jax.physics import Choice, Parameter
 from hdev_jax.problem import Problem, Split, metrics
 
-__all__ = ["FAR", "SUSPICIOUS", "baseline_block", "parameters_of", "summarise"]
+__all__ = ["baseline_block", "parameters_of", "summarise"]
 
 ODD_SHARE = 0.2
-SUSPICIOUS = 8.0  # gain in log-likelihood (odds of 3,000 to 1 before any correction) that is worth a word
 MOST_HINTED = 3
-DOUBTFUL = 0.5  # q from which on the clusters speak against it
-FAR = 2.0  # tabular standard deviations beyond which a coefficient has moved suspiciously far
 
 
 def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> dict[str, Any]:
-    """The contract's `baseline.parameters`: value, sd, the table's, how far it moved, what it may have absorbed."""
+    """The contract's `baseline.parameters`: value, sd, prior, distance from the prior, what it may have absorbed."""
     block = {}
     for c, value, sd, z in zip(fit.table.free, fit.values, fit.sd, fit.prior_z(), strict=True):
         prior = {} if c.sd is None else {"prior_value": c.value, "prior_sd": c.sd, "prior_z": float(z)}
@@ -34,7 +33,7 @@ def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> di
 
 
 def _sized(value: float, error: float, clusters: int) -> dict[str, Any]:
-    """A size with what is known of it from a few clusters: Student's t with `clusters` − 1 degrees of freedom.
+    """A size with its uncertainty from few clusters: Student's t with `clusters` − 1 degrees of freedom.
 
     **Arguments:** `error`, the standard error jackknifed over clusters.
 
@@ -55,63 +54,58 @@ def _heavier(clusters: int) -> float:
     return float(np.sqrt(freedom / (freedom - 2)))
 
 
-def _opened(told: dict[str, Any], p: Parameter, left: Open, error: float | None, clusters: int) -> dict[str, Any]:
-    """What is known of a parameter with what its effect's shapes or other size leave open of it, inside its plausible
-    range: what was `told` of it, widened where that is too narrow.
+def _opened(fitted: dict[str, Any], p: Parameter, left: Open, error: float | None, clusters: int) -> dict[str, Any]:
+    """A parameter with the uncertainty that its effect's shapes or other size add, inside its plausible range: as
+    `fitted`, with a wider interval where that is too narrow.
 
     `error`: its standard error where those are held; None where it was fitted with them or is one of them.
     """
-    low, high = (told["value"] + x for x in left.interval(0.9, _freedom(clusters), error))
-    inner = told.get("interval_90", [told["value"]] * 2)
-    sd = max(told["sd"], left.error(error) * _heavier(clusters))
+    low, high = (fitted["value"] + x for x in left.interval(0.9, _freedom(clusters), error))
+    inner = fitted.get("interval_90", [fitted["value"]] * 2)
+    sd = max(fitted["sd"], left.error(error) * _heavier(clusters))
     within = np.clip([min(low, inner[0]), max(high, inner[1])], p.lower, p.upper).tolist()
     return {
-        "value": told["value"],
+        "value": fitted["value"],
         "sd": sd,
-        "interval_90": [min(within[0], told["value"]), max(within[1], told["value"])],
+        "interval_90": [min(within[0], fitted["value"]), max(within[1], fitted["value"])],
     }
-
-
-def _error(row: Coefficient, error: float) -> float:
-    """A standard error; of what was borrowed no smaller than where it comes from, since both are the same rows."""
-    return max(error, row.told[1]) if row.told else error
 
 
 def parameters_of(f: Found, fit: Calibration, leeway: Mapping[str, Open], clusters: int) -> dict[str, dict[str, Any]]:
     """A found effect's parameters, each with value, sd, unit and, unless it is a choice, its 90 % interval.
 
-    What was held has an sd of 0 by the fit alone, `leeway` empty: the sheet's numbers, which belong together. With what
-    its shapes or its other size leave open every number stands for itself.
+    With an empty `leeway` these are the sheet's numbers, which belong together: what was held has an sd of 0. With the
+    uncertainty from its shapes or its other size each number can be read by itself.
     """
     c = f.score.candidate
     prefix = f"effects.{f.id}."
-    rows = [r for r in zip(fit.table.free, fit.values, fit.sd, strict=True) if r[0].path.startswith(prefix)]
+    rows = [r for r in zip(fit.table.free, fit.values, fit.errors, strict=True) if r[0].path.startswith(prefix)]
     fitted = {row.path.removeprefix(prefix) for row, _, _ in rows}
     held = fitted <= set(c.sizes)
     parameters: dict[str, dict[str, Any]] = {}
     for row, value, sd in rows:
-        name, error = row.name.removeprefix(prefix), _error(row, float(sd))
-        told = _sized(float(value), error, clusters)
+        name, error = row.name.removeprefix(prefix), float(sd)
+        known = _sized(float(value), error, clusters)
         if name in leeway:
-            told = _opened(told, c.parameter(name), leeway[name], error if held else None, clusters)
-        parameters[name] = {**told, "unit": row.unit}
+            known = _opened(known, c.parameter(name), leeway[name], error if held else None, clusters)
+        parameters[name] = {**known, "unit": row.unit}
     for name, value in c.shapes:
         p = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
         if p:
-            told = {"value": value, "sd": 0.0}
-            told = _opened(told, p, leeway[name], None, clusters) if name in leeway else told
-            parameters[name] = {**told, "unit": p.unit}
+            known = {"value": value, "sd": 0.0}
+            known = _opened(known, p, leeway[name], None, clusters) if name in leeway else known
+            parameters[name] = {**known, "unit": p.unit}
     return parameters
 
 
 def _effect_block(
-    f: Found, fit: Calibration, leeway: Mapping[str, Open], before: float, after: float, clusters: int
+    f: Found, fit: Calibration, leeway: Mapping[str, Open], before: float, after: float, clusters: int, most: int
 ) -> dict[str, Any]:
     c = f.score.candidate
     return {
         "id": f.id,
         "stage": c.effect.stage,
-        "verdict": "one_of_class" if f.twins else "found",
+        "verdict": "one_of_class" if f.alike else "found",
         "parameters": parameters_of(f, fit, leeway, clusters),
         "equation": c.effect.equation,
         "separated_by": c.effect.separated_by,
@@ -119,19 +113,20 @@ def _effect_block(
         "stability": f.stability,
         "test_rmse_before": before,
         "test_rmse_after": after,
-        "indistinguishable_from": list(f.twins),
-        "class_size": 1 + f.alike,
+        "indistinguishable_from": list(f.alike[:most]),
+        "class_size": 1 + len(f.alike),
     }
 
 
 def summarise(
     problem: Problem,
     split: Split,
-    state: Search,
+    state: State,
     steps: list[Calibration],
     predicted: list[np.ndarray],
     left: Remainder,
     leeway: Mapping[str, Mapping[str, Open]],
+    settings: Settings,
 ) -> dict[str, Any]:
     """The contract's diagnosis.json. `leeway`: by effect and parameter, what is left open."""
     weight, y = problem.weight(), problem.measured
@@ -148,7 +143,10 @@ def summarise(
     rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
     clusters = cluster_rows(problem.segments.take(train))
     effects = [
-        {**_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count), "order": k + 1}
+        {
+            **_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count, settings.most_in_class),
+            "order": k + 1,
+        }
         for k, f in enumerate(state.found)
     ]
     verdict = {
@@ -157,13 +155,13 @@ def summarise(
         (False, True): "unexplained_structure",
         (True, True): "effects_found_and_unexplained_structure",
     }[bool(effects), left.significant]
-    candidates = [{"id": v.id, "score": v.score, "q_value": v.q_value, "why_not": v.why_not} for v in state.verdicts]
+    candidates = [_candidate(v.id, v.score, v.q_value, v.rejection) for v in state.verdicts]
     considered = {c["id"] for c in candidates}
-    for e in state.fit.vehicle.effects:  # in the vehicle: nothing to turn down, but considered all the same
+    for e in state.fit.vehicle.effects:  # in the vehicle already: listed with the candidates too
         if e.parameters and e.id not in considered:
             f = next((f for f in state.found if f.id == e.id), None)
-            here = (f.gain, f.q_value, "found") if f else (None, 1.0, "declared in the sheet")
-            candidates.append(dict(zip(("id", "score", "q_value", "why_not"), (e.id, *here), strict=True)))
+            here = (f.gain, f.q_value, Kind.FOUND) if f else (None, 1.0, Kind.DECLARED)
+            candidates.append(_candidate(e.id, *here[:2], Rejection(here[2])))
     return {
         "schema": "hdev-diagnosis/1",
         "target": problem.target,
@@ -180,7 +178,7 @@ def summarise(
         "unexplained": {
             "significant": left.significant,
             "share_of_test_variance": left.share,
-            "share_borne_out": left.borne_out,
+            "share_borne_out": left.confirmed,
             "noise_floor_rmse": left.noise_floor_rmse,
             "depends_on": list(left.depends_on),
             "signature": left.signature,
@@ -188,14 +186,14 @@ def summarise(
             "correction": left.correction,
             "expression": left.expression,
         },
-        "not_decidable": _not_decidable(state.verdicts, left),
+        "not_decidable": _not_decidable(state.verdicts, left, settings),
         "verdict": verdict,
         "parameters_fitted": _fitted(state),
         "clusters": {"kind": clusters.kind, "count": clusters.count, "trips": len(split.train)},
         "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
         "notes": [
             *problem.notes,
-            *_warnings(steps, state),
+            *_warnings(steps, state, settings),
             *_known(problem, state, steps[-1], test, rmse[-1]),
             *_by_trip(problem, state),
             *_odd_rows(problem, predicted[0]),
@@ -203,33 +201,37 @@ def summarise(
     }
 
 
-def _not_decidable(verdicts: Sequence[Verdict], left: Remainder) -> list[dict[str, Any]]:
-    """What more trips (or stretches of driving) would tell, the nearest of each kind first.
+def _candidate(id_: str, score: float | None, q_value: float, rejection: Rejection) -> dict[str, Any]:
+    return {"id": id_, "score": score, "q_value": q_value, "kind": str(rejection.kind), "why_not": str(rejection)}
 
-    Either rows speak for it and clusters not yet (one trip in the rain says little of rain), three at most; or trips
-    differ in level, or may, and it is a cause that differs by trip: of any such a log knows no more than it has trips.
+
+def _not_decidable(verdicts: Sequence[Verdict], left: Remainder, settings: Settings) -> list[dict[str, Any]]:
+    """What more trips (or stretches of driving) would decide, the nearest of each kind first.
+
+    Either it is significant by rows but not yet by clusters (rain in one trip), three at most; or random intercepts of
+    trips are significant or suspected, and it differs between trips alone.
     """
     able = sorted((v for v in verdicts if v.needed is not None), key=lambda v: v.needed or 0)
-    open_to_doubt = [v for v in able if v.by_rows or v.q_value < DOUBTFUL]
-    hinted = [v for v in open_to_doubt if (v.score or 0.0) > SUSPICIOUS][:MOST_HINTED]
-    told = [*hinted, *(v for v in able if left.trips_differ and v.between and v not in hinted)]
-    return [{"id": v.id, "clusters_needed": v.needed, "why_not": v.why_not} for v in told]
+    open_to_doubt = [v for v in able if v.by_rows or v.q_value < settings.half]
+    hinted = [v for v in open_to_doubt if (v.score or 0.0) > settings.suspicious][:MOST_HINTED]
+    listed = [*hinted, *(v for v in able if left.trips_differ and v.between and v not in hinted)]
+    return [{"id": v.id, "clusters_needed": v.needed, "why_not": str(v.rejection)} for v in listed]
 
 
-def _fitted(state: Search) -> int:
+def _fitted(state: State) -> int:
     """Every fitted or grid-chosen number: free coefficients, and choices among more than one value."""
     choices = sum(
         len(p.grid) != 1
         for f in state.found
         for p in f.score.candidate.effect.parameters
-        if p.kind == "choice" and any(p.name == n for n, _ in f.score.candidate.shapes)
+        if isinstance(p, Choice) and any(p.name == n for n, _ in f.score.candidate.shapes)
     )
     by_trip = sum(len(x) for f in state.found for x in f.score.candidate.by_trip.values())
-    return len(state.table.free) + choices + by_trip
+    return len(state.fit.table.free) + choices + by_trip
 
 
 def _subsets(problem: Problem, test: np.ndarray, before: np.ndarray, after: np.ndarray) -> dict[str, Any]:
-    """Errors on parts of the test rows that mean something of their own."""
+    """Errors on parts of the test rows: standing, moving, without friction brake."""
     s, weight = problem.segments, problem.weight()
     moving = np.asarray(s.speed_mps) > 2.0
     parts = {"standing still": np.asarray(s.speed_mps) < 0.1, "above 2 m/s": moving}
@@ -245,40 +247,40 @@ def _subsets(problem: Problem, test: np.ndarray, before: np.ndarray, after: np.n
     }
 
 
-def _warnings(steps: list[Calibration], state: Search) -> list[str]:
+def _warnings(steps: list[Calibration], state: State, settings: Settings) -> list[str]:
     out = []
     for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
         if not fit.converged:
             out.append(f"the fit of the {when} stopped early: {fit.message}")
     for name, p in baseline_block(steps[0], state.absorbs).items():
-        if abs(p.get("prior_z", 0.0)) > FAR:
-            held = f"; on this log it cannot be told from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
-            out.append(f"{name} moved {p['prior_z']:+.1f} tabular sd to fit the declared model{held}")
+        if abs(p.get("prior_z", 0.0)) > settings.far:
+            held = f"; on this log it cannot be distinguished from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
+            out.append(f"{name} moved {p['prior_z']:+.1f} prior sd from its table in the declared model{held}")
     return out
 
 
-def _known(problem: Problem, state: Search, last: Calibration, test: np.ndarray, rmse: float) -> list[str]:
-    """What of the error after is no effect's: where its coefficients come from."""
+def _known(problem: Problem, state: State, last: Calibration, test: np.ndarray, rmse: float) -> list[str]:
+    """How the coefficients of the model with the effects are estimated, where not as those of the declared model."""
     if last is state.fit or not state.found:
         return []
     said = problem.predict(state.fit.vehicle)[test]
     plain = metrics(problem.measured[test], said, problem.weight()[test])["rmse"]
     return [
-        "coefficients of the model with the effects are of whitened rows, which know them better: test RMSE "
-        f"{rmse:.4g} {problem.unit}; {plain:.4g} with those of rows of equal weight, as the declared model has them"
+        "coefficients of the model with the effects are by generalised least squares (smaller standard errors): test "
+        f"RMSE {rmse:.4g} {problem.unit}; {plain:.4g} by ordinary least squares, as in the declared model"
     ]
 
 
-def _by_trip(problem: Problem, state: Search) -> list[str]:
-    """What was sought for each trip: the phases of a cycle, the trips of a mode."""
+def _by_trip(problem: Problem, state: State) -> list[str]:
+    """What was estimated for each trip: the phases of a cycle, the trips of a mode."""
     out = []
     for f in state.found:
-        told = next(iter(f.score.candidate.by_trip.values()), {})
-        by_trip = [(problem.log.trip_names[t], v) for t, v in told.items()]
-        mean = "a trip that was not fitted, and every trip in augmented_vehicle.toml, gets its mean"
-        if f.id == "mode_change":
+        values = next(iter(f.score.candidate.by_trip.values()), {})
+        by_trip = [(problem.log.trip_names[t], v) for t, v in values.items()]
+        mean = "other trips, and all trips by augmented_vehicle.toml, are predicted with its mean"
+        if f.score.candidate.effect.searched == "trips":
             trips = ", ".join(t for t, v in by_trip if v > 0)
-            out.append(f"mode_change holds in {trips}; {mean}")
+            out.append(f"{f.id} is on in {trips}; {mean}")
         elif by_trip:
             phases = ", ".join(f"{t} {v:+.2f}" for t, v in by_trip)
             out.append(f"{f.id}: phase by trip {phases}; {mean}")
@@ -286,7 +288,7 @@ def _by_trip(problem: Problem, state: Search) -> list[str]:
 
 
 def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
-    """A row far beyond all others that holds much of the whole log's squared error by itself."""
+    """A note on a single outlier that has much of the log's squared error."""
     square = (problem.measured - declared) ** 2
     worst = int(np.argmax(square))
     share = square[worst] / max(float(np.sum(square)), 1e-300)
@@ -296,6 +298,6 @@ def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
     trip = problem.log.trip_names[int(problem.log.trip[worst])]
     at = float(np.asarray(problem.segments.time_s)[worst])
     return [
-        f"one row alone holds {100 * share:.0f} % of the declared model's squared error: trip {trip} at {at:.6g} s, "
-        f"{problem.target} = {problem.measured[worst]:.6g}; a faulty instrument there would ruin every fit"
+        f"one row has {100 * share:.0f} % of the declared model's squared error: trip {trip} at {at:.6g} s, "
+        f"{problem.target} = {problem.measured[worst]:.6g}; if it is a measurement fault, remove it and run again"
     ]

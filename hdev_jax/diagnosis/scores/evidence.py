@@ -14,18 +14,16 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.scores.normal_equations import NormalEquations, solved
 from hdev_jax.diagnosis.scores.significance import least_clusters, wald
 
-__all__ = ["ABSORBED", "Evidence", "Score"]
-
-ABSORBED = 3e-3  # share of a column left after projecting the Jacobian off, below which the log cannot show it
+__all__ = ["Evidence", "Score"]
 
 
 @dataclass(frozen=True)
 class Score:
-    """What a log says of one candidate beside what the vehicle has.
+    """The tests of one candidate beside the effects that the vehicle has.
 
     `gain` in log-likelihood on training rows, `p_model` from it (χ²), `p_cluster` from a Wald test with jackknifed
     clusters (F), `left_out_gain` in log-likelihood over clusters left out in turn, `left` the share of its columns
-    that the Jacobian does not hold. `plain`: told by rows that weigh the same (`Evidence.plain_score`).
+    that the Jacobian does not hold. `plain`: by ordinary least squares (`Evidence.plain_score`).
     """
 
     candidate: Candidate
@@ -39,7 +37,7 @@ class Score:
 
     @property
     def p(self) -> float:
-        """Both tests have to agree; twice that, since whitened and plain rows are both looked at."""
+        """Both tests have to agree; twice that, since ordinary and generalised least squares are both tried."""
         return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
 
 
@@ -94,8 +92,8 @@ class Evidence(NormalEquations):
         index = self._with_base(at)
         normal = self._normal(totals[v], at)[0]
         weights = np.stack([solved(normal, e) for e in np.eye(len(index))[self.base :]])
-        told = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
-        share = told / np.maximum(np.sum(told, axis=1, keepdims=True), 1e-300)
+        variance = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
+        share = variance / np.maximum(np.sum(variance, axis=1, keepdims=True), 1e-300)
         return 1.0 / np.maximum(np.sum(share**2, axis=1), 1e-300)
 
     def traded(self, own: Sequence[int], other: int) -> Float[np.ndarray, " k"]:

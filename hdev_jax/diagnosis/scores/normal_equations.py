@@ -1,4 +1,4 @@
-"""Normal equations by cluster of [Jacobian | candidates | residual], trips with levels of their own: the algebra.
+"""Normal equations by cluster of [Jacobian | candidates | residual], with random intercepts of trips: the algebra.
 
 Everything is whitened (`whiten.py`), so a cluster's rows enter only through its Gram matrix. Fits, refits without each
 cluster in turn, what candidates gain and what they share with the Jacobian need no second look at the rows.
@@ -180,8 +180,8 @@ class NormalEquations:
     def step(self) -> tuple[np.ndarray, np.ndarray]:
         """The base columns' own Gauss-Newton step, and the covariance of where it leads.
 
-        Standard errors are from clusters left out in turn, and no smaller than the working model's: what a single
-        cluster tells, the others leave as it is. Correlations are the working model's.
+        Standard errors are from clusters left out in turn, and no smaller than the working model's: an estimate
+        that rests on a single cluster does not change without the others. Correlations are the working model's.
         """
         none, totals = np.empty(0, int), self.totals()
         likelihood, x = self._fit(totals, none)
@@ -238,4 +238,25 @@ class NormalEquations:
         return replace(
             self, grams=self.grams[:, kept][:, :, kept], levels=self.levels[:, kept], base=int(np.sum(~held)),
             precision=self.precision[~held], pull=self.pull[~held],
+        )  # fmt: skip
+
+    def freed(self, at: Sequence[int], values: Float[np.ndarray, " k"] | None = None) -> "NormalEquations":
+        """The same without some of the base columns, which come first among the candidates' instead; with `values`,
+        what they stand for is put back into the residual: the equations of a model that lacks them."""
+        d = self.grams.shape[-1]
+        kept = np.array([k for k in range(self.base) if k not in {*at}], dtype=int)
+        order = np.r_[kept, np.asarray(at, dtype=int), np.arange(self.base, d)].astype(int)
+        grams, levels = self.grams, self.levels
+        if values is not None:
+            back = np.zeros(d)
+            back[list(at)] = values
+            more, own = grams @ back, grams[:, -1, -1]
+            grams, levels = grams.copy(), levels.copy()
+            grams[:, :, -1] += more
+            grams[:, -1, :] = grams[:, :, -1]
+            grams[:, -1, -1] = own + 2.0 * more[:, -1] + more @ back
+            levels[:, -1] += levels @ back
+        return replace(
+            self, grams=grams[:, order[:, None], order[None, :]], levels=levels[:, order], base=len(kept),
+            precision=self.precision[kept], pull=self.pull[kept],
         )  # fmt: skip

@@ -8,7 +8,7 @@ __all__ = ["clusters_needed", "clusters_to_tell", "effective_number", "least_clu
 
 
 def least_clusters(k: int) -> int:
-    """With how many clusters a test of `k` numbers begins to say anything."""
+    """The least number of clusters for a test of `k` numbers."""
     return k + 2
 
 
@@ -28,7 +28,7 @@ def wald(beta: Float[np.ndarray, "*way k"], left_out: Float[np.ndarray, "cluster
 def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
     """How many clusters would bring a Wald test of `k` numbers from `p` down to `level`, its size staying as it is.
 
-    **Returns:** None where twenty times as many would not do.
+    **Returns:** None where twenty times as many are not enough.
     """
     if clusters < least_clusters(k):
         return None
@@ -39,9 +39,9 @@ def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None
 
 
 def clusters_to_tell(share: float, k: int, level: float, most: int = 1000) -> int | None:
-    """How many clusters tell `k` numbers that hold this share of what clusters differ by from chance at `level`.
+    """How many clusters make `k` numbers that explain this share of the clusters' differences significant at `level`.
 
-    The F of a regression of the clusters' levels on them, in about half of the logs. None where `most` would not do.
+    By the F of a regression of the clusters' means on them, in about half of the logs. None where `most` are too few.
     """
     n = np.arange(k + 2, most + 1)
     enough = stats.f.sf(share / (1.0 - share) * (n - k - 1) / k, k, n - k - 1) <= level
@@ -49,8 +49,8 @@ def clusters_to_tell(share: float, k: int, level: float, most: int = 1000) -> in
 
 
 def ruled_out(share: float, p: float, k: int, clusters: int, level: float = 0.05) -> bool:
-    """Whether a test of `k` numbers with this p would be rarer than `level` if they held such a share of what clusters
-    differ by: a noncentral F, over what a normal column of so many clusters amounts to by chance."""
+    """Whether a p as large as this would be rarer than `level` if `k` numbers explained this share of the clusters'
+    differences: a noncentral F, averaged over normal columns of so many clusters."""
     free = clusters - k - 1
     if free < 1:
         return False

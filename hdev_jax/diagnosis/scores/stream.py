@@ -8,15 +8,16 @@ from jaxtyping import Float, Int
 
 from hdev_jax.diagnosis.candidates.candidate import plan_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of, merged
-from hdev_jax.diagnosis.noise.model import estimate_noise
-from hdev_jax.diagnosis.scores.chunks import CHUNK_ROWS, Chunk, Shapes, chunks_of
-from hdev_jax.diagnosis.scores.look import View, scored
-from hdev_jax.diagnosis.scores.settle import settle
-from hdev_jax.diagnosis.scores.sums import Ground
+from hdev_jax.diagnosis.noise.noise import estimate_noise
+from hdev_jax.diagnosis.scores.gls import generalised
+from hdev_jax.diagnosis.scores.passes import Baseline
+from hdev_jax.diagnosis.scores.scores import Scores, scored
+from hdev_jax.diagnosis.settings import SETTINGS, Settings
 from hdev_jax.inference import Calibration, clusters_of, predict
+from hdev_jax.inference.rows import CHUNK_ROWS, Chunk, Shapes, chunks_of
 from hdev_jax.physics import Effect
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.segments import Segments, trip_slices
+from hdev_jax.targets import TargetName
 
 __all__ = ["Piece", "Survey", "look_through", "survey"]
 
@@ -40,17 +41,18 @@ def look_through(
     read: Callable[[], Iterable[Piece]],
     fit: Calibration,
     effects: Sequence[type[Effect]],
-    target: Target,
+    target: TargetName,
     *,
     chunk_rows: int = CHUNK_ROWS,
-) -> View:
+    settings: Settings = SETTINGS,
+) -> Scores:
     """What a fitted vehicle leaves of a log that comes in pieces, and what every candidate would explain of it.
 
     **Arguments:** `read`, called up to nine times, gives the pieces in the order of their trips, each of whole trips
     with one and the same set of channels (a few times `chunk_rows` rows suit it); `fit`, the vehicle calibrated on some
     of them; `effects`, the candidates' classes.
 
-    **Returns:** the same as `look` for a log in memory. Memory does not grow with the rows but for 24 bytes of each.
+    **Returns:** the same as `score_all` for a log in memory. Memory grows by 24 bytes a row.
 
     **Raises:** `ValueError` where there are no rows, trips are not in order or lie in two pieces, channels differ, or
     a later reading is not the first.
@@ -74,12 +76,12 @@ def look_through(
         if row != seen.facts.rows:
             raise ValueError(f"{row} rows, {seen.facts.rows} when read first; `read` must repeat itself")
 
-    ground = Ground(chunks, clusters, len(lengths), fit, target, noise)
-    ground = replace(ground, fit=settle(ground)[0])
-    return scored(ground, plan_of(ground.fit.vehicle, effects, seen.facts, target))
+    baseline = Baseline(chunks, clusters, len(lengths), fit, target, noise)
+    baseline = replace(baseline, fit=generalised(baseline)[0])
+    return scored(baseline, plan_of(baseline.fit.vehicle, effects, seen.facts, target), settings)
 
 
-def survey(pieces: Iterable[Piece], fit: Calibration, target: Target, *, chunk_rows: int = CHUNK_ROWS) -> Survey:
+def survey(pieces: Iterable[Piece], fit: Calibration, target: TargetName, *, chunk_rows: int = CHUNK_ROWS) -> Survey:
     """The first pass over a log in pieces of whole trips, with what a fitted vehicle leaves of each row.
 
     It predicts in chunks of `chunk_rows`. Raises `ValueError` where there are no rows, or trips are not in order or

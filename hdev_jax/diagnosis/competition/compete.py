@@ -1,0 +1,108 @@
+"""The competition: candidates are added, taken out and exchanged, one at a time, until none of these does better."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from hdev_jax.diagnosis.candidates.unnamed import TERM
+from hdev_jax.diagnosis.competition.cycle import add_cycle
+from hdev_jax.diagnosis.competition.forward import Round, forward
+from hdev_jax.diagnosis.competition.mode import add_mode
+from hdev_jax.diagnosis.competition.needed import backward, classes, exchanged
+from hdev_jax.diagnosis.competition.refit import widened, without
+from hdev_jax.diagnosis.competition.state import State, Verdict
+from hdev_jax.diagnosis.competition.unnamed_step import add_unnamed
+from hdev_jax.diagnosis.competition.verdicts import verdicts_of
+from hdev_jax.diagnosis.scores.scores import score_all
+from hdev_jax.diagnosis.training import Training
+from hdev_jax.inference import ParameterTable
+from hdev_jax.physics import Vehicle
+
+__all__ = ["compete", "named_alone"]
+
+Tell = Callable[[str], None]
+
+
+def compete(
+    training: Training,
+    vehicle: Vehicle,
+    table: ParameterTable,
+    *,
+    seed: int,
+    tell: Tell = lambda _: None,
+    remember: Callable[[int, Callable[[], State]], State] = lambda _, compute: compute(),
+) -> State:
+    """From the declared vehicle to the one with every effect that the training rows support.
+
+    **Arguments:** the declared vehicle with its table; `seed` for placebos and resampling; `tell` for progress;
+    `remember` keeps the state of each step for a run that is killed.
+
+    **Returns:** the vehicle with every effect that passed the gates, its fit, a term without a name where one passed
+    too, and a verdict on every other candidate.
+    """
+
+    def declared() -> State:
+        tell("calibrating the declared model")
+        return State(training.calibrate(vehicle, table))
+
+    state = remember(0, declared)
+    for step in range(1, training.settings.most_effects + 3):
+        rng = np.random.default_rng([seed, step])
+        state = remember(step, lambda s=state, k=step, r=rng: _step(_rows_with(training, s), s, k, r, tell))
+        if state.finished:
+            break
+    return state
+
+
+def _rows_with(training: Training, state: State) -> Training:
+    """The training rows with the channels of the terms that the state holds."""
+    for term in state.terms:
+        if not training.rows.segments.has(TERM):
+            training = training.with_channel(TERM, term.column(training.rows.segments)[: training.rows.rows])
+    return training
+
+
+def _step(training: Training, state: State, step: int, rng: np.random.Generator, tell: Tell) -> State:
+    """One round: the first of forward, the searched candidates, exchange, a wider form, a term without a name, that
+    changes something; then backward. `finished` where none does."""
+    tell(f"scoring candidates, step {step}")
+    scores = score_all(training, state.fit)
+    if step == 1:
+        state = replace(state, absorbs=scores.absorbs)
+    round_ = Round(training, state, scores, rng, tell)
+    sought: list[Verdict] = []
+    new = None
+    if len(state.found) < training.settings.most_effects and step <= training.settings.most_effects + 1:
+        new = forward(round_, skip=state.refused)
+        if new is None and state.refused:
+            new = forward(round_, skip=tuple(round_.reasons))  # tried just now: no second time
+        for add in (add_cycle, add_mode):
+            # last: the residual without an effect that depends on traffic is not noise, and may have cycles
+            if new is None and not state.terms:
+                new, verdict = add(training, state, rng.spawn(1)[0])
+                sought += [verdict] if verdict is not None else []
+        new = new or exchanged(round_) or widened(training, state)
+        if new is None and (added := add_unnamed(round_)) is not None:
+            training, new = added
+            tell("added a term without a name")
+    if new is None:
+        state = replace(state, found=classes(scores, state))
+        return replace(state, verdicts=verdicts_of(round_, sought), finished=True)
+    kept = backward(training, new, newest=len(new.terms) > len(state.terms))
+    for id_ in set(new.ids) - set(kept.ids):
+        tell(f"taking {id_} out again: {kept.removed[id_]}")
+    trail = {**kept.trail, ",".join(kept.ids): [float(x) for x in kept.fit.values]} if not kept.terms else kept.trail
+    refused = tuple(dict.fromkeys((*kept.refused, *round_.reasons)))
+    return replace(kept, verdicts=verdicts_of(round_, sought), trail=trail, refused=refused)
+
+
+def named_alone(training: Training, state: State) -> State:
+    """The state without the terms that have no name: what is handed out. An effect has to be significant there too."""
+    if not state.terms:
+        return state
+    alone = without(training, state, *(t.id for t in state.terms))
+    kept = backward(training, alone, newest=True)
+    lost = [f for f in alone.found if f.id not in kept.ids]
+    verdicts = tuple(Verdict(f.id, f.gain, f.q_value, kept.removed[f.id]) for f in lost)
+    return replace(kept, verdicts=(*verdicts, *state.verdicts))

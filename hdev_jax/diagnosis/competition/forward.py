@@ -1,0 +1,123 @@
+"""Forward: the leaders compete in joint refits, and one that passes every gate is taken."""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hdev_jax.diagnosis.competition.refit import Refit, refit
+from hdev_jax.diagnosis.competition.state import Found, State
+from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class, stability
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.scores import Scores, inside
+from hdev_jax.diagnosis.training import Training
+
+__all__ = ["Round", "forward"]
+
+
+@dataclass
+class Round:
+    """One step of the competition: the scores of all candidates, why some were turned down, and its random draws."""
+
+    training: Training
+    state: State
+    scores: Scores
+    rng: np.random.Generator
+    tell: Callable[[str], None] = lambda _: None
+    reasons: dict[str, Rejection] = field(default_factory=dict)
+
+    def asked(self, s: Score) -> Asked:
+        """What the gates look at for a candidate of this round."""
+        out = frozenset((*self.reasons, *self.state.refused))
+        return Asked(s, self.scores, self.training.trip, self.rng, out)
+
+    def passes(self, s: Score) -> bool:
+        """Whether a candidate passes the gates of its score."""
+        return first_rejection(self.asked(s), SCORE_GATES) is None
+
+    def turned_down(self, id_: str, why: Rejection) -> None:
+        """Note why a candidate is out for this round."""
+        self.reasons[id_] = why
+        self.tell(f"turned down {id_}: {why}")
+
+
+def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] | None = None) -> State | None:
+    """The state with the candidate that passes every gate, refitted; None where none does. Goes on past one that
+    fails; `only` these, without those to `skip`."""
+    scores, settings = round_.scores, round_.training.settings
+    done = {*round_.state.barred, *skip}
+    for _ in range(settings.tries):
+        # in each round again: an effect taken in fewer groups has another p, which changes every adjusted p-value
+        wanted = scores.best if only is None else {k: s for k, s in scores.best.items() if k in only}
+        able = [s for id_, s in wanted.items() if id_ not in done and round_.passes(s)]
+        # candidates of generalised least squares first; those of ordinary least squares when nothing else is left
+        able.sort(key=lambda s: (s.plain, -scores.worth(s)))
+        if not able:
+            return None
+        first, members = _plainest(round_, able)
+        bar = settings.close * scores.worth(first)
+        rivals = [s for s in able if s.plain == first.plain and s.candidate.id not in members]
+        close = [first, *(s for s in rivals[: settings.leaders - 1] if scores.worth(s) >= bar)]
+        fits = [(s, fit) for s in close if (fit := _refitted(round_, s)) is not None]
+        done |= {s.candidate.id for s in close}
+        each = [(taken, fit, max(fit.gain, taken.gain) if taken.plain else fit.gain) for taken, fit in fits]
+        each.sort(key=lambda f: -scores.worth(replace(f[0], gain=f[2])))
+        for s, fit, gain in each:
+            if (new := _taken(round_, s, fit, gain)) is not None:
+                return new
+    return None
+
+
+def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:
+    """The leader, or the simplest member of its class: physics before an instrument's fault, fewer coefficients before
+    more; and the ids of the class."""
+
+    def asks(s: Score) -> tuple[bool, int]:
+        return s.candidate.effect.stage == "sensors", s.candidate.freedoms
+
+    members = {able[0].candidate.id, *of_class(round_.asked(able[0]))}
+    return min((s for s in able if s.candidate.id in members), key=asks), members
+
+
+def _refitted(round_: Round, s: Score) -> Refit | None:
+    """A candidate's joint refit, None where it fails.
+
+    Without a group (a gear) whose size the refit puts beyond 0 it is another candidate, which passes every gate again.
+    """
+    again = round_.scores.again(s)
+    round_.tell(f"refitting with {s.candidate.id}")
+    came = refit(round_.training, round_.state, s, round_.scores)
+    while came.fit is None and came.fewer is not None:
+        s = inside(again([came.fewer])[0], again)
+        round_.scores.replaced(s)
+        if not round_.passes(s):
+            break
+        round_.tell(f"refitting {s.candidate.id} with {len(s.candidate.groups)} groups")
+        came = refit(round_.training, round_.state, s, round_.scores)
+    if came.fit is None:
+        round_.turned_down(s.candidate.id, Rejection(Kind.REFIT))
+        return None
+    return came
+
+
+def _taken(round_: Round, s: Score, came: Refit, gain: float) -> State | None:
+    """The state with a refitted candidate, if it passes the remaining gates."""
+    state, scores, id_ = round_.state, round_.scores, s.candidate.id
+    s = scores.best[id_]  # as it was taken: perhaps in fewer groups
+    asked = round_.asked(s)
+    if (why := first_rejection(asked, (*SCORE_GATES, *DRAWN_GATES))) is not None:
+        round_.turned_down(id_, why)
+        return None
+    assert came.fit is not None
+    found = Found(
+        id_,
+        came.score,
+        float(scores.q[id_]),
+        stability(asked),
+        of_class(asked),
+        float(gain),
+        scores.between(s.candidate),
+    )  # fmt: skip
+    round_.tell(f"added {id_}")
+    return replace(state, fit=came.fit, found=(*state.found, found))

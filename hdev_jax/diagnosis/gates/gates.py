@@ -1,0 +1,182 @@
+"""The gates that a candidate has to pass, in order: those of its score, then those that cost draws.
+
+Each is a function of the candidate's score and of the scores of all, and returns None (passed) or a `Rejection`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
+from hdev_jax.diagnosis.scores.evidence import Evidence, Score
+from hdev_jax.diagnosis.scores.passes import evidence_of, written_by_chunk
+from hdev_jax.diagnosis.scores.scores import Scores, plausible
+from hdev_jax.diagnosis.scores.significance import least_clusters
+from hdev_jax.inference import Chunk
+
+__all__ = ["DRAWN_GATES", "SCORE_GATES", "Asked", "alike", "first_rejection", "stability"]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a gate looks at: a score among all `scores`, the trips' ids by row, what is out already, and draws."""
+
+    score: Score
+    scores: Scores
+    trip: np.ndarray
+    rng: np.random.Generator
+    out: frozenset[str] = frozenset()
+
+    @property
+    def unit(self) -> str:
+        """What a cluster is, in words."""
+        return "trips" if self.scores.baseline.clusters.kind == "trip" else "stretches of driving"
+
+
+Gate = Callable[[Asked], Rejection | None]
+
+
+def _not_absorbed(a: Asked) -> Rejection | None:
+    by = a.scores.absorbed_by.get(a.score.candidate.id)
+    return Rejection(Kind.ABSORBED, {"by": by}) if by else None
+
+
+def _enough_clusters(a: Asked) -> Rejection | None:
+    least, there = least_clusters(len(a.score.beta)), a.scores.white.count
+    return Rejection(Kind.TOO_FEW_CLUSTERS, {"least": least, "there": there, "unit": a.unit}) if there < least else None
+
+
+def _plausible(a: Asked) -> Rejection | None:
+    if plausible(a.score, a.scores.settings):
+        return None
+    return Rejection(Kind.IMPLAUSIBLE, {"sizes": [float(b) for b in a.score.beta]})
+
+
+def _confirmed(a: Asked) -> Rejection | None:
+    gain = a.score.left_out_gain
+    if gain > a.scores.settings.ahead:
+        return None
+    return Rejection(Kind.NOT_CONFIRMED, {"left_out_gain": float(gain), "unit": a.unit})
+
+
+def _significant(a: Asked) -> Rejection | None:
+    q = a.scores.q[a.score.candidate.id]
+    return Rejection(Kind.NOT_SIGNIFICANT, {"q": float(q)}) if q > a.scores.settings.fdr else None
+
+
+def _worthwhile(a: Asked) -> Rejection | None:
+    worth = a.scores.worth(a.score)
+    return Rejection(Kind.OUTSCORED, {"worth": float(worth)}) if worth <= 0 else None
+
+
+def _beats_placebos(a: Asked) -> Rejection | None:
+    """A column that changes inside trips is moved in time by a random amount in each; one that hardly does is given a
+    random sign in each trip instead. (Signs are no test of an effect in two or three trips, shifts none of a
+    constant.)"""
+    s, settings = a.score, a.scores.settings
+    column = written_by_chunk(a.scores.baseline, a.scores.source, s.candidate.columns)
+    parts = np.split(np.arange(len(column)), np.flatnonzero(np.diff(a.trip)) + 1)
+    within = np.concatenate([column[p] - column[p].mean(axis=0) for p in parts])
+    if s.plain or np.sum(within**2) < 0.2 * np.sum(column**2):
+        signs = a.scores.evidence(s).sign_placebos(s, a.rng, settings.placebos)
+        as_good = float(np.mean(signs >= s.gain))
+        how = {"how": "its column with random signs by trip", "share": as_good}
+        return Rejection(Kind.PLACEBO, how) if as_good > settings.placebo_level else None
+    sizes = [len(p) for p in parts]
+    shifts = [[int(a.rng.integers(n // 8, max(n - n // 8, 2))) for n in sizes] for _ in range(settings.shifts)]
+    k = column.shape[1]
+
+    def shifted(out: np.ndarray, chunk: Chunk) -> None:
+        own = column[chunk.at]
+        for t, trip in enumerate(chunk.slices(), start=chunk.first_trip):
+            for i, by in enumerate(shifts):
+                out[trip, i * k : (i + 1) * k] = np.roll(own[trip], by[t], axis=0)
+
+    evidence = evidence_of(a.scores.baseline, len(shifts) * k, shifted)
+    totals = evidence.totals()
+    before = evidence.base_likelihood(totals)
+    best = max(evidence.gain(totals, range(i * k, (i + 1) * k), before)[0] for i in range(len(shifts)))
+    return Rejection(Kind.PLACEBO, {"how": "its column shifted in time", "gain": best}) if best >= s.gain else None
+
+
+def _stable(a: Asked) -> Rejection | None:
+    share = stability(a)
+    if share >= a.scores.settings.stable:
+        return None
+    return Rejection(Kind.UNSTABLE, {"percent": 100.0 * share, "unit": a.unit})
+
+
+SCORE_GATES: tuple[Gate, ...] = (_not_absorbed, _enough_clusters, _plausible, _confirmed, _significant, _worthwhile)
+DRAWN_GATES: tuple[Gate, ...] = (_beats_placebos, _stable)
+
+
+def first_rejection(asked: Asked, gates: Sequence[Gate]) -> Rejection | None:
+    """The answer of the first gate that turns the candidate down; None where it passes all."""
+    return next((r for gate in gates if (r := gate(asked)) is not None), None)
+
+
+def alike(
+    evidence: Evidence, own: Candidate, rivals: Sequence[Candidate], gain: float, scores: Scores, *, plain: bool
+) -> tuple[str, ...]:
+    """Its class: other effects that, put in its place, explain about as much and beside which it is not needed, the
+    best first. `own` and `rivals` hold places in `evidence`, in which it is not."""
+    settings, out = scores.settings, []
+    totals = evidence.totals()
+    before = evidence.base_likelihood(totals)
+    for other, score in zip(rivals, (evidence.plain_scores if plain else evidence.scores)(rivals), strict=True):
+        if score.left <= settings.absorbed or not plausible(score, settings):
+            continue
+        if plain:
+            rival, beside = score.gain, evidence.beside(other.columns, own.columns)
+        else:
+            both = tuple(dict.fromkeys((*other.columns, *own.columns)))
+            rival = evidence.gain(totals, other.columns, before)[0]
+            more = evidence.gain(totals, both, before)[0] - rival
+            beside = float(stats.chi2.sf(2 * max(more, 0.0), len(own.columns)))
+        if rival > settings.class_share * gain and beside > settings.class_p:
+            out.append((-rival, other.id))
+    return tuple(id_ for _, id_ in sorted(out))
+
+
+def stability(a: Asked) -> float:
+    """Share of resampled sets of clusters in which the same effect (or its class) comes first of its kind.
+
+    Its rivals are the candidates with p at most 0.01 before any correction that no joint refit or placebo has turned
+    down.
+    """
+    scores, chosen = a.scores, a.score
+    settings, g = scores.settings, scores.white.count
+    names = {chosen.candidate.id, *of_class(a)[: settings.most_in_class]}
+    rivals = [
+        s for s in scores.best.values()
+        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in {*scores.absorbed_by, *a.out}
+        and plausible(s, settings)
+    ]  # fmt: skip
+    rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
+    small = [scores.evidence(s).only(s.candidate) for s in rivals]
+    hits = 0
+    for _ in range(settings.resamples):
+        drawn = a.rng.integers(0, g, g)
+        weight = np.bincount(drawn, minlength=g).astype(float)
+        gains = []
+        for s, (evidence, candidate) in zip(rivals, small, strict=True):
+            if s.plain:
+                gain = replace(evidence, grams=evidence.grams[drawn]).plain_score(candidate).gain
+            else:
+                gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
+            gains.append(scores.worth(replace(s, gain=gain)))
+        hits += rivals[int(np.argmax(gains))].candidate.id in names and max(gains) > 0
+    return hits / settings.resamples
+
+
+def of_class(a: Asked) -> tuple[str, ...]:
+    """The class of a candidate that the vehicle does not have yet."""
+    s = a.score
+    rivals = [
+        o.candidate for id_, o in a.scores.best.items()
+        if id_ != s.candidate.id and id_ not in a.scores.absorbed_by and plausible(o, a.scores.settings)
+    ]  # fmt: skip
+    return alike(a.scores.evidence(s), s.candidate, rivals, s.gain, a.scores, plain=s.plain)

@@ -1,0 +1,66 @@
+"""Why a candidate was turned down: an enumerated kind with its numbers, and the one place where it is worded."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+__all__ = ["SENTENCES", "UNTRIED", "Kind", "Rejection", "sentence"]
+
+
+class Kind(StrEnum):
+    """The gate that turned a candidate down (`candidates[].kind` of diagnosis.json), or that it is in the model."""
+
+    UNAVAILABLE = "unavailable"
+    NO_EFFECT = "no_effect"
+    ABSORBED = "absorbed"
+    TOO_FEW_CLUSTERS = "too_few_clusters"
+    IMPLAUSIBLE = "implausible"
+    NOT_CONFIRMED = "not_confirmed"
+    NOT_SIGNIFICANT = "not_significant"
+    OUTSCORED = "outscored"
+    REFIT = "refit"
+    PLACEBO = "placebo"
+    UNSTABLE = "unstable"
+    SUPERFLUOUS = "superfluous"
+    FOUND = "found"
+    DECLARED = "declared"
+
+
+UNTRIED = (Kind.UNAVAILABLE, Kind.NO_EFFECT, Kind.DECLARED)
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A gate's answer: which gate, and the numbers behind it."""
+
+    kind: Kind
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return sentence(self)
+
+
+SENTENCES = {
+    Kind.UNAVAILABLE: "not tried: {reason}",
+    Kind.NO_EFFECT: "no effect on this log",
+    Kind.ABSORBED: "absorbed: this log cannot distinguish it from {by}",
+    Kind.TOO_FEW_CLUSTERS: "not decidable: at least {least} {unit} are needed for training, there are {there}",
+    Kind.IMPLAUSIBLE: "its best estimate has the wrong sign or is out of range",
+    Kind.NOT_CONFIRMED: "not confirmed by cross-validation: does not lower the error on {unit} left out of the fit",
+    Kind.NOT_SIGNIFICANT: "not significant over the whole library (FDR-adjusted p = {q:.2g})",
+    Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
+    Kind.REFIT: "out of range or not significant in the joint refit",
+    Kind.PLACEBO: "a placebo ({how}) does as well",
+    Kind.UNSTABLE: "comes first in only {percent:.0f} % of resampled sets of {unit}",
+    Kind.SUPERFLUOUS: "not needed beside {beside}",
+    Kind.FOUND: "found",
+    Kind.DECLARED: "declared in the sheet",
+}
+
+
+def sentence(rejection: Rejection) -> str:
+    """The rejection in words; `detail` among its numbers replaces it where an effect has tests of its own."""
+    if detail := rejection.numbers.get("detail"):
+        return str(detail)
+    return SENTENCES[rejection.kind].format(**{"unit": "trips"} | dict(rejection.numbers))

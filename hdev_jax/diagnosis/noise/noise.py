@@ -1,0 +1,268 @@
+"""The noise of a log: its colour, the level of each trip, the scale of each trip; and what makes it white."""
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hdev_jax.inference import padded_rows
+from hdev_jax.segments import trip_slices
+
+__all__ = ["Noise", "estimate_noise", "whiten", "without_level"]
+
+MAX_ORDER = 24
+ORDERS = (4, 12, MAX_ORDER)  # that the filter is compiled for; the rest of the coefficients are zero
+NARROW, WIDE = 2, 32  # columns that it takes at once
+PIECE = 65_536  # rows that it takes at once
+BLOCK_S = 600.0
+BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
+LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
+LARGE_SHARE = 0.3  # of trips' means: from here on the grid is too coarse, and lags of the whole too inexact
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Gaussian working model of the residual: AR(p) inside a trip, plus a level and a scale of each trip.
+
+    `coefficients[k]` predicts the row at position k of its trip from the k rows before it (the last line serves all
+    later rows), `scales[k]` is the standard deviation of that prediction's error. `level_sd` is the standard deviation
+    of the trips' levels, `block_sd` that of the levels of blocks of `BLOCK_S` inside them: what wanders more slowly
+    than an autoregression of a few rows can follow. `trip_scale` multiplies `scales`, by trip in the order of the rows.
+    """
+
+    coefficients: Float[np.ndarray, "position lag"]
+    scales: Float[np.ndarray, " position"]
+    level_sd: float
+    trip_scale: Float[np.ndarray, " trip"]
+    log_likelihood: float
+    block_sd: float = 0.0
+
+    @property
+    def order(self) -> int:
+        """Order of the autoregression."""
+        return self.coefficients.shape[1]
+
+    def after(self, trips: int) -> "Noise":
+        """The noise of a log that begins so many trips later."""
+        return replace(self, trip_scale=self.trip_scale[min(trips, len(self.trip_scale) - 1) :])
+
+
+def _levinson(acov: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Predictors of every order up to `order` and the sd of their errors (Levinson 1946, Durbin 1960).
+
+    Orders that the sequence cannot support have an infinite sd.
+    """
+    phi = np.zeros((order + 1, order))
+    var = np.empty(order + 1)
+    var[0] = acov[0]
+    for k in range(1, order + 1):
+        prev = phi[k - 1, : k - 1]
+        reflection = (acov[k] - prev @ acov[k - 1 : 0 : -1]) / var[k - 1] if k > 1 else acov[1] / acov[0]
+        if abs(reflection) >= 0.9999 and k > 1:  # no stationary noise has it: the lags of short trips are not exact
+            var[k:] = np.inf
+            break
+        reflection = np.clip(reflection, -0.9999, 0.9999)
+        phi[k, : k - 1] = prev - reflection * prev[::-1]
+        phi[k, k - 1] = reflection
+        var[k] = var[k - 1] * (1 - reflection**2)
+    return phi, np.sqrt(np.maximum(var, 1e-300))
+
+
+def _positions(trip: np.ndarray) -> np.ndarray:
+    position = np.arange(len(trip))
+    for _, s in trip_slices(trip):
+        position[s] -= s.start
+    return position
+
+
+def _blocks(trip: np.ndarray, duration_s: np.ndarray) -> list[slice]:
+    """Rows of each block of about `BLOCK_S`; a last piece under half of it joins the one before."""
+    out = []
+    for _, s in trip_slices(trip):
+        clock = np.cumsum(duration_s[s])
+        count = max(1, round(float(clock[-1]) / BLOCK_S))
+        edges = np.searchsorted(clock, np.linspace(0, clock[-1], count + 1)[1:-1])
+        out += [slice(int(a), int(b)) for a, b in itertools.pairwise(np.r_[s.start, s.start + edges, s.stop]) if b > a]
+    return out
+
+
+def _autocovariance(x: np.ndarray, slices: list[slice], order: int) -> np.ndarray:
+    """Autocovariance about zero up to lag `order`: each lag with the number of pairs it has, so that short trips are
+    not biased to white."""
+    longest = max(s.stop - s.start for s in slices)
+    acov, pairs = np.zeros(order + 1), np.zeros(order + 1)
+    size = 1 << int(np.ceil(np.log2(2 * longest)))
+    for s in slices:
+        n = s.stop - s.start
+        lags = min(order + 1, n)
+        acov[:lags] += np.fft.irfft(np.abs(np.fft.rfft(x[s], size)) ** 2, size)[:lags]
+        pairs[:lags] += n - np.arange(lags)
+    pairs = np.maximum(pairs, 1.0)
+    # divided by n, not by pairs, where there is plenty of either: that keeps the sequence positive definite
+    return acov / (pairs if longest < 50 * order else pairs[0])
+
+
+def _less_levels(residual: np.ndarray, slices: list[slice]) -> np.ndarray:
+    """The residual less each trip's own mean."""
+    out = residual.copy()
+    for s in slices:
+        out[s] -= np.mean(out[s])
+    return out
+
+
+def estimate_noise(
+    residual: Float[np.ndarray, " row"],
+    trip: Int[np.ndarray, " row"],
+    duration_s: Float[np.ndarray, " row"],
+    *,
+    levels: bool,
+) -> Noise:
+    """The colour of a residual, by trip: order by AIC up to 24, random intercepts of trips by maximum likelihood.
+
+    `levels=False` where trips are too few for random intercepts. Trips of a scale of their own (`trip_scale`)
+    are shrunk towards one common scale, as far as their number of rows allows.
+    """
+    slices = [s for _, s in trip_slices(trip)]
+    common = float(np.sqrt(np.mean(residual**2)))
+    if common < 1e-150:  # met exactly: nothing is left to have a colour
+        return Noise(np.zeros((2, 1)), np.ones(2), 0.0, np.ones(len(slices)), 0.0)
+    longest = max(s.stop - s.start for s in slices)
+    order = int(max(1, min(MAX_ORDER, longest // 4)))
+    acov = _autocovariance(residual / common, slices, order)
+    levels = levels and len(slices) >= 4
+    tried = [(share, acov - share * acov[0]) for share in (LEVEL_SHARES if levels else (0.0,))]
+    inside = _less_levels(residual, slices) / common
+    if (between := 1.0 - float(np.mean(inside**2))) > LARGE_SHARE:
+        colour = _autocovariance(inside, slices, order)
+        tried += [(0.0, colour + between), *([(between, colour)] if levels else [])]
+
+    best: tuple[float, Noise] | None = None
+    for share, rest in tried:
+        if rest[0] <= 1e-12:
+            continue
+        phi, sd = _levinson(rest, order)
+        aic = len(residual) * 2 * np.log(sd) + 2 * np.arange(order + 1)
+        keep = max(1, int(np.argmin(aic)))
+        noise = Noise(phi[: keep + 1, :keep], sd[: keep + 1] * common, float(np.sqrt(share)) * common, np.ones(1), 0.0)
+        loglik = _log_likelihood(noise, residual, trip, slices) - keep
+        if best is None or loglik > best[0] + (2.0 if share > 0 and best[1].level_sd == 0 else 0.0):
+            best = (loglik, noise)
+    assert best is not None
+    noise = best[1]
+    # scale by trip from what is white, shrunk by the number of rows: 50 rows are worth as much as the common scale
+    white = _filtered(residual[:, None], noise, trip)[:, 0]
+    rows = np.array([s.stop - s.start for s in slices])
+    own = np.array([np.mean(white[s] ** 2) for s in slices])
+    pooled = float(np.mean(white**2))
+    scale = np.sqrt((rows * own + 50.0 * pooled) / (rows + 50.0))
+    noise = replace(noise, trip_scale=np.maximum(scale, 1e-6), log_likelihood=best[0])
+    return replace(noise, block_sd=_block_sd(noise, residual, trip, duration_s, common))
+
+
+def _block_sd(noise: Noise, residual: np.ndarray, trip: np.ndarray, duration_s: np.ndarray, common: float) -> float:
+    """Standard deviation of the blocks' intercepts by maximum likelihood, 0 where it gains less than 5."""
+    blocks = _blocks(trip, duration_s)
+    if len(blocks) < 3 * len(np.unique(trip)) or len(residual) < 20 * len(blocks):
+        return 0.0
+    both = whiten(residual[:, None], noise, trip, duration_s)
+    starts = np.array([b.start for b in blocks])
+    uu = np.add.reduceat(both[:, 1] ** 2, starts)
+    uz = np.add.reduceat(both[:, 1] * both[:, 0], starts)
+    variances = np.array(BLOCK_VARIANCES)[:, None] * common**2
+    gain = np.sum(0.5 * variances * uz**2 / (1 + variances * uu) - 0.5 * np.log1p(variances * uu), axis=1)
+    k = int(np.argmax(gain))
+    return float(np.sqrt(variances[k, 0])) if gain[k] > 5.0 else 0.0
+
+
+def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices: list[slice]) -> float:
+    """Gaussian log-likelihood with the random intercepts integrated out."""
+    both = _filtered(residual[:, None], noise, trip)
+    z, u = both[:, 0], both[:, 1]
+    logs = np.log(noise.scales)
+    total = -0.5 * float(z @ z)
+    for s in slices:
+        first = min(noise.order, s.stop - s.start)  # rows that fewer than `order` rows go before
+        total -= float(np.sum(logs[:first])) + (s.stop - s.start - first) * float(logs[noise.order])
+        uu, uz = float(u[s] @ u[s]), float(u[s] @ z[s])
+        g = noise.level_sd**2
+        total += -0.5 * np.log1p(g * uu) + 0.5 * g * uz**2 / (1 + g * uu)
+    return float(total)
+
+
+def _filtered(
+    columns: Float[np.ndarray, "row k"], noise: Noise, trip: Int[np.ndarray, " row"]
+) -> Float[np.ndarray, "row k+1"]:
+    """Columns, and a level of 1, less what the rows before predict of them, over the prediction's sd.
+
+    Rows, orders and widths come in a few shapes only: a program for each log, order and set of candidates would take
+    longer to compile than to run. Long logs are taken a piece of rows at a time.
+    """
+    (n, k), order = columns.shape, noise.order
+    lags = next(o for o in ORDERS if o >= order)
+    at = np.minimum(_positions(trip), order)
+    before, rows, size = (lags, PIECE, lags + PIECE) if n > PIECE else (0, n, padded_rows(n))
+    width = NARROW if k + 1 <= NARROW else WIDE
+    out = np.empty((n, k + 1))
+    for start in range(0, n, rows):
+        low, stop = max(start - before, 0), min(start + rows, n)
+        here = slice(before - (start - low), before - start + stop)  # where rows low to stop are in this piece
+        phi, inverse = np.zeros((size, lags)), np.ones(size)
+        phi[here, :order], inverse[here] = noise.coefficients[at[low:stop]], 1.0 / noise.scales[at[low:stop]]
+        for first in range(0, k + 1, width):
+            part = columns[low:stop, first : first + width]
+            wide = np.zeros((size, width))
+            wide[here, : part.shape[1]] = part
+            if k < first + width:
+                wide[here, k - first] = 1.0
+            white = np.asarray(_filter(wide, phi, inverse))[before : before + stop - start]
+            out[start:stop, first : first + width] = white[:, : k + 1 - first]
+    return out
+
+
+@jax.jit
+def _filter(columns: Any, phi: Any, inverse: Any) -> Array:
+    out = columns
+    for k in range(phi.shape[1]):
+        back = jnp.concatenate([jnp.zeros_like(columns[: k + 1]), columns[: -(k + 1)]])
+        # rows too early in their trip have a zero coefficient here, so nothing leaks from the trip before
+        out = out - phi[:, k : k + 1] * back
+    return out * inverse[:, None]
+
+
+def whiten(
+    columns: Float[np.ndarray, "row k"],
+    noise: Noise,
+    trip: Int[np.ndarray, " row"],
+    duration_s: Float[np.ndarray, " row"],
+) -> Float[np.ndarray, "row k+1"]:
+    """Columns for generalised least squares: independent rows of variance 1, except for the random intercepts of trips.
+
+    Random intercepts of blocks are taken out by their variance. The last column is an intercept of 1 of each trip;
+    `Sums.evidence` takes those out by their variance.
+    """
+    k = columns.shape[1]
+    out = _filtered(columns, noise, trip)
+    for t, (_, s) in enumerate(trip_slices(trip)):
+        out[s] /= noise.trip_scale[min(t, len(noise.trip_scale) - 1)]
+    if noise.block_sd > 0:
+        for b in _blocks(trip, duration_s):
+            level = out[b, k].copy()
+            square = float(level @ level)
+            shrink = 1.0 - 1.0 / np.sqrt(1.0 + noise.block_sd**2 * square)
+            out[b] -= (shrink / square) * np.outer(level, level @ out[b])
+    return out
+
+
+def without_level(
+    columns: Float[np.ndarray, "row k"], level: Float[np.ndarray, " row"], slices: Iterable[slice]
+) -> Float[np.ndarray, "row k"]:
+    """Whitened columns with a fixed intercept of each trip taken out; `level` is the column of an intercept of 1."""
+    out = columns.copy()
+    for s in slices:
+        out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
+    return out

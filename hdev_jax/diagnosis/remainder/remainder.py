@@ -1,0 +1,141 @@
+"""What remains: how much of the residual the log's channels predict, and what it looks like."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
+from hdev_jax.diagnosis.remainder.learner import curve, learn, share_of
+from hdev_jax.diagnosis.remainder.rows import features, side
+from hdev_jax.diagnosis.remainder.structure import (
+    GROWS_AS,
+    change_point,
+    colour,
+    cycle_rms,
+    levels_of,
+    period_of,
+    scales_with,
+    shared_offset,
+    shift_rms,
+)
+from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.problem import Problem, Split
+
+__all__ = ["Formula", "Remainder", "remainder"]
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """The contract's `unexplained`, and a smooth correction: what a flexible learner would add, by its first channel.
+
+    `scales_with` is what a trip's remainder is in proportion to: `time`, `distance`, `energy`, or None. `trips_differ`
+    where random intercepts of trips are significant or suspected: effects that differ between trips alone may be among
+    them.
+    """
+
+    significant: bool
+    share: float
+    noise_floor_rmse: float
+    depends_on: tuple[str, ...]
+    signature: str
+    rms: float  # of the structure found on training rows, in the target's unit; 0 where there is none
+    trips_differ: bool = False
+    scales_with: str | None = None
+    correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
+    expression: str | None = None
+    confirmed: bool = False  # whether cross-validation over training clusters confirms the learner's share
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A term without a name that passed the gates: its words, the channels in it, and the prediction with it."""
+
+    words: str
+    channels: tuple[str, ...]
+    predicted: np.ndarray
+
+
+def remainder(
+    problem: Problem, split: Split, predicted: np.ndarray, declared: np.ndarray, formula: Formula | None,
+    settings: Settings, *, seed: int, tell: Callable[[str], None] = lambda _: None,
+) -> Remainder:  # fmt: skip
+    """Five tests of the residual: the term without a name that passed the gates of the search, a flexible learner
+    validated by trip, periods, change points, random intercepts of trips.
+
+    The learner (LightGBM) is trained on training rows; its share is what it predicts of the test residual. It counts
+    only where cross-validation over training clusters confirms it. The others are tests against coloured noise. What
+    is reported is measured on test rows; `rms` is of training rows alone.
+
+    **Arguments:** predictions of the model with the found effects and of the declared one on every row of the log.
+    """
+    columns, names = features(problem, predicted, declared)
+    train, test = (side(problem, problem.rows(trips), predicted, columns) for trips in (split.train, split.test))
+    tell("what remains: a flexible learner, validated by trip")
+    correction, share_train, p_learner, order = learn(train, test, names, seed)
+    share = share_of(test.residual, correction)
+    learned = p_learner < settings.level and share > settings.least_share
+    tell("what remains: periods, change points, random intercepts of trips")
+    noise = estimate_noise(train.residual, train.trip, train.duration_s, levels=False)
+    white = whiten(train.residual[:, None], noise, train.trip, train.duration_s)[:, 0]
+    period = period_of(train, noise, settings)
+    change = change_point(white, train.trip, settings)
+    levels = levels_of(train, train.residual, settings)  # a common offset is part of them, and is separated below
+    rmse = float(np.sqrt(np.mean(test.residual**2)))
+    floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
+    parts: list[str] = []
+    depends: list[str] = []
+    sizes = [0.0]
+    after = rmse
+    if formula is not None:
+        after = float(np.sqrt(np.mean((problem.measured - formula.predicted)[problem.rows(split.test)] ** 2)))
+        formula = formula if after < rmse else None  # a description that held-out trips contradict is none
+    if formula is not None:
+        floor = min(floor, after)
+        depends += formula.channels
+        added = (formula.predicted - predicted)[problem.rows(split.train)]
+        sizes.append(float(np.sqrt(np.mean(added**2))))
+        error = f"test RMSE {rmse:.4g} → {after:.4g} {problem.unit}"
+        parts.append(f"it follows {formula.words}, which is no effect of the library ({error})")
+    if p_learner < settings.level and share_train > settings.least_share:
+        sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
+    if learned:
+        depends += list(order)
+        how = f"{100 * share:.0f} % of its variance depends on {', '.join(order)}"
+        parts.append(f"{how} in a form that no effect of the library has")
+    if period is not None:
+        seconds, amplitude = period.period_s, period.amplitude
+        sizes.append(cycle_rms(train, amplitude))
+        depends.append("time_s")
+        clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
+        parts.append(f"a {clock} cycle of about {amplitude:.3g} {train.cycle_unit}")
+    if change is not None:
+        where, row = change
+        before = (train.trip == where) & (np.arange(len(train.trip)) <= row)
+        sizes.append(shift_rms(train.residual, before, (train.trip == where) & ~before))
+        depends.append("time_s")
+        minutes = float(np.sum(train.duration_s[before]) / 60.0)
+        parts.append(f"a change inside trip {problem.log.trip_names[where]} after {minutes:.0f} min")
+    mean = shared_offset(train) if levels is not None else 0.0
+    apart = train.residual - mean
+    apart[np.abs(apart) < 1e-9 * abs(mean)] = 0.0  # rounding is no difference between trips
+    differing = levels_of(train, apart, settings) if mean else levels
+    if differing is not None and differing.significant:
+        sizes.append(differing.sd)
+        depends.append("trip_id")
+        worst = f"{problem.log.trip_names[differing.worst]} ({differing.level:+.2g} {problem.unit})"
+        parts.append(f"random intercepts by trip, sd about {differing.sd:.2g} {problem.unit}, largest in {worst}")
+    elif mean and levels is not None and levels.significant:
+        sizes.append(abs(mean))
+        parts.append(f"an offset of about {mean:+.2g} {problem.unit} that all trips share")
+    grows = scales_with(train, settings) if parts else None
+    if grows is not None:
+        parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
+    signature = "What is left looks like noise: " + colour(noise) if not parts else "What is left: " + "; ".join(parts)
+    return Remainder(
+        bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", max(sizes), differing is not None,
+        scales_with=grows,
+        correction=curve(correction, test, list(names), order[0], problem.unit) if learned and order else None,
+        expression=formula.words if formula is not None else None, confirmed=learned,
+    )  # fmt: skip

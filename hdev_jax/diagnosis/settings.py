@@ -1,0 +1,130 @@
+"""Every number that decides what is named: its meaning, its unit, where it comes from.
+
+What half and double of each do to the study of planted effects is in docs/settings.md, which
+`python -m experiments configs/studies/settings.toml` measures. Numbers of computation (rows in a chunk, points of a
+grid, tolerances of a solver) are not among them.
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+__all__ = ["SETTINGS", "Settings", "described"]
+
+
+def _number(default: Any, meaning: str, unit: str, source: str) -> Any:
+    return field(default=default, metadata={"meaning": meaning, "unit": unit, "source": source})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Numbers that decide; `described` lists them with meaning, unit and source."""
+
+    fdr: float = _number(
+        0.05, "highest FDR-adjusted p-value of a named effect", "1", "Benjamini and Hochberg, JRSS B 57 (1995)"
+    )
+    most_effects: int = _number(10, "effects that one search adds at most", "effects", "a bound on time")
+
+    # what a candidate costs: its gain in log-likelihood has to pay for its numbers
+    size_cost: float = _number(
+        3.0, "cost of each coefficient", "log-likelihood", "BIC for 400 independent rows: ½·ln 400 (Schwarz 1978)"
+    )
+    shape_cost: float = _number(1.5, "cost of each number chosen on a grid", "log-likelihood", "BIC for 20: ½·ln 20")
+    close: float = _number(
+        0.85, "share of the best gain above which another candidate is about as good", "1", "chosen on seeds 1-99"
+    )
+    ahead: float = _number(
+        3.0,
+        "gain that is more than chance: in cross-validation, and of one candidate over another",
+        "log-likelihood",
+        "odds of 20 to 1 (Kass and Raftery, JASA 90, 1995: strong)",
+    )
+    leaders: int = _number(3, "candidates about as good that are refitted before one is taken", "candidates", "time")
+    tries: int = _number(4, "rounds of leaders in one step", "rounds", "time")
+
+    # gates
+    absorbed: float = _number(
+        3e-3, "share of a column outside the span of the fitted coefficients, below which it is absorbed", "1",
+        "collinearity: standard error 18 times that of an orthogonal column",
+    )  # fmt: skip
+    placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
+    placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
+    shifts: int = _number(
+        19, "placebos shifted in time, none of which may gain as much", "draws", "permutation test, 5 %"
+    )
+    stable: float = _number(
+        0.25, "share of resampled sets of clusters in which the effect, or its class, comes first again", "1",
+        "Meinshausen and Bühlmann, JRSS B 72 (2010), far below their 0.6: sets of 8 trips differ much",
+    )  # fmt: skip
+    resamples: int = _number(100, "resampled sets of clusters", "draws", "a share to ± 5 points")
+    switch_low: float = _number(
+        0.4, "least estimate of a switch, over its full difference", "1", "half, less two standard errors"
+    )
+    switch_high: float = _number(2.5, "largest estimate of a switch, over its full difference", "1", "1 / switch_low")
+
+    # a joint refit
+    stands: float = _number(2.6, "least |t| of a size in the joint refit", "standard errors", "1 %, two-sided")
+    agrees: float = _number(
+        0.9878, "probability below which least squares and generalised least squares agree on a size", "1",
+        "Hausman, Econometrica 46 (1978): 2.25 sd",
+    )  # fmt: skip
+    known: float = _number(
+        2.0,
+        "times smaller standard error for which generalised least squares are tried first",
+        "1",
+        "relative efficiency 4",
+    )
+
+    # is X still needed beside Y
+    keep: float = _number(0.05, "p-value up to which an effect stays beside those added later", "1", "Wald test, 5 %")
+    class_share: float = _number(
+        0.8, "least share of an effect's gain that another of its class reaches", "1", "chosen on seeds 1-99"
+    )
+    class_p: float = _number(
+        0.05, "p-value above which an effect is not needed beside another of its class", "1", "Wald test, 5 %"
+    )
+    most_in_class: int = _number(2, "members of a class that are listed at most", "effects", "contract §4")
+
+    # terms without a name
+    unnamed_stricter: float = _number(
+        5.0, "times lower FDR level for a term without a name", "1", "a description is not a cause"
+    )
+
+    # loads that switch in a cycle, modes of some trips
+    alike_p: float = _number(
+        1e-3, "p-value below which a cycle differs between trips, or is no square wave", "1", "a test at 0.1 %"
+    )
+    alike_spread: float = _number(0.3, "largest sd of its size over trips, over the size", "1", "chosen on seeds 1-99")
+    other_waves: float = _number(0.1, "largest share of its gain that harmonics may add", "1", "chosen on seeds 1-99")
+    mode_trips: int = _number(8, "least number of trips for a mode of some trips", "trips", "as for trips as clusters")
+    mode_side: int = _number(2, "least trips of either mode", "trips", "one is an outlier")
+    mode_enough: float = _number(0.01, "p-value above which two values are enough for all trips", "1", "a test at 1 %")
+
+    # what remains
+    level: float = _number(
+        1e-3, "p-value of unexplained structure; a tenth of it for change points and intercepts", "1",
+        "four kinds of structure are tested",
+    )  # fmt: skip
+    least_share: float = _number(
+        0.02, "least share of the variance that a found structure explains", "1",
+        "1 % of the error",
+    )  # fmt: skip
+    least_levels: float = _number(
+        0.1, "least share of the variance that random intercepts of trips explain", "1", "chosen on seeds 1-99"
+    )
+
+    # notes
+    far: float = _number(2.0, "|prior_z| above which a coefficient is flagged", "sd", "5 %, two-sided")
+    suspicious: float = _number(
+        8.0, "gain above which an undecided candidate is reported", "log-likelihood", "odds of 3,000 to 1"
+    )
+    half: float = _number(
+        0.5, "share of the trips' differences, and adjusted p-value, of effects reported as undecided", "1", "half"
+    )
+
+
+SETTINGS = Settings()
+
+
+def described() -> list[dict[str, Any]]:
+    """Name, default, meaning, unit and source of each setting."""
+    return [{"name": f.name, "default": f.default, **f.metadata} for f in fields(Settings)]

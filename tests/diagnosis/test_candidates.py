@@ -1,0 +1,239 @@
+"""Columns of candidates against differences of whole vehicles; the vehicle that a candidate stands for."""
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from planted import opened
+
+from hdev_jax.diagnosis.candidates.candidate import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
+from hdev_jax.diagnosis.settings import SETTINGS
+from hdev_jax.inference import padded
+from hdev_jax.physics import LIBRARY, Effect, Grouped, Size, Vehicle, at_null
+from hdev_jax.problem import Problem
+
+# by hook and kind: force, power and sensor effects of one row, sums over a trip, groups, switches, shifts
+SIZES = ("headwind", "auxiliary_power", "mass_scale", "tyre_warmup", "hvac_power", "gear_efficiency", "brake_drag")
+LIMITS = ("regen_cutoff", "regen_limit", "grade_lag")
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    return opened(tmp_path_factory.mktemp("log"), seed=2, trips=9, rows_per_trip=60)[1]
+
+
+@pytest.fixture(scope="module")
+def rows(problem: Problem):
+    return padded(problem.segments, problem.measured)
+
+
+@pytest.fixture(scope="module")
+def gathered(problem: Problem, rows) -> tuple[list[Candidate], np.ndarray, dict[str, str]]:
+    effects = [LIBRARY[k] for k in (*SIZES, *LIMITS, "traction_limit", "drafting")]
+    return columns(problem.vehicle, effects, rows.segments, rows.rows, problem.target)
+
+
+def with_values(cls: type[Effect], gears: int, **values: Any) -> Effect:
+    """The effect at its null with some values; `(gear, x)` sets one of a group. No code of the candidates."""
+    null = at_null(cls, gears=gears)
+    leaves = {p.name: getattr(null, p.name) for p in cls.parameters}
+    for name, value in values.items():
+        if isinstance(value, tuple):
+            leaves[name] = Grouped(leaves[name].values.at[value[0]].set(value[1]), leaves[name].by)
+        else:
+            leaves[name] = np.asarray(value, dtype=float)
+    return cls(**leaves)
+
+
+def predicted(problem: Problem, rows, vehicle: Vehicle) -> np.ndarray:
+    return np.asarray(vehicle.predict(rows.segments, problem.target))[: rows.rows]
+
+
+def of(gathered, effect_id: str) -> list[Candidate]:
+    found = [c for c in gathered[0] if c.id == effect_id]
+    assert found
+    return found
+
+
+@pytest.mark.parametrize("effect_id", SIZES)
+def test_columns_are_derivatives(effect_id, problem, rows, gathered):
+    """Central differences of the vehicle with the effect, at the shapes of the first and of the last candidate."""
+    every = of(gathered, effect_id)
+    gears = int(np.max(problem.segments.channels["gear"]))
+    for c in {id(c): c for c in (every[0], every[-1])}.values():
+        assert c.kind == "size"
+        for name, group, at in zip(c.sizes, c.groups, c.columns, strict=True):
+            # rows that stand have a kink at no wind, |w| w, so the step is small
+            h = 1e-5 * abs(c.parameter(name).scale)
+            up, down = (
+                predicted(problem, rows, problem.vehicle.plus(
+                    with_values(c.effect, gears, **dict(c.shapes), **{name: x if group is None else (group, x)})
+                ))
+                for x in (h, -h)
+            )  # fmt: skip
+            slope, column = (up - down) / (2 * h), gathered[1][:, at]
+            assert np.any(column != 0)
+            # rows within h of the efficiency's switch have a kink between the two
+            off = np.abs(column - slope) > 1e-5 * np.max(np.abs(slope))
+            assert np.mean(off) < 0.01
+
+
+@pytest.mark.parametrize("effect_id", LIMITS)
+def test_columns_of_switches_are_differences(effect_id, problem, rows, gathered):
+    """Of the vehicle with the switch at its place and without it; other limits of the effect are out."""
+    base = predicted(problem, rows, problem.vehicle)
+    every = of(gathered, effect_id)
+    for c in (every[0], every[len(every) // 2], every[-1]):
+        assert c.kind == "limit"
+        with_ = problem.vehicle.plus(realised(c, np.ones(1)))
+        np.testing.assert_allclose(
+            gathered[1][:, c.columns[0]], predicted(problem, rows, with_) - base, rtol=1e-9, atol=1e-9 * np.std(base)
+        )
+        at = dict(c.shapes)[c.sizes[0]]
+        assert at != c.parameter(c.sizes[0]).null
+    assert {dict(c.shapes)[c.sizes[0]] for c in every} == {dict(c.shapes)[c.sizes[0]] for c in set(every)}
+
+
+@pytest.mark.parametrize("effect_id", SIZES)
+def test_a_realised_candidate_has_its_coefficients(effect_id, problem, gathered):
+    c = of(gathered, effect_id)[-1]
+    gears = int(np.max(problem.segments.channels["gear"]))
+    beta = np.arange(1.0, 1.0 + len(c.sizes))
+    effect = realised(c, beta, gears=gears)
+    for name, group, b in zip(c.sizes, c.groups, beta, strict=True):
+        leaf = getattr(effect, name)
+        assert float(leaf if group is None else leaf.values[group]) == b
+    for name, value in c.shapes:
+        assert float(getattr(effect, name)) == value
+
+
+def test_the_null_of_everything_is_the_vehicle(problem, rows, gathered):
+    """What the derivatives are taken at predicts what the declared vehicle does."""
+    base = predicted(problem, rows, problem.vehicle)
+    gears = int(np.max(problem.segments.channels["gear"]))
+    for effect_id in SIZES:
+        null = problem.vehicle.plus(at_null(LIBRARY[effect_id], gears=gears))
+        np.testing.assert_allclose(predicted(problem, rows, null), base, rtol=1e-12, err_msg=effect_id)
+
+
+def test_what_the_log_cannot_show_is_left_out_with_a_reason(gathered):
+    assert "drafting" in gathered[2]
+    assert "gap_m" in gathered[2]["drafting"]
+    assert not any(c.id == "drafting" for c in gathered[0])
+    assert set(gathered[2]) == {"drafting"}
+
+
+def test_an_effect_that_the_vehicle_has_is_no_candidate(problem, rows):
+    car = problem.vehicle.plus(with_values(LIBRARY["headwind"], 1, scale=0.9))
+    found, matrix, left_out = columns(
+        car, [LIBRARY[k] for k in ("headwind", "auxiliary_power")], rows.segments, rows.rows, problem.target
+    )
+    assert {c.id for c in found} == {"auxiliary_power"}
+    assert matrix.shape == (rows.rows, 1)
+    assert left_out == {}
+
+
+def test_none_at_all(problem, rows):
+    found, matrix, _ = columns(problem.vehicle, [], rows.segments, rows.rows, problem.target)
+    assert found == []
+    assert matrix.shape == (rows.rows, 0)
+
+
+@pytest.mark.parametrize("effect_id", ["tyre_warmup", "hvac_power", "regen_cutoff", "grade_lag"])
+def test_finer_grids(effect_id, problem, gathered):
+    """About where the candidate stands, inside the plausible range; what goes in proportion stays where it is."""
+    row_s = float(np.median(problem.segments.duration_s))
+    for c in of(gathered, effect_id):
+        grids = finer(c, row_s)
+        assert set(grids) == {n for n, _ in c.shapes}
+        for name, at in c.shapes:
+            p = c.parameter(name)
+            assert min(abs(np.array(grids[name]) - at)) < 1e-9 * max(abs(at), 1.0)
+            assert all(p.lower <= x <= p.upper for x in grids[name])
+            if p.smooth:
+                assert grids[name] == (at,)
+
+
+def test_drag_of_the_driveline_is_sought_in_every_gear(problem, rows):
+    """Nothing declared stands for the commonest gear, as an efficiency does for `gear_efficiency`."""
+    (c,), made, _ = columns(problem.vehicle, [LIBRARY["driveline_drag"]], rows.segments, rows.rows, problem.target)
+    assert (c.sizes, c.groups) == (("torque_nm",) * 4, (1, 2, 3, 4))
+    car, segments = problem.vehicle, problem.segments
+    ratio = np.array([9.16, 5.27, 3.33, 2.16])[np.asarray(segments.channels["gear"], dtype=int) - 1] * 4.5 / 0.5
+    turns = ratio * np.asarray(segments.distance_m) / (2 * np.pi)
+    for gear, k in zip(c.groups, c.columns, strict=True):  # a newton metre over a turn is 2π joules
+        expected = np.where(segments.channels["gear"] == gear, 2 * np.pi * turns / 3600, 0.0)
+        np.testing.assert_allclose(made[:, k], expected, rtol=1e-9, atol=1e-12)
+    back = realised(c, np.array([1.0, 2.0, 3.0, 4.0]), gears=4)
+    added = predicted(problem, rows, car.plus(back)) - predicted(problem, rows, car)
+    np.testing.assert_allclose(added, made[:, list(c.columns)] @ [1.0, 2.0, 3.0, 4.0], rtol=1e-6, atol=1e-9)
+
+
+def test_without_a_gear_drag_of_the_driveline_is_one_number(problem):
+    segments = replace(problem.segments, channels={k: v for k, v in problem.segments.channels.items() if k != "gear"})
+    rows = padded(segments, problem.measured)
+    effects = [LIBRARY[k] for k in ("driveline_drag", "gear_efficiency")]
+    (c,), made, left_out = columns(problem.vehicle, effects, rows.segments, rows.rows, problem.target)
+    assert (c.id, c.sizes, c.groups) == ("driveline_drag", ("torque_nm",), (None,))
+    assert set(left_out) == {"gear_efficiency"}
+    car = problem.vehicle.plus(realised(c, np.array([7.0])))
+    added = predicted(problem, rows, car) - predicted(problem, rows, problem.vehicle)
+    np.testing.assert_allclose(added, 7.0 * made[:, c.columns[0]], rtol=1e-6, atol=1e-9)
+
+
+def test_an_effect_by_gear_starts_as_one_number_each_where_the_log_tells_no_gear():
+    """Sizes that a variant leaves out too: nothing may ask for a gear then."""
+
+    class TwoDrags(LIBRARY["driveline_drag"]):
+        parameters: ClassVar = tuple(
+            Size(n, "Nm", 0.0, 5.0, 0.0, 200.0, by="gear", whole=True) for n in ("torque_nm", "more_nm")
+        )
+        variants: ClassVar = (("torque_nm",), ("more_nm",))
+        more_nm: Any
+
+    c = Candidate(TwoDrags, ("more_nm",), (None,), (), "size", (0,))
+    effect = realised(c, np.array([4.0]))
+    assert float(effect.more_nm) == 4.0
+    assert float(effect.torque_nm) == 0.0
+    by_gear = realised(replace(c, groups=(2,)), np.array([4.0]), gears=3)
+    np.testing.assert_array_equal(by_gear.more_nm.values, [0.0, 0.0, 4.0, 0.0])
+    np.testing.assert_array_equal(by_gear.torque_nm.values, np.zeros(4))
+
+
+def test_groups_may_go_one_by_one_and_other_sizes_all_together(problem):
+    effects = [LIBRARY[k] for k in ("driveline_drag", "hvac_power")]
+    every, _, _ = columns(problem.vehicle, effects, problem.segments, len(problem.measured), problem.target)
+    drag = next(c for c in every if c.id == "driveline_drag")
+    two = drag.only([False, True, True, False])
+    assert two is not None
+    assert (two.sizes, two.groups, two.columns) == (("torque_nm",) * 2, (2, 3), drag.columns[1:3])
+    assert drag.only([True] * 4) is drag
+    assert drag.only([False] * 4) is None
+    both = next(c for c in every if len(c.sizes) == 2 and c.id == "hvac_power")
+    assert both.only([True, True]) is both
+    assert both.only([True, False]) is None, "heating without cooling is a way of its own, with its own shapes"
+
+
+def test_only_a_group_beyond_a_null_that_bounds_it_goes(problem):
+    """A torque below nothing is a gear without drag; one of 300 Nm, or a delta of half, says the effect is another."""
+    effects = [LIBRARY[k] for k in ("driveline_drag", "gear_efficiency", "hvac_power")]
+    every, _, _ = columns(problem.vehicle, effects, problem.segments, len(problem.measured), problem.target)
+    drag, efficiency = (next(c for c in every if c.id == k) for k in ("driveline_drag", "gear_efficiency"))
+    both = next(c for c in every if len(c.sizes) == 2 and c.id == "hvac_power")
+    fewer = without_idle(drag, np.array([9.0, -0.5, -2.0, 8.0]))
+    assert fewer is not None
+    assert fewer.groups == (1, 2, 4), "the furthest goes first"
+    assert without_idle(drag, np.array([9.0, 2.5, 7.0, 300.0])) is None
+    assert without_idle(efficiency, np.full(len(efficiency.sizes), -0.5)) is None
+    assert without_idle(both, np.array([-9.0, 0.5])) is None, "heating without cooling is a way of its own"
+
+    def scores(candidates):
+        sizes = np.array([9.0, -0.1, 0.0, 300.0])
+        return [Score(c, sizes[np.array(c.groups) - 1], 50.0, 1e-9, 1e-9, 9.0, 0.5) for c in candidates]
+
+    left = inside(scores([drag])[0], scores)
+    assert left.candidate.groups == (1, 3, 4)
+    assert not plausible(left, SETTINGS), "300 Nm are no drag"

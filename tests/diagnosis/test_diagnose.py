@@ -1,0 +1,268 @@
+"""The whole method as one call: what it keeps and takes up again, what it refuses, odd logs, a user's effect."""
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from planted import breaches, diagnosed, named, opened, training
+
+from hdev_jax.diagnosis.candidates.unnamed import TERM, Factor, Term, describing
+from hdev_jax.diagnosis.competition.compete import compete
+from hdev_jax.diagnosis.competition.state import Verdict
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
+from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
+from hdev_jax.diagnosis.result.stages import add_stages
+from hdev_jax.diagnosis.settings import SETTINGS
+from hdev_jax.errors import InputError
+from hdev_jax.physics import LIBRARY, Effect, Shape, Size
+from hdev_jax.problem import Problem, Split
+from hdev_jax.rundir import open_run
+
+FEW = {k: LIBRARY[k] for k in ("driveline_drag", "headwind", "standstill_load", "tyre_warmup", "step_change")}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> tuple[Problem, Split]:
+    """A log with drag by gear and a load at standstill."""
+    options = {"effects": {"driveline_drag": {}, "standstill_load": {}}, "ratio": 1.5}
+    return opened(tmp_path_factory.mktemp("log"), seed=71, trips=12, **options)[1:]
+
+
+# --- kept, and taken up again ------------------------------------------------------------------------------------
+
+
+class KilledError(Exception):
+    pass
+
+
+class Kept:
+    """A run's folder that holds plain values, and a kill before the stage of one name."""
+
+    def __init__(self, folder, killed_at: str = ""):
+        self.run, self.killed_at, self.computed = folder, killed_at, []
+
+    def __call__(self, name, compute):
+        def here():
+            if name == self.killed_at:
+                raise KilledError
+            self.computed.append(name)
+            return compute()
+
+        return self.run.checkpoint(name, here)
+
+
+@pytest.fixture(scope="module")
+def whole(log):
+    return diagnosed(*log, FEW)
+
+
+@pytest.mark.parametrize("at", ["step-2", "remainder"])
+def test_a_run_that_was_killed_goes_on_where_it_stood(at, log, whole, tmp_path):
+    assert sorted(named(whole)) == ["driveline_drag", "standstill_load"]
+    with pytest.raises(KilledError), open_run(tmp_path / "out", {"verb": "test"}) as run:
+        diagnosed(*log, FEW, checkpoint=Kept(run, at))
+    with open_run(tmp_path / "out", {"verb": "test"}) as run:
+        again = Kept(run)
+        result = diagnosed(*log, FEW, checkpoint=again)
+    assert again.computed[0] == at
+    assert result.summary == whole.summary
+    np.testing.assert_array_equal(result.predicted_after, whole.predicted_after)
+
+
+@pytest.mark.parametrize("through", ["memory", "disk"])
+def test_a_state_is_kept_and_comes_back(through, log, tmp_path):
+    """With sizes by gear, a shape, a term without a name, and what was turned down and taken out."""
+    problem, _ = log
+    rows = training(problem, FEW)
+    state = compete(rows, problem.vehicle, problem.table, seed=0)
+    assert len(state.found) >= 2
+    term = Term((Factor("humidity_pct", above=70.0), Factor("speed_mps", 2)), 41.5)
+    rows = rows.with_channel(TERM, term.column(rows.rows.segments)[: rows.rows.rows])
+    verdict = Verdict("wet_road", 2.0, 0.4, Rejection(Kind.UNSTABLE, {"percent": 3.0}), needed=20, between=True)
+    state = replace(
+        state, terms=(term,), verdicts=(*state.verdicts, verdict), refused=("headwind",),
+        removed={"step_change": Rejection(Kind.SUPERFLUOUS, {"beside": "headwind"})},
+        absorbs={"road.c_rr": ["grade_bias"]},
+        fit=replace(state.fit, vehicle=state.fit.vehicle.plus(describing(problem.target)(np.asarray(1.0)))),
+    )  # fmt: skip
+    plain = to_plain(state)
+    if through == "disk":
+        with open_run(tmp_path / "out", {"verb": "test"}) as run:
+            run.checkpoint("step-1", lambda: plain)
+            plain = run.checkpoint("step-1", lambda: pytest.fail("computed again"))
+    again = from_plain(plain, problem.vehicle, rows)
+    for name in ("terms", "verdicts", "removed", "refused", "absorbs", "finished", "ids"):
+        assert getattr(again, name) == getattr(state, name), name
+    assert {k: list(v) for k, v in again.trail.items()} == dict(state.trail)
+    assert again.fit.table == state.fit.table
+    np.testing.assert_array_equal(again.fit.values, state.fit.values)
+    segments = problem.segments.with_channels(**{TERM: term.column(problem.segments)})
+    np.testing.assert_array_equal(
+        problem.predict(again.fit.vehicle, segments), problem.predict(state.fit.vehicle, segments)
+    )
+    for one, other in zip(again.found, state.found, strict=True):
+        assert one.score.candidate == other.score.candidate
+        np.testing.assert_array_equal(one.score.beta, other.score.beta)
+        assert replace(one, score=other.score) == other
+
+
+# --- what comes out ----------------------------------------------------------------------------------------------
+
+
+def test_the_summary_adds_up(log, whole):
+    """The error before and after, the errors on the way between, one candidate a line and each with its kind."""
+    problem, split = log
+    summary = whole.summary
+    test = problem.rows(split.test)
+    for when, predicted in (("before", whole.predicted_before), ("after", whole.predicted_after)):
+        rmse = np.sqrt(np.mean((problem.measured - predicted)[test] ** 2))
+        assert summary[when]["test"]["rmse"] == pytest.approx(rmse)
+    first, last = summary["effects"][0], summary["effects"][-1]
+    assert first["test_rmse_before"] == summary["before"]["test"]["rmse"]
+    assert first["test_rmse_after"] == last["test_rmse_before"]
+    assert last["test_rmse_after"] == summary["after"]["test"]["rmse"]
+    ids = [c["id"] for c in summary["candidates"]]
+    assert len(set(ids)) == len(ids)
+    assert set(ids) == set(FEW)
+    assert {c["id"] for c in summary["candidates"] if c["kind"] == "found"} == set(named(whole))
+    assert {c["kind"] for c in summary["candidates"]} <= {*Kind}
+    assert summary["parameters_fitted"] >= len(whole.fit.table.free)
+    np.testing.assert_allclose(problem.predict(whole.after), whole.predicted_after)
+    assert breaches(whole) == []
+
+
+def test_an_effect_of_the_sheet_is_declared(log):
+    problem, split = log
+    car = problem.vehicle.plus(LIBRARY["standstill_load"](power_w=np.asarray(500.0), by_door=np.asarray(0.0)))
+    summary = diagnosed(replace(problem, vehicle=car), split, FEW).summary
+    assert {c["id"]: c["kind"] for c in summary["candidates"]}["standstill_load"] == "declared"
+    assert "standstill_load" not in [e["id"] for e in summary["effects"]]
+
+
+def test_nobody_looks_at_test_trips_before_the_end(log, whole):
+    """Other numbers measured there change what is told of the error, not what is found nor any coefficient."""
+    problem, split = log
+    test = problem.rows(split.test)
+    noise = np.random.default_rng(0).normal(0.0, 50.0, len(test))
+    other = diagnosed(replace(problem, measured=problem.measured + np.where(test, noise, 0.0)), split, FEW)
+    assert named(other) == named(whole)
+    keys = ("id", "q_value", "stability", "indistinguishable_from")
+    assert [[e[k] for k in keys] for e in other.summary["effects"]] == [
+        [e[k] for k in keys] for e in whole.summary["effects"]
+    ]
+    assert other.summary["after"]["test"]["rmse"] > 2 * whole.summary["after"]["test"]["rmse"]
+
+
+# --- logs that are short, odd, or of one trip --------------------------------------------------------------------
+
+
+def test_a_target_that_is_no_number_is_refused(log):
+    problem, split = log
+    measured = problem.measured.copy()
+    measured[3] = np.nan
+    with pytest.raises(InputError, match="missing or infinite values"):
+        diagnosed(replace(problem, target="battery_power_kw", measured=measured), split, FEW)
+
+
+def test_one_trip_is_cut_into_stretches_of_driving(tmp_path):
+    """It gives its last third to the test, and the rest in blocks to the training."""
+    options = {"effects": {"headwind": {}}, "ratio": 2.0, "ar_coefficient": 0.5}
+    _, problem, split = opened(tmp_path, seed=72, trips=1, rows_per_trip=400, **options)
+    result = diagnosed(problem, split, FEW)
+    assert result.summary["clusters"]["kind"] == "block"
+    assert result.summary["clusters"]["count"] >= 8
+    assert set(named(result)) <= {"headwind"}
+    assert breaches(result) == []
+
+
+def test_a_log_too_short_says_so_of_each_candidate(tmp_path):
+    _, problem, split = opened(tmp_path, seed=73, trips=1, rows_per_trip=60)
+    result = diagnosed(problem, split)
+    assert named(result) == []
+    assert result.summary["verdict"] in ("nothing_missing", "unexplained_structure")
+    kinds = {c["kind"] for c in result.summary["candidates"]}
+    assert kinds <= {*Kind} - {Kind.FOUND, Kind.DECLARED}
+    if result.summary["clusters"]["count"] < 3:
+        assert Kind.TOO_FEW_CLUSTERS in kinds
+    assert breaches(result) == []
+
+
+def test_a_log_that_is_met_exactly_lacks_nothing(log):
+    problem, split = log
+    exact = replace(problem, measured=problem.predict(problem.vehicle))
+    result = diagnosed(exact, split, FEW)
+    assert named(result) == []
+    assert result.summary["verdict"] == "nothing_missing"
+
+
+# --- a user's own effect -----------------------------------------------------------------------------------------
+
+
+class FadingStart(Effect):
+    """A user's own, without bounds: a time constant below 0 would make a column that no number holds."""
+
+    id: ClassVar = "fading_start"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "P·exp(−t/τ)"
+    parameters: ClassVar = (
+        Size("power_w", "W", 0.0, 1e4),
+        Shape("tau_s", "s", 100.0, 100.0, grid=(20.0, 100.0, 400.0)),
+    )
+    power_w: Any
+    tau_s: Any
+
+    def power(self, row, car, point):
+        """Power [W]."""
+        return self.power_w * jnp.exp(-row.time_s / self.tau_s)
+
+
+def test_a_users_effect_competes_like_any_other(tmp_path):
+    def fading(frame) -> None:
+        frame["energy_wh"] += 6e4 * np.exp(-frame["time_s"] / 100.0) * frame["duration_s"] / 3600.0
+
+    _, problem, split = opened(tmp_path, seed=74, trips=10, change=fading)
+    result = diagnosed(problem, split, {**FEW, FadingStart.id: FadingStart})
+    assert named(result) == [FadingStart.id]
+    told = result.summary["effects"][0]["parameters"]
+    assert abs(told["power_w"]["value"] / 6e4 - 1.0) < 0.15
+    low, high = told["tau_s"]["interval_90"]
+    assert 0.0 < low < 100.0 < high
+    assert breaches(result) == []
+
+
+# --- two sides of a chain that is measured in between --------------------------------------------------------------
+
+
+def test_each_side_is_diagnosed_apart(tmp_path):
+    sides = {k: LIBRARY[k] for k in ("copper_loss", "iron_loss", "rolling_speed")}
+    options = {"entry": "shaft", "mode": "samples", "effects": {"copper_loss": {}}, "ratio": 2.0}
+    opening = {"seed": 75, "trips": 9, "rows_per_trip": 200, "ar_coefficient": 0.9} | options
+    _, alone, split = opened(tmp_path / "a", **opening)
+    result = diagnosed(alone, split, sides)
+    add_stages(result, sides, settings=SETTINGS, seed=0)
+    assert "stages" not in result.summary, "the sheet says nothing of the road"
+    _, problem, split = opened(tmp_path / "b", road_side=True, **opening)
+    result = diagnosed(problem, split, sides)
+    add_stages(result, sides, settings=SETTINGS, seed=0)
+    stages = result.summary["stages"]
+    assert named(result) == stages["machine"]["effects"] == ["copper_loss"]
+    assert stages["machine"]["after"] == result.summary["after"]["test"]
+    assert stages["road"]["unit"] == "N"
+    assert "copper_loss" not in stages["road"]["effects"]
+    assert stages["road"]["before"]["n"] == result.summary["before"]["test"]["n"]
+    assert any("between the road and the wheels" in note for note in result.summary["notes"])
+    assert breaches(result) == []
+
+
+def test_what_lies_behind_a_force_is_excluded_with_a_reason(tmp_path):
+    options = {"entry": "shaft", "mode": "samples", "seed": 76, "trips": 9, "rows_per_trip": 120}
+    _, problem, split = opened(tmp_path, road_side=True, target="traction_force_n", **options)
+    library = {k: LIBRARY[k] for k in ("power_gain", "periodic_load", "mode_change", "rolling_speed")}
+    result = diagnosed(problem, split, library)
+    assert [e["id"] for e in result.summary["excluded"]] == ["power_gain"]
+    kinds = {c["id"]: c["kind"] for c in result.summary["candidates"]}
+    assert "power_gain" not in kinds
+    assert kinds["periodic_load"] == kinds["mode_change"] == "unavailable"
+    assert breaches(result) == []
