@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from hdev_jax import __version__
-from hdev_jax.compiling import compile_quickly, compiles_long
+from hdev_jax.compiling import compile_quickly, compiles_long, keep_compiled
 from hdev_jax.errors import InputError
+from hdev_jax.targets import TARGETS
 
 __all__ = ["main", "parser"]
-
-TARGETS = ("energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n")
 
 _ABOUT = """\
 Give it a measured log of an electric vehicle and a sheet of what you know about
@@ -84,8 +83,8 @@ def parser() -> argparse.ArgumentParser:
     diagnose = verbs.add_parser(
         "diagnose",
         help="calibrate, find what the model misses, add it, show the error before and after",
-        description="Calibrate the vehicle on the training trips, trace what is left to effects that the sheet does "
-        "not declare, add those that hold, and report the error before and after on trips that no choice has seen.",
+        description="Calibrate the vehicle on the training trips, trace the residual to effects that the sheet does "
+        "not declare, add those that pass every test, and show the error before and after on held-out test trips.",
         epilog="examples:\n  hdev diagnose trips.csv --vehicle truck.toml --out result\n"
         "  hdev diagnose day*.csv --vehicle truck.toml --train-trips mon,tue --test-trips wed --out result\n\n"
         "The folder gets report.html, diagnosis.json, figures/ and augmented_vehicle.toml, a sheet with the effects\n"
@@ -94,10 +93,14 @@ def parser() -> argparse.ArgumentParser:
     _logs(diagnose)
     _split(diagnose)
     _effects(diagnose)
-    diagnose.add_argument("--only", type=_names, metavar="ID,ID", help="search these effects and no others")
+    diagnose.add_argument("--only", type=_names, metavar="ID,ID", help="search only these effects")
     diagnose.add_argument("--exclude", type=_names, metavar="ID,ID", help="leave these effects out of the search")
     diagnose.add_argument(
-        "--fdr", type=_share, default=0.05, metavar="Q", help="accepted rate of false discoveries (default: 0.05)"
+        "--fdr",
+        type=_share,
+        default=0.05,
+        metavar="Q",
+        help="highest FDR-adjusted p-value of an added effect (default: 0.05)",
     )
     _out(diagnose)
 
@@ -105,7 +108,7 @@ def parser() -> argparse.ArgumentParser:
         "calibrate",
         help="the sheet's coefficients with their uncertainty, from the tabular values and the log",
         description="Estimate the coefficients to which the sheet gives an sd, from their tabular values and the "
-        "training trips, with standard errors. No effect is added.",
+        "training trips, with standard errors. No effect is searched.",
         epilog="examples:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated\n"
         "  hdev calibrate trips.csv --vehicle truck.toml --method nuts --noise student_t --out drawn",
     )
@@ -117,7 +120,7 @@ def parser() -> argparse.ArgumentParser:
         choices=["map", "linear", "nuts"],
         default="map",
         help="map: Levenberg-Marquardt with the priors; linear: Bayesian regression in closed form; nuts: draws of the "
-        "posterior, from sufficient statistics or through the kernel (default: map)",
+        "posterior, from sufficient statistics or by NUTS (default: map)",
     )
     calibrate.add_argument(
         "--noise",
@@ -130,9 +133,9 @@ def parser() -> argparse.ArgumentParser:
     predict = verbs.add_parser(
         "predict",
         help="what a vehicle sheet predicts for each row of a log, with an interval",
-        description="Predict the target for each row of the logs, which need not have measured it, and the total of "
-        "each trip, with intervals. A sheet that hdev calibrate or diagnose wrote, in its folder, brings with it what "
-        "they need.",
+        description="Predict the target for each row of the logs, and the total of each trip, with intervals. The logs "
+        "need not have measured it. A sheet in the folder where hdev calibrate or diagnose wrote it has the covariance "
+        "and noise for the intervals beside it.",
         epilog="example:\n  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out predicted.csv",
     )
     _logs(predict)
@@ -175,7 +178,11 @@ def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> No
         "logs", nargs="+", type=Path, metavar="LOG", help="log files (.csv, .csv.gz, .parquet, .mat), read as one log"
     )
     verb.add_argument(
-        "--vehicle", type=Path, required=vehicle_required, metavar="V.toml", help="the vehicle sheet: what is known"
+        "--vehicle",
+        type=Path,
+        required=vehicle_required,
+        metavar="V.toml",
+        help="the vehicle sheet: what is known of the vehicle",
     )
     verb.add_argument(
         "--adapter", type=Path, metavar="A.toml", help="how to read files whose columns have other names or units"
@@ -184,32 +191,36 @@ def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> No
 
 def _target(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
-        "--target", choices=TARGETS, help="what to explain (default: what the log measures nearest the battery)"
+        "--target", choices=tuple(TARGETS), help="the signal to explain (default: the measured one nearest the battery)"
     )
 
 
 def _split(verb: argparse.ArgumentParser) -> None:
     _target(verb)
     verb.add_argument(
-        "--train-trips", type=_names, metavar="A,B", help="trips to learn from; alone: all others are the test"
+        "--train-trips",
+        type=_names,
+        metavar="A,B",
+        help="training trips; without --test-trips all others are test trips",
     )
     verb.add_argument(
         "--test-trips",
         type=_names,
         metavar="C,D",
-        help="trips to test on; alone: all others train; with neither, every third trip is the test",
+        help="held-out test trips; without --train-trips all others are for training; with neither, "
+        "every third trip is held out",
     )
 
 
 def _effects(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
-        "--effects", type=Path, metavar="FILE.py", help="effects of your own: a diagnosis tries them, a sheet has them"
+        "--effects", type=Path, metavar="FILE.py", help="effects of your own, for the search and for the sheet"
     )
 
 
 def _out(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
-    verb.add_argument("--seed", type=_count, default=0, metavar="N", help="of everything drawn at random (default: 0)")
+    verb.add_argument("--seed", type=_count, default=0, metavar="N", help="random seed (default: 0)")
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -260,6 +271,7 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
     from hdev_jax import progress
 
     jax.config.update("jax_enable_x64", True)
+    keep_compiled()
     with progress.shown():
         return getattr(import_module(f"hdev_jax.verbs.{verb}"), verb)(**arguments)
 

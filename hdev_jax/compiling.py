@@ -1,4 +1,4 @@
-"""How XLA compiles: quickly where a log is small, for then compiling is most of the work.
+"""How XLA compiles: quickly where a log is small, and once: compiled programs are kept between commands.
 
 A search compiles the vehicle anew for every effect that it adds. With an efficiency map and a log of 2,000 rows that
 is three quarters of the time, and programs that are not optimised bring the answer 2.6 times sooner; of a log of 40,000
@@ -9,11 +9,12 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["compile_quickly", "compiles_long"]
+__all__ = ["compile_quickly", "compiles_long", "keep_compiled"]
 
 FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
 PACKED = 5  # times smaller than that, where a file is compressed
+KEPT_BYTES = 1_000_000_000  # of compiled programs; those not used for longest go first
 _COMPRESSED = {".gz", ".parquet", ".mat", ".zip", ".xz", ".bz2"}
 
 
@@ -28,3 +29,29 @@ def compiles_long(logs: Iterable[str | Path]) -> bool:
     """Whether compiling is most of what these logs take; what is no file counts as nothing."""
     paths = [p for p in map(Path, logs) if p.is_file()]
     return sum(p.stat().st_size * (PACKED if p.suffix in _COMPRESSED else 1) for p in paths) < SMALL_BYTES
+
+
+def keep_compiled() -> Path | None:
+    """Keep compiled programs for the next command: JAX's persistent cache, in the user's cache folder.
+
+    `HDEV_CACHE` names another folder, or is `off`; where `JAX_COMPILATION_CACHE_DIR` is set, that holds. JAX takes a
+    lock for each entry, so that two processes may share the folder. **Returns:** the folder, None where nothing is
+    kept.
+    """
+    import jax
+    import platformdirs
+
+    asked = os.environ.get("HDEV_CACHE", "")
+    if asked.lower() == "off" or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return None
+    folder = Path(asked or platformdirs.user_cache_dir("hdev_jax")) / "compiled"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ".lockfile").touch()
+    except OSError:
+        return None  # a machine without a home: everything is compiled each time
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_compilation_cache_max_size", KEPT_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return folder

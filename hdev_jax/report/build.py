@@ -12,6 +12,7 @@ from hdev_jax.physics.across import distance_since_start
 from hdev_jax.problem import Problem, Split
 from hdev_jax.report.data import ReportData
 from hdev_jax.report.words import answer, next_drives, plus_minus
+from hdev_jax.targets import TARGETS
 
 __all__ = ["answer_text", "of_diagnosis", "report_data"]
 
@@ -48,7 +49,7 @@ def report_data(
 def of_diagnosis(result: Diagnosis, command: str, started: float) -> ReportData:
     problem, split = result.problem, result.split
     breakdown = {}
-    if problem.target in ("energy_wh", "battery_power_kw"):
+    if TARGETS[problem.target].of_battery:
         test = problem.rows(split.test)
         trip = np.asarray(problem.segments.trip)
         whole = np.isin(trip, trip[test])  # of a trip that is tested in part, what came before belongs to it
@@ -72,7 +73,8 @@ def answer_text(data: ReportData, out: Path) -> str:
         lines.append(f"{when:10s}{m['rmse']:12.4g}{pe:>20s}")
     for e in s["effects"]:
         sizes = ", ".join(f"{k} {plus_minus(p['value'], p['sd'], p['unit'])}" for k, p in e["parameters"].items())
-        twins = f"; not told from {', '.join(e['indistinguishable_from'])}" if e["indistinguishable_from"] else ""
+        others = ", ".join(e["indistinguishable_from"])
+        twins = f"; cannot be distinguished from {others}" if others else ""
         lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")
     lines += next_drives(s)
     lines.append(s["unexplained"]["signature"])

@@ -8,7 +8,7 @@ from typing import Any
 
 __all__ = ["AFTER", "BEFORE", "GREY", "INK", "MEASURED", "axis_label", "figure", "plain_log", "png", "style", "tidy"]
 
-# Okabe and Ito (2008): told apart with any colour vision, and by lightness in print
+# Okabe and Ito (2008): distinguishable with any colour vision, and by lightness in print
 MEASURED, BEFORE, AFTER = "#1a1a1a", "#D55E00", "#0072B2"
 INK, GREY, LINE = "#1b1f24", "#6b7680", "#d9dee3"
 DPI = 150

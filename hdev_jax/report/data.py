@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.problem import PER_KWH, sum_weight
 from hdev_jax.problem import metrics as errors
+from hdev_jax.problem import sum_weight
+from hdev_jax.targets import TARGETS
 
 __all__ = ["ReportData", "TripLine", "metrics", "same_model", "test_rows", "total", "total_name", "trip_lines"]
-
-_TOTALS = {"Wh": "energy", "kW": "energy", "N": "work", "Nm": "mean torque"}
 
 
 @dataclass(frozen=True)
@@ -91,17 +90,17 @@ def _weight(data: ReportData, rows: np.ndarray) -> np.ndarray:
 
 def total_name(data: ReportData) -> tuple[str, str]:
     """What the target sums to, and its unit: `("energy", "kWh")`."""
-    return _TOTALS.get(data.unit, "mean"), "Nm" if data.unit == "Nm" else "kWh"
+    target = TARGETS[data.summary["target"]]
+    return target.total, target.unit if target.per_kwh is None else "kWh"
 
 
 def total(data: ReportData, rows: np.ndarray) -> float:
     """The measured total of some rows (by index) in the unit of `total_name`: kWh, or the mean torque in Nm."""
     rows = rows[np.isfinite(data.row("measured")[rows])]
     weight = _weight(data, rows)
+    per_kwh = TARGETS[data.summary["target"]].per_kwh
     s = float(np.sum(data.row("measured")[rows] * weight))
-    if data.unit == "Nm":
-        return s / max(float(np.sum(weight)), 1e-12)
-    return s / PER_KWH[data.summary["target"]]
+    return s / max(float(np.sum(weight)), 1e-12) if per_kwh is None else s / per_kwh
 
 
 def metrics(data: ReportData, rows: np.ndarray, when: str) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.fleet.tally import ACCEL_EDGES, GRADE_EDGES, Tally
+from hdev_jax.physics import LIBRARY, Aero, Auxiliary, Grade, Inertia, Rolling, Switch
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, figure, tidy
 from hdev_jax.report.fleet_sources import (
     CONSUMPTION,
@@ -29,17 +30,18 @@ _USES = {
     "city_bus": ("city bus", "#009E73"),
 }
 _PLURAL = {"tractor": "tractors", "truck": "rigid trucks", "bus": "city buses", "articulated": "articulated buses"}
+_LIMITED = [c.id for c in LIBRARY.values() if c.stage == "battery" and any(isinstance(p, Switch) for p in c.parameters)]
 _GROUPS = (
-    ("rolling", "#7f6a4f", ("rolling",)),
-    ("air", "#56B4E9", ("aero",)),
-    ("slope and inertia", "#999999", ("grade", "inertia")),
-    ("driveline, declared map", "#CC79A7", ("driveline",)),
-    ("auxiliaries, declared", "#F0E442", ("auxiliary",)),
-    ("not declared: tyres and road", "#4a3b28",
-     ("rolling_temperature", "rolling_speed", "tyre_warmup", "wet_road", "road_surface", "cornering")),
-    ("not declared: wind, density", "#0072B2", ("headwind", "crosswind", "air_density")),
-    ("not declared: loads, climate", "#E69F00", ("auxiliary_power", "hvac_power")),
-    ("not declared: limits of regeneration", "#D55E00", ("regen_limit", "regen_cutoff")),
+    ("rolling", "#7f6a4f", [Rolling.id]),
+    ("air", "#56B4E9", [Aero.id]),
+    ("slope and inertia", "#999999", [Grade.id, Inertia.id]),
+    ("driveline, declared map", "#CC79A7", ["driveline"]),
+    ("auxiliaries, declared", "#F0E442", [Auxiliary.id]),
+    ("not declared: tyres and road", "#4a3b28", [c.id for c in LIBRARY.values() if c.goes_with == "weight"]),
+    ("not declared: wind, density", "#0072B2", [c.id for c in LIBRARY.values() if c.goes_with == "air"]),
+    ("not declared: loads, climate", "#E69F00",
+     [c.id for c in LIBRARY.values() if c.stage == "battery" and c.id not in _LIMITED]),
+    ("not declared: limits of regeneration", "#D55E00", _LIMITED),
 )  # fmt: skip
 
 

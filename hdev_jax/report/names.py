@@ -4,86 +4,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hdev_jax.physics import DECLARED, LIBRARY
+from hdev_jax.targets import TARGETS
+
 __all__ = ["Shown", "channel", "coefficient", "effect", "explained", "parameter", "target", "verbose_join"]
 
-# ids of effects.md and of the declared model -> what to call it in a sentence
-_EFFECTS = {
-    "inertia": "acceleration",
-    "grade": "slope",
-    "rolling": "rolling resistance",
-    "aero": "air drag",
-    "auxiliary": "declared auxiliary load",
-    "driveline": "driveline loss",
-    "machine": "machine loss",
-    "traction": "traction",
-    "auxiliary_power": "constant auxiliary load",
-    "hvac_power": "cabin heating and cooling",
-    "passenger_heat": "warmth of the passengers",
-    "cabin_warmup": "cabin warm-up",
-    "periodic_load": "periodic load",
-    "standstill_load": "load at standstill",
-    "cooling_power": "cooling power",
-    "constant_headwind": "constant headwind",
-    "headwind": "headwind",
-    "air_density": "air density",
-    "crosswind": "crosswind",
-    "drafting": "drafting",
-    "rolling_speed": "rolling resistance that grows with speed",
-    "rolling_temperature": "rolling resistance by temperature",
-    "tyre_warmup": "tyre warm-up",
-    "wet_road": "wet road",
-    "road_surface": "road surface by place",
-    "mass_scale": "payload error",
-    "grade_bias": "slope bias",
-    "grade_lag": "lag of the slope",
-    "road_grade": "road slope",
-    "rotating_mass": "rotating mass",
-    "standstill_hold": "brakes that hold at rest",
-    "driveline_drag": "drag torque of the driveline",
-    "gear_efficiency": "efficiency by gear",
-    "brake_drag": "brake drag",
-    "friction_brake": "friction brake",
-    "friction_blending": "blending of the friction brake",
-    "regen_limit": "limit of regeneration",
-    "regen_cutoff": "cut-off of regeneration at low speed",
-    "traction_limit": "limit of traction power",
-    "efficiency_scale": "scale of the efficiency map",
-    "battery_resistance": "battery resistance",
-    "copper_loss": "copper loss of the motor",
-    "iron_loss": "iron loss of the motor",
-    "inverter_loss": "inverter loss",
-    "speed_scale": "scale of the speed signal",
-    "torque_offset": "offset or gain of the torque signal",
-    "power_gain": "offset or gain of the power signal",
-    "time_skew": "time skew between channels",
-    "sampling_filter": "filter of the measured signal",
-    "accelerometer_bias": "bias of the accelerometer",
-    "voltage_dependence": "dependence on the battery's voltage",
-    "cornering": "cornering resistance",
-    "step_change": "step change of a coefficient",
-    "mode_change": "change of operating mode",
-}
-
-_PARAMETERS = {
-    "tau_s": "time constant",
-    "skew_s": "skew",
-    "n_per_pa": "force per pressure",
-    "per_k": "per kelvin",
-    "per_v": "per volt",
-    "per_mps2": "per speed squared",
-    "drag_per_rad2": "drag per yaw squared",
-    "w_per_nm2": "power per torque squared",
-    "below_w_per_k": "below the heating limit",
-    "above_w_per_k": "above the cooling limit",
-    "heat_c": "heating limit",
-    "cool_c": "cooling limit",
-    "per_nm_w": "power per torque",
-    "n_per_unit": "force per unit of the signal",
-    "w_per_radps": "power per motor speed",
-    "w_per_radps2": "power per motor speed squared",
-    "w_per_passenger": "power per passenger",
-}
-_GROUPED = {"driveline_drag": "gear", "gear_efficiency": "gear", "road_surface": "road surface"}
+_CHAIN = {"driveline": "driveline loss", "machine": "machine loss", "traction": "traction"}  # parts that are no effects
+_EFFECTS = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}
+_PARAMETERS = {p.name: p.label for c in _EFFECTS.values() for p in c.parameters if p.label}
 _SUFFIXES = {"w", "s", "m", "mps", "nm", "n", "ohm", "rad", "c", "v", "mps2", "kg", "kw"}
 
 _COEFFICIENTS = {
@@ -92,16 +20,10 @@ _COEFFICIENTS = {
     "road.cda_m2": ("drag area", "m²"),
     "road.rotating_mass_factor": ("rotating mass factor", ""),
     "driveline.efficiency": ("driveline efficiency", ""),
+    "driveline.regenerating_efficiency": ("driveline efficiency when braking", ""),
     "machine.motoring_efficiency": ("efficiency when motoring", ""),
     "machine.regenerating_efficiency": ("efficiency when regenerating", ""),
     "battery.auxiliary_w": ("auxiliary load", "W"),
-}
-
-_TARGETS = {
-    "energy_wh": ("battery energy", "energy per row"),
-    "battery_power_kw": ("battery power", "battery power"),
-    "motor_torque_nm": ("motor torque", "motor torque"),
-    "traction_force_n": ("traction force", "traction force"),
 }
 
 
@@ -157,15 +79,13 @@ _CHANNELS = {
 
 def effect(effect_id: str) -> str:
     """`"tyre_warmup"` -> `"tyre warm-up"`; of an id that is not known, its words."""
-    return _EFFECTS.get(effect_id, effect_id.replace("_", " "))
+    known = _EFFECTS.get(effect_id)
+    return known.label if known else _CHAIN.get(effect_id, effect_id.replace("_", " "))
 
 
 def explained(effect_id: str) -> dict[str, Any]:
     """What the library says of an effect: `words`, `equation`, `source`, `separated_by`; empty for a user's own."""
-    from hdev_jax.physics.library import DECLARED, LIBRARY
-
-    found = LIBRARY.get(effect_id) or {c.id: c for c in DECLARED}.get(effect_id)
-    if found is None:
+    if (found := _EFFECTS.get(effect_id)) is None:
         return {}
     first = (found.__doc__ or "").strip().splitlines()[0]
     return {
@@ -181,9 +101,13 @@ def parameter(name: str, effect_id: str = "") -> str:
     gear or kind of road: `"torque_nm[2]"` of `driveline_drag` -> `"torque (gear 2)"`."""
     stem, bracket, group = name.partition("[")
     head, _, tail = stem.rpartition("_")
-    word = _PARAMETERS.get(stem) or (head if head and tail in _SUFFIXES else stem).replace("_", " ")
-    if bracket and effect_id in _GROUPED:
-        return f"{word} ({_GROUPED[effect_id]} {group.removesuffix(']')})"
+    known = {p.name: p for p in _EFFECTS[effect_id].parameters} if effect_id in _EFFECTS else {}
+    own = known.get(stem)
+    word = (own.label if own else _PARAMETERS.get(stem)) or (head if head and tail in _SUFFIXES else stem).replace(
+        "_", " "
+    )
+    if bracket and own and own.by:
+        return f"{word} ({own.by.replace('_', ' ')} {group.removesuffix(']')})"
     return f"{word} [{group}" if bracket else word
 
 
@@ -207,8 +131,9 @@ def channel(name: str) -> Shown:
 
 def target(name: str) -> tuple[str, str]:
     """A target as a thing (`battery energy`) and as an axis (`energy per row`)."""
-    words = name.replace("_", " ")
-    return _TARGETS.get(name, (words, words))
+    if found := TARGETS.get(name):
+        return found.label, found.axis
+    return (words := name.replace("_", " ")), words
 
 
 def verbose_join(items: list[str], word: str = "and") -> str:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.result.summary import FAR
+from hdev_jax.diagnosis.gates.rejection import Kind
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.report import names, words
 from hdev_jax.report.canvas import png, style
 from hdev_jax.report.data import ReportData, metrics, same_model, test_rows, total_name, trip_lines
@@ -112,7 +113,7 @@ def _calibrated(data: ReportData, rows: list[dict[str, Any]]) -> list[tuple[str,
     if moved := [c["name"] for c in rows if c["flag"]]:
         verb = "lies" if len(moved) == 1 else "lie"
         pieces += [(f" {names.verbose_join(moved).capitalize()}", True), (f" {verb} far from the table: ", False)]
-        pieces += [("hdev diagnose looks for what may be missing.", False)]
+        pieces += [("hdev diagnose searches for what may be missing.", False)]
     return pieces
 
 
@@ -194,7 +195,7 @@ def _tiles(data: ReportData) -> list[dict[str, str]]:
         {
             "label": "Noise floor",
             "value": words.number(u.get("noise_floor_rmse"), 2, data.unit),
-            "note": "estimated: what nothing that is borne out predicts",
+            "note": "estimated: the error that nothing in the log predicts",
         },
         {
             "label": "Still predictable",
@@ -231,12 +232,11 @@ def _found(data: ReportData, e: dict[str, Any]) -> dict[str, Any]:
 
 
 def _candidates(summary: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Candidates by gain, the leaders apart; those that this log cannot show last."""
-    there = ("found", "declared in the sheet")
+    """Candidates by gain, the leaders apart; those that this log cannot show at the end."""
     rows = [
         {**c, "name": names.effect(c["id"])}
         for c in summary.get("candidates", [])
-        if c.get("why_not") not in there  # in the model: shown where effects and coefficients are
+        if c.get("kind") not in (Kind.FOUND, Kind.DECLARED)  # in the model: shown with effects and coefficients
     ]
     tried = sorted((c for c in rows if c.get("score") is not None), key=lambda c: -c["score"])
     tried += [c for c in rows if c.get("score") is None]
@@ -257,7 +257,7 @@ def _coefficient(path: str, p: dict[str, Any]) -> dict[str, Any]:
         "value": words.plus_minus(p.get("value"), p.get("sd"), unit),
         "prior": words.plus_minus(prior, p.get("prior_sd"), unit) if p.get("prior_sd") else "none",
         "z": "–" if z is None else f"{z:+.1f}".replace("-", "−"),
-        "flag": z is not None and abs(z) > FAR,
+        "flag": z is not None and abs(z) > SETTINGS.far,
         "absorbs": [names.effect(a) for a in p.get("absorbs") or []],
     }
 

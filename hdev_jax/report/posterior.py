@@ -1,4 +1,4 @@
-"""Prior, likelihood and posterior of each coefficient as curves: what the table said, what the log says, both."""
+"""Prior, likelihood and posterior of each coefficient as curves: the table, the log, both."""
 
 from typing import Any
 
@@ -25,10 +25,10 @@ def likelihood_of(
     precision = np.linalg.inv(inside)
     own = precision - np.eye(len(mean))
     values, vectors = np.linalg.eigh(0.5 * (own + own.T))
-    told = values > 1e-6 * max(float(values[-1]), 1.0)
-    inverse = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
+    determined = values > 1e-6 * max(float(values[-1]), 1.0)
+    inverse = np.where(determined, 1.0 / np.where(determined, values, 1.0), 0.0)
     centre = vectors @ (inverse * (vectors.T @ (precision @ z)))
-    empty = np.sum(vectors[:, ~told] ** 2, axis=1) > 1e-6
+    empty = np.sum(vectors[:, ~determined] ** 2, axis=1) > 1e-6
     sd = np.where(empty, np.inf, np.sqrt((vectors**2) @ inverse))
     return prior + prior_sd * centre, prior_sd * sd
 

@@ -57,7 +57,7 @@ def edges_of(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
     if len(values) <= bins:
         return 0.5 * (values[1:] + values[:-1])
     edges = np.unique(np.quantile(sample, np.linspace(0, 1, bins + 1)[1:-1]))
-    if len(edges) < bins // 2:  # half of the rows at one value: like widths tell more
+    if len(edges) < bins // 2:  # half of the rows at one value: bins of equal width show more
         edges = np.linspace(values[0], values[-1], bins + 1)[1:-1]
     return edges
 
@@ -65,7 +65,7 @@ def edges_of(x: np.ndarray, bins: int = BINS) -> np.ndarray | None:
 def binned(x: np.ndarray, residual: np.ndarray, cluster: np.ndarray, edges: np.ndarray, least: int = 5) -> Binned:
     """Means by bin; the error of a mean sums residuals by cluster first, for they are not independent.
 
-    The error is NaN in a bin that only one cluster fills: one says nothing of how clusters differ.
+    The error is NaN in a bin that only one cluster fills: one does not show how clusters differ.
     """
     good = np.isfinite(x) & np.isfinite(residual)
     x, residual, cluster = x[good], residual[good], cluster[good]
@@ -155,7 +155,7 @@ def variance_by_period(
 def stretch(data: ReportData, rows: int = 240) -> slice | None:
     """The stretch of one test trip whose errors, before and after, are nearest to those of all test rows.
 
-    Typical on purpose, not the best. Stretches that mostly stand still are passed over where others are there.
+    Typical on purpose, not the best. Stretches that mostly stand still are skipped where there are others.
     """
     good = test_rows(data)
     if not good.any():

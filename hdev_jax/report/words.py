@@ -5,8 +5,9 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
-from hdev_jax.diagnosis.remainder.unexplained import LEAST_SHARE
+from hdev_jax.diagnosis.gates.rejection import UNTRIED
 from hdev_jax.diagnosis.scores.significance import least_clusters
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.problem import LAST_THIRD
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
@@ -87,8 +88,8 @@ def plus_minus(value: Any, sd: Any, unit: str | None = "") -> str:
 
 
 def known(p: dict[str, Any]) -> str:
-    """A parameter of diagnosis.json: `0.98 ± 0.03 m`; `150 W/K (90 %: 52 to 410)` where what is known of it leans far
-    to one side, as of a slope whose threshold few trips tell."""
+    """A parameter of diagnosis.json: `0.98 ± 0.03 m`; `150 W/K (90 %: 52 to 410)` where the interval is far
+    from symmetric, as of a slope whose threshold rests on few trips."""
     value, low, high = (float("nan") if x is None else x for x in (p.get("value"), *p.get("interval_90", (None, None))))
     if _finite(value, low, high) and high - low > 0:
         below, above = value - low, high - value
@@ -125,15 +126,15 @@ def percent(x: Any, *, signed: bool = True, decimals: int = 1) -> str:
 
 
 def doubt(unexplained: Mapping[str, Any]) -> str:
-    """What to say behind a flexible learner's share that training trips do not bear out; nothing where they do."""
+    """What to add to a flexible learner's share that cross-validation does not confirm; empty where it does."""
     share = unexplained.get("share_of_test_variance")
-    if unexplained.get("share_borne_out", True) or share is None or not share >= LEAST_SHARE:
+    if unexplained.get("share_borne_out", True) or share is None or not share >= SETTINGS.least_share:
         return ""
-    return ", which training trips do not bear out"
+    return ", not confirmed by cross-validation on training trips"
 
 
 def q_value(q: Any) -> str:
-    """A corrected chance of a false find: `0.03`, `< 0.0001`."""
+    """An FDR-adjusted p-value: `0.03`, `< 0.0001`."""
     if not _finite(q):
         return _DASH
     return f"<{NBSP}0.0001" if q < 1e-4 else f"{q:.4f}" if q < 0.001 else f"{q:.3f}" if q < 0.1 else f"{q:.2f}"
@@ -149,7 +150,7 @@ def _sizes(effect: dict[str, Any]) -> str:
     found = [
         f"{names.parameter(name, effect['id'])} {known(p)}"
         for name, p in effect.get("parameters", {}).items()
-        if p.get("sd")  # what was chosen among a few is in the table
+        if p.get("sd")  # choices among a few values are in the table
     ]
     if len(found) > 3:
         return f" ({', '.join(found[:2])} and {len(found) - 2} more values)"
@@ -160,7 +161,7 @@ def _missing(effects: list[dict[str, Any]]) -> str:
     items = []
     for e in effects[:4]:
         twins = [names.effect(t) for t in e.get("indistinguishable_from") or []]
-        alike = f" or {names.verbose_join(twins, 'or')}, which this log cannot tell apart," if twins else ""
+        alike = f" or {names.verbose_join(twins, 'or')}, which this log cannot distinguish," if twins else ""
         items.append(f"\x02{names.effect(e['id'])}\x03{_sizes(e)}{alike}")
     if len(effects) > 4:
         items.append(f"{len(effects) - 4} more")
@@ -184,23 +185,23 @@ def _errors(data: ReportData) -> str:
 
 def _where(data: ReportData) -> str:
     tested = data.summary.get("split", {}).get("test_trips", [])
-    if len(tested) == 1 and tested[0].endswith(LAST_THIRD):  # a log of one trip: its end is tested on
-        return f"on the last third of {tested[0].removesuffix(LAST_THIRD)} that no choice has seen"
-    return f"on {count(len(tested), 'trip')} that no choice has seen"
+    if len(tested) == 1 and tested[0].endswith(LAST_THIRD):  # a log of one trip: its end is held out
+        return f"on the held-out last third of {tested[0].removesuffix(LAST_THIRD)}"
+    return f"on {count(len(tested), 'held-out test trip')}"
 
 
 def remaining(data: ReportData) -> str:
-    """What is left, in a sentence or two: on what it depends, what it looks like, how much of it there is."""
+    """What is left, in a sentence: what it depends on and what it looks like."""
     u = data.summary.get("unexplained", {})
     on = [names.channel(c).label for c in u.get("depends_on") or []]
-    text = f"it depends on {names.verbose_join(on)}" if on else "no channel of the log names it"
+    text = f"it depends on {names.verbose_join(on)}" if on else "it depends on no single channel of the log"
     if signature := str(u.get("signature") or "").strip():
         text += f" – {signature.rstrip('.').removeprefix('What is left: ')}"
     return text
 
 
 def _suspects(data: ReportData) -> str:
-    """What only more trips could decide, and how many would do; empty where there is nothing of the kind."""
+    """What only more trips could decide, and how many would be enough; empty where there is nothing."""
     able, clusters = data.summary.get("not_decidable") or [], data.summary.get("clusters") or {}
     if not able:
         return ""
@@ -208,31 +209,31 @@ def _suspects(data: ReportData) -> str:
     there = clusters.get("trips", count) if by_trip else count  # many trips share clusters
     unit = "trips" if by_trip else "stretches of driving"
     needed = [(names.effect(c["id"]), math.ceil(c["clusters_needed"] * there / count)) for c in able]
-    named = [f"{name} (about {many} {unit} like these would tell)" for name, many in needed[:MOST_SUSPECTS]]
+    named = [f"{name} (about {many} {unit} like these would be enough)" for name, many in needed[:MOST_SUSPECTS]]
     if len(needed) > MOST_SUSPECTS:
-        named.append(f"{len(needed) - MOST_SUSPECTS} more that act between {unit} alone")
+        named.append(f"{len(needed) - MOST_SUSPECTS} more that differ between {unit} alone")
     return f"with {there} {unit} for training this log cannot decide on {names.verbose_join(named)}"
 
 
 def _too_few(summary: dict[str, Any]) -> str:
-    """Said where nothing could have been found, whatever is missing; empty otherwise."""
+    """Why no effect could have been found, where clusters are too few; empty otherwise."""
     clusters, least = summary.get("clusters") or {}, least_clusters(1)
     if (there := clusters.get("count", least)) >= least:
         return ""
     unit = "trip" if clusters.get("kind") == "trip" else "stretch"
     have = f"1 {unit}" if there == 1 else f"{there} {unit}{'s' if unit == 'trip' else 'es'}"
-    return f"with {have} of driving for training nothing can be told from chance ({least} at least are needed)"
+    return f"with {have} of driving for training no effect can be separated from chance (at least {least} are needed)"
 
 
 def _unnamed(data: ReportData) -> str:
-    """Whether the library has no word for what is left, or has one that did not clear the bar."""
+    """Whether no effect of the library explains what is left, or one might that is not significant."""
     if suspects := _suspects(data):
         return f"could not be named with confidence ({suspects})"
-    return "the library does not hold"
+    return "no effect of the library explains"
 
 
 def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
-    """The answer as (text, bold) pieces, so that a page can mark names without trusting them."""
+    """The answer as (text, bold) pieces, so that a page can escape names and mark them."""
     s = data.summary
     verdict, effects = s.get("verdict", ""), s.get("effects", [])
     if effects:
@@ -244,19 +245,18 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
         text = f"\x02Something is missing that {_unnamed(data)}\x03: {remaining(data)}."
         if _finite(share):
             text += (
-                f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of what is left"
+                f" A flexible learner still predicts {percent(100 * share, signed=False, decimals=0)} of its variance"
                 f"{doubt(s['unexplained'])}."
             )
     else:
-        untried = ("not tried", "declared in the sheet")
-        tried = sum(not str(c.get("why_not") or "").startswith(untried) for c in s.get("candidates", []))
+        tried = sum(c.get("kind") not in UNTRIED for c in s.get("candidates", []))
         test = s["after"]["test"]
         if suspects := _suspects(data) or _too_few(s):
             text = f"\x02Not decidable on this log\x03: {suspects}; "
         elif not tried:
             text = (
-                "\x02Nothing was tried\x03: what was asked for is declared in the sheet already, or not to be seen in "
-                "this log; "
+                "\x02Nothing was tried\x03: every requested effect is declared in the sheet already, or cannot be seen "
+                "in this log; "
             )
         else:
             text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
@@ -274,16 +274,16 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
 
 
 def next_drives(summary: dict[str, Any]) -> list[str]:
-    """One sentence for each drive that would tell a found effect from its rival, the shortest first."""
+    """One sentence for each drive that separates a found effect from its rival, the shortest first."""
     out = []
     for d in summary.get("next_drives", []):
         pair = f"{names.effect(d['effect'])} from {names.effect(d['rival'])}"
         if not d["drive"]:
             how = next((e["separated_by"] for e in summary["effects"] if e["id"] == d["effect"]), "")
-            out.append(f"no drive that was simulated tells {pair} in good time{f'; what may: {how}' if how else ''}")
+            out.append(f"no simulated drive separates {pair} in reasonable time{f'; try: {how}' if how else ''}")
             continue
         length = f"{number(d['kilometres'], 2)} km, " if d["kilometres"] > 0 else ""
-        out.append(f"to tell {pair}: {d['drive']} ({length}{number(d['hours'], 2)} h)")
+        out.append(f"to separate {pair}: {d['drive']} ({length}{number(d['hours'], 2)} h)")
     return out
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log, write_adapter_skeleton
 from hdev_jax.problem import prepare
+from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.opening import Paths, known_effects
 
 __all__ = ["check"]
@@ -29,7 +30,7 @@ def check(
     s = log.segments
     lines = [f"{len(log)} rows, {len(log.trip_names)} trips, {len(log.vehicle_names)} vehicles"]
     lines += ["", "columns"] + [f"  {c.source:34s} {c.unit or '-':10s} -> {c.name}" for c in log.columns]
-    has_energy = any(t in log.targets for t in ("energy_wh", "battery_power_kw"))
+    has_energy = any(TARGETS[t].of_battery for t in log.targets)
     energy = log.target("energy_wh") if has_energy else None
     lines += ["", f"{'trip':40s} {'rows':>7s} {'min':>7s} {'km':>8s} {'kWh':>9s} {'kWh/km':>8s}"]
     for i, name in enumerate(log.trip_names):

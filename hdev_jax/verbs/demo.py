@@ -6,17 +6,17 @@ import sys
 from pathlib import Path
 
 from hdev_jax import progress
-from hdev_jax.compiling import compile_quickly
+from hdev_jax.compiling import compile_quickly, keep_compiled
 from hdev_jax.errors import InputError
 
 __all__ = ["main"]
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write the log and the sheet as a customer would send them, diagnose them, and say what was planted."""
+    """Write the log and the sheet as a customer would send them, diagnose them, and print what was planted."""
     parser = argparse.ArgumentParser(prog="python -m hdev_jax.verbs.demo", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder for log, sheet and result")
-    parser.add_argument("--seed", type=int, default=3, help="of the synthetic log")
+    parser.add_argument("--seed", type=int, default=3, help="random seed of the synthetic log")
     out: Path = parser.parse_args(argv).out
     seed: int = parser.parse_args(argv).seed
 
@@ -24,6 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    keep_compiled()
     from hdev_jax.fleet import demo_log
     from hdev_jax.verbs.diagnose import diagnose
 

@@ -9,6 +9,7 @@ from hdev_jax import progress
 from hdev_jax.diagnosis.diagnose import Diagnosis
 from hdev_jax.diagnosis.diagnose import diagnose as run_loop
 from hdev_jax.diagnosis.result.stages import add_stages
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.report.page import write_report
@@ -37,7 +38,7 @@ def diagnose(
     """Find what the vehicle's model misses in these logs: the loop, into the folder `out`.
 
     **Arguments:** as the options of `hdev diagnose`. **Returns:** the answer as text; everything else is in `out`:
-    `diagnosis.json`, `report.html`, `augmented_vehicle.toml`, figures. Raises `InputError` for what the user can mend.
+    `diagnosis.json`, `report.html`, `augmented_vehicle.toml`, figures. Raises `InputError` for faults of the input.
     """
     started = time.time()
     known = known_effects(effects)
@@ -56,8 +57,9 @@ def diagnose(
         if run.done:
             return (run.work / "answer.txt").read_text()
         progress.step(start.read)
-        result = run_loop(problem, split, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
-        add_stages(result, candidates, fdr=fdr, seed=seed, tell=progress.step, checkpoint=run.checkpoint)
+        how = {"settings": Settings(fdr=fdr), "seed": seed, "tell": progress.step, "checkpoint": run.checkpoint}
+        result = run_loop(problem, split, candidates, **how)
+        add_stages(result, candidates, **how)
         progress.step("writing the report")
         why = {k: "--exclude" if k in (exclude or ()) else "not in --only" for k in known if k not in candidates}
         result.summary["excluded"] += [{"id": k, "why": w} for k, w in why.items() if not problem.vehicle.has(k)]

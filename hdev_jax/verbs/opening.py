@@ -3,11 +3,9 @@
 import difflib
 import hashlib
 import importlib.util
-import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +14,15 @@ import jax
 import numpy as np
 
 from hdev_jax import progress
-from hdev_jax.diagnosis.candidates.candidate import FIXED, as_seen, plan_of
-from hdev_jax.diagnosis.candidates.facts import GROUPS, Facts, facts_of
+from hdev_jax.diagnosis.candidates.candidate import as_seen, plan_of
+from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import computed
 from hdev_jax.errors import InputError
 from hdev_jax.inference import padded
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
-from hdev_jax.physics.effect import KINDS, STAGES
+from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.library import DECLARED
 from hdev_jax.problem import Problem, Split, prepare, split_trips
 from hdev_jax.rundir import Run
@@ -33,7 +31,7 @@ __all__ = ["Opening", "Paths", "chosen_effects", "command_line", "digest", "know
 
 Paths = Sequence[str | Path]
 HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
-ROUNDING = 1e4  # units in the last place of the largest prediction, for two that are said to be the same
+ROUNDING = 1e4  # units in the last place of the largest prediction, for two that count as equal
 
 
 def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
@@ -47,7 +45,7 @@ def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as e:  # a script that ends itself has not been read to its end
+    except (Exception, SystemExit) as e:  # a script that exits was not read to its end
         raise InputError(f"--effects {file}: does not run: {type(e).__name__}: {e}") from e
     own = [
         c for c in vars(module).values()
@@ -81,27 +79,25 @@ def _malformed(effect: type[Effect]) -> str | None:
     if not effect.entries or set(effect.entries) - {*Effect.entries}:
         return f"entries is {effect.entries!r}; some of {', '.join(Effect.entries)} are expected"
     if effect.searched:
-        return f"searched is {effect.searched!r}; only effects of the library are looked for in a way of their own"
+        return f"searched is {effect.searched!r}; only effects of the library have a search of their own"
     if not any(getattr(effect, hook) is not getattr(Effect, hook) for hook in HOOKS):
         return f"it has no hook of its own ({', '.join(HOOKS)}), so it does nothing"
     if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
-        return "parameters is something else than a tuple of hdev_jax.physics.Parameter"
+        return "parameters is something else than a tuple of Size, Switch, Shape and Choice (hdev_jax.physics)"
     return _malformed_parameters(effect, parameters)
 
 
 def _malformed_parameters(effect: type[Effect], parameters: Sequence[Parameter]) -> str | None:
-    if odd := [p.name for p in parameters if not isinstance(p.name, str)]:
-        return f"a parameter's name is {odd[0]!r}; text is expected"
     names = [p.name for p in parameters]
     if twice := {n for n in names if names.count(n) > 1}:
         return f"two parameters are called {min(twice)}"
     for p in parameters:
-        if why := _malformed_parameter(p):
-            return f"parameter {p.name!r}: {why}"
+        if not p.has_column and not len(p.grid):  # some of the library's have a search of their own
+            return f"parameter {p.name!r}: a {type(p).__name__} without a grid is never tried; give it values to try"
         if p.of and p.of not in names:
             return f"parameter {p.name!r}: of is {p.of!r}; one of {', '.join(names)} is expected"
-    if all(p.kind in FIXED for p in parameters):
-        return "parameters holds no size and no limit, so nothing of it could be found"
+    if all(not p.has_column for p in parameters):
+        return "parameters has no size and no switch, so it could not be found"
     if not (isinstance(effect.variants, tuple | list) and all(map(_texts, effect.variants))):
         return f"variants is {effect.variants!r}; a tuple of tuples of names is expected"
     if odd := [n for variant in effect.variants for n in variant if n not in names]:
@@ -119,33 +115,11 @@ def _texts(names: Any) -> bool:
     return isinstance(names, tuple | list) and all(isinstance(n, str) for n in names)
 
 
-def _malformed_parameter(p: Parameter) -> str | None:
-    """Why a parameter could never be fitted or tried, in one phrase; None where it can."""
-    if not isinstance(p.grid, tuple | list | np.ndarray):
-        return f"grid is {p.grid!r}; a tuple of values is expected"
-    numbers = (p.null, p.scale, p.lower, p.upper, p.least, *p.grid)
-    if not all(isinstance(x, Real) and not math.isnan(x) for x in numbers):
-        return "null, scale, lower, upper, least and the values of grid are numbers"
-    if p.kind not in KINDS:
-        return f"kind is {p.kind!r}; one of {', '.join(KINDS)} is expected"
-    if p.by not in ("", *GROUPS):
-        return f"by is {p.by!r}; empty or one of {', '.join(GROUPS)} is expected"
-    if p.scale == 0 or math.isinf(p.scale):
-        return f"scale is {p.scale:g}; a typical size other than 0 is expected"
-    if not p.lower < p.upper:
-        return f"lower is {p.lower:g} and upper {p.upper:g}; a range is expected"
-    if p.kind == "size" and not (math.isfinite(p.null) and p.lower <= p.null <= p.upper):
-        return f"null is {p.null:g}, no number of its range {p.lower:g} to {p.upper:g}"
-    if p.kind != "size" and not len(p.grid) and p.name != "at_trip":  # whose values are the log's trips
-        return f"a {p.kind} without a grid is never tried; give it values to try"
-    return None
-
-
 def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None, *candidates: str) -> None:
-    """Work out the columns of a user's own effects on every row of the log, before anything is fitted: of those that
+    """Compute the columns of a user's own effects on every row of the log, before anything is fitted: of those that
     are `candidates` or that the vehicle has.
 
-    Raises `InputError` that names the class, for one that fails there, does not give a number in every row, or changes
+    Raises `InputError` that names the class, for one that fails there, is not finite in every row, or changes
     the prediction while all of its sizes are null.
     """
     own = [c for k, c in known.items() if k not in LIBRARY and (k in candidates or problem.vehicle.has(k))]
@@ -169,13 +143,13 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
             first = int(np.argmax(bad))
             trip, at = problem.log.trip_names[problem.log.trip[first]], problem.segments.time_s[first]
             raise InputError(
-                f"{where}: it or its slope is no finite number in {bad.sum()} of {rows.rows} rows, the first in trip "
-                f"{trip} at {at:g} s; a number is expected in every row, also of a branch that is not taken"
+                f"{where}: it or its derivative is not finite in {bad.sum()} of {rows.rows} rows, the first in trip "
+                f"{trip} at {at:g} s; it must be finite in every row, in every branch"
             )
         if not np.allclose(null, plain, rtol=0.0, atol=ROUNDING * np.finfo(plain.dtype).eps * np.max(np.abs(plain))):
             raise InputError(
                 f"{where}: changes the prediction by up to {np.max(np.abs(null - plain)):.3g} {problem.unit} while its "
-                "sizes are null; what it adds is expected to be 0 there"
+                "sizes are null; it must add 0 there"
             )
 
 
@@ -183,14 +157,14 @@ def _idle(effect: type[Effect], facts: Facts) -> Effect:
     """With its sizes null and each shape at a value that is tried."""
     null = as_seen(at_null(effect, gears=facts.gears), facts)
     values = {p.name: getattr(null, p.name) for p in effect.parameters}
-    tried = {p.name: np.asarray(float(p.grid[0])) for p in effect.parameters if p.kind in FIXED and len(p.grid)}
+    tried = {p.name: np.asarray(float(p.grid[0])) for p in effect.parameters if not p.has_column and len(p.grid)}
     return effect(**(values | tried))
 
 
 def chosen_effects(
     known: Mapping[str, type[Effect]], only: Sequence[str] | None, exclude: Sequence[str] | None
 ) -> dict[str, type[Effect]]:
-    """Those of the known effects that are tried. Raises `InputError` for a name that none has, or if none is left."""
+    """The effects that are tried. Raises `InputError` for an unknown name, or if none is left."""
     for name in (*(only or ()), *(exclude or ())):
         if name not in known:
             near = difflib.get_close_matches(name, list(known), 1)
@@ -208,7 +182,7 @@ def digest(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Opening:
-    """What `diagnose` and `calibrate` start from: the log in its trips, the vehicle, what decides the result."""
+    """What `diagnose` and `calibrate` start from: the log in its trips, the vehicle, the configuration."""
 
     sheet: Sheet
     problem: Problem
@@ -217,7 +191,7 @@ class Opening:
 
     @property
     def read(self) -> str:
-        """What was read, for the first line of progress: said once nothing more can be refused."""
+        """What was read, for the first line of progress, when the input is accepted."""
         return f"read {len(self.problem.log)} rows of {len(self.problem.log.trip_names)} trips"
 
 
@@ -265,7 +239,7 @@ def opened(
 
 
 def command_line(verb: str, run: Run) -> str:
-    """The command that makes this run again: the split as the user gave it, and options off their defaults."""
+    """The command that makes this run again: the split as the user gave it, and options that are not defaults."""
     c = run.config
     parts = ["hdev", verb, *c["logs"], "--vehicle", c["vehicle"], "--target", c["target"]]
     lists = {"train-trips": "asked_train", "test-trips": "asked_test", "only": "only", "exclude": "exclude"}

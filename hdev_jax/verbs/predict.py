@@ -1,4 +1,4 @@
-"""The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips that no fit has seen."""
+"""The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips outside the fit."""
 
 import json
 from collections.abc import Sequence
@@ -13,24 +13,25 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, left_out, padded, spread_of, sums_of
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.problem import PER_KWH, UNITS, Problem, Split, prepare
+from hdev_jax.problem import Problem, Split, derivable, prepare
 from hdev_jax.rundir import Run, atomic_file
+from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.opening import Paths, digest, known_effects, tried
 
-__all__ = ["predict", "told_together", "write_predictive"]
+__all__ = ["predict", "strongly_correlated", "write_predictive"]
 
 BESIDE = "predictive.json"  # what a fitted sheet has beside it
 Noise = Literal["normal", "student_t"]
-TOGETHER = 0.95  # correlation of two coefficients, from which on neither is read by itself
-LIKE = 1.5  # times as long: rows of another log whose noise is still like
+STRONG = 0.95  # correlation of two coefficients, above which neither is read by itself
+LIKE = 1.5  # times as long: rows of another log with about the same noise
 
 
 def write_predictive(
     run: Run, sheet: Path, problem: Problem, split: Split, fit: Calibration, noise: Noise
 ) -> list[str]:
-    """Write beside a fitted sheet what intervals need: the coefficients' covariance and the spread of what is left.
+    """Write beside a fitted sheet what intervals need: the coefficients' covariance and the noise.
 
-    **Returns:** what a user should know of them.
+    **Returns:** notes for the user.
     """
     train = problem.rows(split.train)
     rows = padded(problem.segments.take(train), problem.measured[train])
@@ -43,20 +44,22 @@ def write_predictive(
         "spread": asdict(spread),
     }
     run.path(BESIDE).write_text(json.dumps(known, indent=1, allow_nan=False) + "\n")
-    notes = told_together([c.name for c in fit.table.free], np.asarray(fit.covariance))
+    notes = strongly_correlated([c.name for c in fit.table.free], np.asarray(fit.covariance))
     if clusters.kind == "block":
-        notes.append("one training trip: how trips differ from each other is not in the intervals of hdev predict")
+        notes.append(
+            "there is one training trip: the intervals of hdev predict do not include differences between trips"
+        )
     return notes
 
 
-def told_together(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[str]:
-    """A sentence for each pair of coefficients that a log knows together far better than one by one."""
+def strongly_correlated(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[str]:
+    """A sentence for each pair of coefficients whose estimates are strongly correlated."""
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(sd, sd)
-    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > TOGETHER, 1)), strict=True)
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > STRONG, 1)), strict=True)
     return [
-        f"{names[i]} and {names[k]} are known together far better than one by one (correlation "
-        f"{correlation[i, k]:+.2f}): read neither by itself"
+        f"{names[i]} and {names[k]} are strongly correlated ({correlation[i, k]:+.2f}): the log determines them "
+        "together, not each by itself"
         for i, k in pairs
     ]
 
@@ -73,10 +76,10 @@ def predict(
 ) -> str:
     """One line for each row of the logs: `trip_id, time_s, predicted, lower, upper, level` in the target's unit.
 
-    The interval holds what the coefficients leave open (their covariance from the `predictive.json` beside a fitted
-    sheet, else their sds in the sheet) and the noise of a row: as seen where that fit left trips out, else as in this
-    log where it measures the target. A trip's total has the interval that errors of whole trips ask for, by a Student t
-    of as many degrees of freedom as there were trips; of a single trip, its autocorrelation. **Returns:** the total of
+    The interval has the uncertainty of the coefficients (covariance from the `predictive.json` beside a fitted sheet,
+    else their sds in the sheet) and the noise of a row: by cross-validation over trips of that fit, else from this log
+    where it measures the target. The interval of a trip's total is from errors of whole trips, by a Student t with as
+    many degrees of freedom as there were trips; for a single trip, from its autocorrelation. **Returns:** the total of
     each trip with its interval, as text. Raises `InputError`.
     """
     import pandas as pd
@@ -90,7 +93,7 @@ def predict(
     beside = _beside(Path(vehicle))
     measures = target in log.targets if target else bool(log.targets)
     name = target or (log.default_target if measures else beside.get("target", "energy_wh"))
-    measures = measures or (name == "traction_force_n" and log.segments.has("motor_torque_nm"))
+    measures = measures or derivable(log, name)
     problem, reach = prepare(log, sheet, name, need_measured=measures), float(stats.norm.ppf(0.5 + level / 2))
     tried(problem, library, effects)
     predicted = problem.predict(problem.vehicle)
@@ -122,32 +125,32 @@ def predict(
 
 
 def _whence(level: float, spread: Spread | None, known: bool) -> str:
-    """What the intervals are made of."""
+    """How the intervals are made."""
     what = f"trip totals, {100 * level:g} % intervals"
     if spread is None:
-        return f"{what} of the coefficients alone: the noise of the rows is not known"
-    whose = "the fit's training trips left out" if known else "this log's own errors"
+        return f"{what} from the coefficients alone: the noise of the rows is not known"
+    whose = "cross-validation over the fit's training trips" if known else "this log's own errors"
     return f"{what} from {whose}, Student t of {spread.total_freedom:.3g} degrees of freedom"
 
 
 def _warnings(problem: Problem, spread: Spread | None, beside: dict[str, Any], known: dict[str, Any]) -> list[str]:
-    """Where the intervals are not of this sheet, this target or rows like these."""
+    """Notes where the intervals are for another sheet, another target or other rows."""
     out = []
     if beside and not known and not beside.get("stale"):
-        out.append(f"note: {BESIDE} beside the sheet is of {beside['target']} and is not used")
+        out.append(f"note: {BESIDE} beside the sheet is for the target {beside['target']} and is not used")
     if beside.get("stale"):
-        out.append(f"note: the sheet was changed after {BESIDE} was written, which is not used")
+        out.append(f"note: {BESIDE} is not used: the sheet was changed after it was written")
     row_s = float(np.median(np.asarray(problem.segments.duration_s)))
     if spread is not None and max(row_s, spread.row_s) > LIKE * min(row_s, spread.row_s):
         out.append(
-            f"note: rows of this log last {row_s:.3g} s, those that the noise is known of {spread.row_s:.3g} s: "
-            "intervals are not of such rows"
+            f"note: rows of this log last {row_s:.3g} s, but the noise is from rows of {spread.row_s:.3g} s: the "
+            "intervals may be wrong"
         )
     return out
 
 
 def _beside(sheet: Path) -> dict[str, Any]:
-    """What lies beside a fitted sheet; of one that was changed since, no more than that (`stale`).
+    """The file beside a fitted sheet; `stale` alone where the sheet was changed since.
 
     Raises `InputError` where the file is there and cannot be used.
     """
@@ -163,7 +166,7 @@ def _beside(sheet: Path) -> dict[str, Any]:
         names, matrix = found["covariance"]["names"], np.asarray(found["covariance"]["matrix"], dtype=float)
         spread = {k: float(v) for k, v in found["spread"].items()}
         right = (
-            found["target"] in UNITS
+            found["target"] in TARGETS
             and matrix.size == len(names) ** 2
             and np.all(np.isfinite(matrix))
             and {f.name for f in fields(Spread)} == set(spread)
@@ -180,7 +183,7 @@ def _beside(sheet: Path) -> dict[str, Any]:
 
 
 def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free free"]:
-    """A root of the coefficients' covariance, in the table's order; by their sds alone where no more is known."""
+    """A root of the coefficients' covariance, in the table's order; from their sds alone where there is no other."""
     free = problem.table.free
     names = known.get("covariance", {}).get("names", [])
     covariance = np.diag([(c.sd or 0.0) ** 2 for c in free]).reshape(len(free), len(free))
@@ -195,7 +198,7 @@ def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free fr
 def _spread(
     problem: Problem, predicted: np.ndarray, x: np.ndarray, known: dict[str, Any], measures: bool
 ) -> Spread | None:
-    """Of the fit that made the sheet; else of this log itself; None where it measures nothing."""
+    """Noise of the fit that made the sheet, else of this log; None where it does not measure the target."""
     if known:
         return Spread(**known["spread"])
     if not measures:
@@ -212,13 +215,14 @@ def _totals(problem: Problem, predicted: np.ndarray, x: np.ndarray, spread: Spre
     from scipy import stats
 
     weight = problem.weight()
-    unit = "kWh" if problem.target in PER_KWH else problem.unit
+    per_kwh = TARGETS[problem.target].per_kwh
+    unit = problem.unit if per_kwh is None else "kWh"
     lines = []
     for i, trip in enumerate(problem.log.trip_names):
         rows = problem.rows([i])
-        per = PER_KWH.get(problem.target, float(np.sum(weight[rows])))
+        per = float(np.sum(weight[rows])) if per_kwh is None else per_kwh
         if not per > 0:
-            lines.append(f"{trip:40s} {'-':>10s} {unit}  stands all the time")
+            lines.append(f"{trip:40s} {'-':>10s} {unit}  never moves")
             continue
         total = float(np.sum((weight * predicted)[rows])) / per
         open_sd = float(np.linalg.norm(weight[rows] @ x[rows]))
