@@ -66,18 +66,18 @@ def measure(rows: int, seed: int) -> dict[str, float]:
 
     def run(rows: int):
         start = time.perf_counter()
-        view = look_through(lambda: pieces(rows), fit, list(LIBRARY.values()), problem.target)
-        return time.perf_counter() - start, view
+        scores = look_through(lambda: pieces(rows), fit, list(LIBRARY.values()), problem.target)
+        return time.perf_counter() - start, scores
 
     few = min(rows, 2 * len(base))
     first, again = run(few)[0], run(few)[0]
-    seconds, view = run(rows)
-    best = max(view.best.values(), key=lambda s: s.gain).candidate.id
+    seconds, scores = run(rows)
+    best = max(scores.best.values(), key=lambda s: s.gain).candidate.id
     return {
-        "rows": rows, "trips": view.ground.trips, "clusters": view.evidence.count, "compile_s": first - again,
+        "rows": rows, "trips": scores.baseline.trips, "clusters": scores.white.count, "compile_s": first - again,
         "run_s": seconds, "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9,
-        "effects": len({c.id for c in view.source.candidates}), "ways": len(view.source.candidates),
-        "columns": view.source.width, "best": best,
+        "effects": len({c.id for c in scores.source.candidates}), "ways": len(scores.source.candidates),
+        "columns": scores.source.width, "best": best,
     }  # fmt: skip
 
 

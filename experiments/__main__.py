@@ -23,11 +23,12 @@ def main(argv: list[str] | None = None) -> int:
 
     from experiments.runner.config import listed
     from experiments.runner.workers import ClusterError
-    from hdev_jax.compiling import compile_quickly
+    from hdev_jax.compiling import compile_quickly, keep_compiled
 
     if options.compile_quickly:
         compile_quickly()
     jax.config.update("jax_enable_x64", True)
+    keep_compiled()
     try:
         with progress.shown():
             configs = listed(options.config)

@@ -32,7 +32,7 @@ from hdev_jax.segments import Segments
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("coverage.py", "paper1_halves.py")
+SOURCES = ("../paper1/halves.py",)
 NEW = 4  # trips of a log that no fit has seen
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 
@@ -42,7 +42,7 @@ Noise = Literal["white", "ar1", "ar1_white", "trip_levels", "student_t", "trip_v
 class Config(Strict):
     """Logs of each noise and number of training trips; halves of drives; routes of the fleet's models."""
 
-    experiment: Literal["coverage"]
+    experiment: Literal["calibration.coverage"]
     artefact: str
     caption: str
     noises: list[Noise]

@@ -23,7 +23,7 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("linearity.py", "paper1_halves.py")
+SOURCES = ("../paper1/halves.py",)
 NEAR_ZERO = 0.1  # of the median segment's energy
 TABLE = ((0.0060, 0.0008), (5.6, 0.5))
 
@@ -31,7 +31,7 @@ TABLE = ((0.0060, 0.0008), (5.6, 0.5))
 class Config(Strict):
     """How far the truth is from the tables, in their sds, and how many logs of each."""
 
-    experiment: Literal["linearity"]
+    experiment: Literal["calibration.linearity"]
     artefact: str
     caption: str
     distances: list[float]

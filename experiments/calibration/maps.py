@@ -23,7 +23,7 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("maps.py",)
+SOURCES = ()
 EXACT = {"speed_noise_mps": 0.0, "grade_noise_rad": 0.0, "clock_skew_s": 0.0, "dropout_share": 0.0}
 MASS_KNOWN = {"payload_bias": 0.0, "payload_sd": 0.0}
 LogName = Literal["noise on the energy", "all instruments", "all instruments, the sheet's vehicle"]
@@ -37,7 +37,7 @@ LOGS: dict[LogName, dict[str, Any]] = {
 class Config(Strict):
     """Vehicles, the length of their logs, and what is asked of cells of so many rows."""
 
-    experiment: Literal["maps"]
+    experiment: Literal["calibration.maps"]
     artefact: str
     caption: str
     variants: list[str]

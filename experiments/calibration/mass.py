@@ -7,7 +7,6 @@ passengers takes no part in a held-out mission's masses: they are of its forces,
 """
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import equinox as eqx
@@ -15,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from experiments.paper1.halves import coefficient, paper_table
-from experiments.runner.config import Strict
+from experiments.runner.config import CONFIGS, Strict
 from experiments.runner.data import MissingDataError, data_folder, fingerprint
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import write_tables
@@ -26,8 +25,8 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("mass.py", "paper1_halves.py")
-ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "ztbus.toml"
+SOURCES = ("../paper1/halves.py",)
+ADAPTER = CONFIGS / "adapters" / "ztbus.toml"
 BRAKES_ON_PA = 2e4  # above this the force at the wheels is not the motor's alone
 SHORTEST_KM = 0.3  # a stretch between two stops
 
@@ -35,7 +34,7 @@ SHORTEST_KM = 0.3  # a stretch between two stops
 class Config(Strict):
     """The fleet's models and routes, and the buses' missions."""
 
-    experiment: Literal["mass"]
+    experiment: Literal["calibration.mass"]
     artefact: str
     caption: str
     models: list[str]
@@ -121,7 +120,7 @@ def _ztbus(task: dict[str, Any]) -> dict[str, Any]:
     from hdev_jax.physics import Driveline, Machine, Vehicle
     from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 
-    table = paper_table((0.0080, 0.0016), (6.0, 1.0))  # as in paper1_table1
+    table = paper_table((0.0080, 0.0016), (6.0, 1.0))  # as in paper1/table1.py
     car = Vehicle((Inertia(np.asarray(1.0)), Grade(), Rolling(np.asarray(0.008)), Aero(np.asarray(6.0))),
                   mass_kg=np.asarray(2e4), driveline=Driveline(np.asarray(1.0)),
                   machine=Machine(np.asarray(1.0), np.asarray(1.0)))  # fmt: skip

@@ -39,7 +39,7 @@ from hdev_jax.segments import Segments
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("ranks.py", "paper1_halves.py")
+SOURCES = ("../paper1/halves.py",)
 C_RR, CDA, EFFICIENCY = (0.0060, 0.0008), (5.6, 0.5), (0.91, 0.02)
 NOISE_WH = 20.0  # believed of a row: about what the two coefficients' sds come to
 SHORT = {"road.c_rr": "c_rr", "road.cda_m2": "C_d·A", "driveline.efficiency": "efficiency"}
@@ -53,7 +53,7 @@ World = dict[str, float]
 class Config(Strict):
     """How many worlds of each posterior, in blocks; rows of a vehicle, and vehicles of a fleet."""
 
-    experiment: Literal["ranks"]
+    experiment: Literal["calibration.ranks"]
     artefact: str
     caption: str
     worlds: dict[Kind, int]

@@ -1,4 +1,4 @@
-"""What the loop does on the measured logs: `python experiments/measured/logs.py [PART …] --work DIR`, from a checkout.
+"""What the loop does on the measured logs: `python -m experiments.measured.logs [PART …] --work DIR`, from a checkout.
 
 Parts: niro (trained on each trip in turn), road (the Niro's force balance), ztbus (three folds of missions), withheld
 (a known channel of ZTBus taken out of the log). Each run is one `hdev diagnose`; a run that is there already is read,
@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 
 import hdev_jax
+from experiments.measured import page as pages
 from experiments.measured.withheld import WITHHELD, compare_logs, write_adapter
 from experiments.runner.store import sources_of
 from hdev_jax.verbs.opening import digest
-from hdev_jax.verbs.predict import told_together
+from hdev_jax.verbs.predict import strongly_correlated
 
 __all__ = ["Job", "jobs", "kept", "main"]
 
@@ -35,7 +36,10 @@ TRIPS = ("1", "2", "3", "4")
 FOLDS = (1, 2, 3)
 # Which channel is withheld in which fold. The warmth of the passengers is small: the fold decides whether it is found.
 HELD = (("temperature", 1), ("passengers", 1), ("passengers", 3), ("steering", 1))
-CODE = tuple(Path(hdev_jax.__file__).parent / p for p in ("diagnosis/diagnose.py", "diagnosis/stages.py", "opening.py"))
+CODE = tuple(
+    Path(hdev_jax.__file__).parent / p
+    for p in ("diagnosis/diagnose.py", "diagnosis/result/stages.py", "verbs/opening.py")
+)
 ZTBUS = Path("configs/adapters/ztbus.toml")
 
 
@@ -98,10 +102,10 @@ def main(argv: list[str] | None = None) -> int:
         print(f"not on the page, for it was not run: {', '.join(absent)}", file=sys.stderr)
     warm = _temperatures(everything["ztbus"][0], options.work)
     rest = _json(options.work / "same_rest.json").get("rest", {})
-    page, figures = real_page.page(results, warm=warm, rest=rest)
+    page, figures = pages.page(results, warm=warm, rest=rest)
     print(page)
     if options.write:
-        real_page.write(options.docs, page, figures)
+        pages.write(options.docs, page, figures)
     return 0
 
 
@@ -150,7 +154,7 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     covariance = _json(out / "predictive.json").get("covariance")
     if covariance is None:
         raise SystemExit(f"{out} lacks predictive.json: remove the folder, and the run is made again")
-    together = told_together(covariance["names"], np.array(covariance["matrix"]))
+    together = strongly_correlated(covariance["names"], np.array(covariance["matrix"]))
     return {**result, "cost": cost, "ran": ran, "together": together}
 
 

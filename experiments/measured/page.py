@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import real_figures as figures
 
+from experiments.measured import figures
 from experiments.measured.tables import (
     Runs,
     by_chance,
@@ -26,7 +26,7 @@ from experiments.measured.tables import (
 )
 from experiments.measured.told import changes, fold_and_what, new_names, withheld
 from experiments.measured.withheld import WITHHELD
-from hdev_jax.diagnosis.competition.select import RESAMPLES
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.report import names
 
 __all__ = ["page", "write"]
@@ -39,7 +39,7 @@ HEAD = """# Measured logs
 What the loop finds on two public logs, how far that depends on the trips it was trained on, what stays unexplained, and
 what it concludes when a channel that the log has is kept from it. Made by
 
-    python experiments/measured/logs.py --work DIR --write
+    python -m experiments.measured.logs --work DIR --write
 
 from the diagnosis.json of each run. Everything here is measured; nothing is synthetic. Every error is on trips that no
 choice has seen, and predictions are free of measured power (no feedback). Both logs are public, and effects of the
@@ -148,7 +148,7 @@ def _reading(runs: Runs) -> list[str]:
     kind = {"trip": "trips"}.get(next(iter(runs.values()))["clusters"]["kind"], "stretches of at least 5 minutes")
     clusters = f"{names.verbose_join(sorted(count, key=int), 'or')} {kind}"
     chance = names.verbose_join([f"{by_chance(k):.2f} for {k}" for k in range(2, max(2, len(runs)) + 1)])
-    return READING.format(draws=RESAMPLES, clusters=clusters, chance=chance).splitlines()
+    return READING.format(draws=SETTINGS.resamples, clusters=clusters, chance=chance).splitlines()
 
 
 def _agreement(runs: Runs, caution: str) -> list[str]:

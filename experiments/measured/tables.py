@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.result.summary import SUSPICIOUS
+from hdev_jax.diagnosis.gates.rejection import Kind
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.physics import LIBRARY
 from hdev_jax.report import names, words
 
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 Runs = Mapping[str, Mapping[str, Any]]  # diagnosis.json by the name of its training set
-IMPOSSIBLE = ("its best size has the wrong sign", "absorbed", "does nothing")
+IMPOSSIBLE = {Kind.IMPLAUSIBLE, Kind.ABSORBED, Kind.NO_EFFECT}
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def nearest(result: Mapping[str, Any]) -> str:
     found = set(found_ids(result))
     able = [
         c for c in result["candidates"]
-        if c["id"] not in found and (c["score"] or 0.0) > SUSPICIOUS and not c["why_not"].startswith(IMPOSSIBLE)
+        if c["id"] not in found and (c["score"] or 0.0) > SETTINGS.suspicious and c["kind"] not in IMPOSSIBLE
     ]  # fmt: skip
     best = max(able, key=lambda c: c["score"], default=None)
     return "–" if best is None else f"`{best['id']}` (score {words.number(best['score'])}): {best['why_not']}"

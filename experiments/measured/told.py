@@ -6,8 +6,7 @@ Every sentence follows from numbers and names in the two results; where they are
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import real_figures as figures
-
+from experiments.measured import figures
 from experiments.measured.tables import Runs, found_ids, named, nearest, signature, size_rows, table
 from experiments.measured.withheld import WITHHELD
 from hdev_jax.report import names, words

@@ -21,13 +21,13 @@ from hdev_jax.learn.gears.gears import EVERY, FEATURES, MOST_GEARS, PLACE, absol
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("paper1_fig5.py", "paper1_gears.py", "paper1_gear_bound.py", "paper1_gear_energy.py")
+SOURCES = ("gears.py", "gear_bound.py", "gear_energy.py")
 
 
 class Config(Strict):
     """The fleet, what is held out, the budget of the searches, and the paper's numbers."""
 
-    experiment: Literal["paper1_fig5"]
+    experiment: Literal["paper1.fig5"]
     artefact: str
     caption: str
     seed: int = Field(1, ge=0)

@@ -12,9 +12,9 @@ import numpy as np
 from hdev_jax.inference import Coefficient, LinearFit, ParameterTable, Rows, clusters_of, linear_fit, padded, predict
 from hdev_jax.physics import Vehicle, at_null
 from hdev_jax.physics.sensors import MassScale
-from hdev_jax.physics.vehicle import Target
 from hdev_jax.problem import metrics, sum_weight
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
 
 __all__ = ["coefficient", "errors", "fitted", "halves", "laps", "ours", "paper_table"]
 
@@ -62,8 +62,8 @@ def halves(segments: Segments) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fitted(
-    vehicle: Vehicle, table: ParameterTable, segments: Segments, measured: np.ndarray, target: Target, *, paper: bool,
-    size: int | None = None,
+    vehicle: Vehicle, table: ParameterTable, segments: Segments, measured: np.ndarray, target: TargetName, *,
+    paper: bool, size: int | None = None,
 ) -> LinearFit:  # fmt: skip
     """The closed form on these rows: the paper's (independent normal rows), or ours. `size`: as in `padded`."""
     rows = padded(segments, measured, size)
@@ -73,7 +73,9 @@ def fitted(
     )
 
 
-def errors(vehicle: Vehicle, segments: Segments, measured: np.ndarray, target: Target) -> tuple[float, float | None]:
+def errors(
+    vehicle: Vehicle, segments: Segments, measured: np.ndarray, target: TargetName
+) -> tuple[float, float | None]:
     """`(rmse, pe)`: by row in the target's unit, and of the total in per cent; None where that is near 0."""
     rows = padded(segments, measured)
     predicted = np.asarray(predict(vehicle, rows.segments, target))[: rows.rows]

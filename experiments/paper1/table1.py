@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from experiments.paper1.halves import errors, fitted, halves, laps, ours, paper_table
-from experiments.runner.config import Strict
+from experiments.runner.config import CONFIGS, Strict
 from experiments.runner.data import MissingDataError, data_folder, fingerprint
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import write_tables
@@ -22,15 +22,14 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("paper1_table1.py", "paper1_halves.py")
+SOURCES = ("halves.py",)
 WAYS = ("tabular", "bayesian", "ours")
-SHEETS = Path(__file__).parents[1] / "configs"
 
 
 class Config(Strict):
     """The models, how many tracks and laps, and the measured missions."""
 
-    experiment: Literal["paper1_table1"]
+    experiment: Literal["paper1.table1"]
     artefact: str
     caption: str
     models: list[str] = Field(default_factory=lambda: ["A", "B", "C", "D"])
@@ -150,7 +149,7 @@ def _ztbus(task: dict[str, Any]) -> dict[str, Any]:
     from hdev_jax.physics import Driveline, Machine, Vehicle
     from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 
-    log = read_log([data_folder("ztbus") / task["file"]], SHEETS / "adapters" / "ztbus.toml")
+    log = read_log([data_folder("ztbus") / task["file"]], CONFIGS / "adapters" / "ztbus.toml")
     brake = log.segments.channels.get("brake_pressure_pa")
     s = eqx.tree_at(lambda q: q.channels, log.segments,
                     {k: x for k, x in log.segments.channels.items() if k in ("grade_rad", "mass_kg")})  # fmt: skip
@@ -169,9 +168,9 @@ def _kia_trip(task: dict[str, Any]) -> dict[str, Any]:
     from hdev_jax.logs import read_log
     from hdev_jax.problem import prepare
 
-    log = read_log([data_folder("kia_niro") / task["file"]], SHEETS / "adapters" / "kia_niro.toml")
+    log = read_log([data_folder("kia_niro") / task["file"]], CONFIGS / "adapters" / "kia_niro.toml")
     log = dataclasses.replace(log, segments=log.segments.without("accelerator_pct"))
-    p = prepare(log, read_sheet(SHEETS / "vehicles" / "kia_niro_road.toml"), "traction_force_n")
+    p = prepare(log, read_sheet(CONFIGS / "vehicles" / "kia_niro_road.toml"), "traction_force_n")
     s = eqx.tree_at(lambda q: q.channels, p.segments, {})
     s, y = _driving(s, p.measured, None, task["rows"])
     return _measured(p.vehicle, p.table, s, y)

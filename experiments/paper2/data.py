@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
+from experiments.runner.config import CONFIGS
 from experiments.runner.data import ORIGIN, MissingDataError, data_folder, fingerprint
 from hdev_jax.errors import InputError
 from hdev_jax.learn import Trip, trips_of
@@ -17,7 +18,7 @@ TripName = Literal["1", "2", "3", "4"]
 MPH = 0.44704  # m/s: the international mile (1959)
 LEAST_ROWS = 20  # of a trip that a model is fitted on
 TRIPS: tuple[TripName, ...] = ("1", "2", "3", "4")
-ADAPTER = Path(__file__).parents[1] / "configs" / "adapters" / "kia_niro.toml"
+ADAPTER = CONFIGS / "adapters" / "kia_niro.toml"
 
 
 def _files(only: str) -> list[Path]:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+import hdev_jax
+from experiments.runner.config import CONFIGS
 from experiments.runner.data import fingerprint
 from hdev_jax.diagnosis.diagnose import diagnose
 from hdev_jax.inference import padded, predict
@@ -19,9 +21,9 @@ from hdev_jax.problem import Split, prepare
 
 __all__ = ["Diagnosed", "diagnosis_key"]
 
-SHEET = Path(__file__).parents[1] / "configs" / "vehicles" / "kia_niro.toml"
+SHEET = CONFIGS / "vehicles" / "kia_niro.toml"
 TARGET = "battery_power_kw"
-LOOP = ("diagnosis", "inference", "physics")  # what the loop is made of
+LOOP = ("diagnosis", "problem", "inference", "physics")  # what the loop is made of
 
 
 def diagnosis_key(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -31,7 +33,7 @@ def diagnosis_key(settings: Mapping[str, Any]) -> dict[str, str]:
 
 @cache
 def _fingerprint() -> str:
-    package = Path(__file__).parents[1] / "hdev_jax"
+    package = Path(hdev_jax.__file__).parent
     sources = sorted(p for part in LOOP for p in (package / part).rglob("*.py"))
     return fingerprint([SHEET, Path(__file__), *sources])
 

@@ -18,13 +18,13 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("paper2_figures.py", "paper2_models.py", "paper2_data.py", "paper2_fits.py")
+SOURCES = ("models.py", "data.py", "fits.py")
 
 
 class Config(Strict):
     """One model's prediction of trip 1: the whole trip, or the seconds `window`."""
 
-    experiment: Literal["paper2_figures"]
+    experiment: Literal["paper2.figures"]
     artefact: str
     caption: str
     model: str = "NARXP"

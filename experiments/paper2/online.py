@@ -23,13 +23,13 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("paper2_online.py", "paper2_data.py")
+SOURCES = ("data.py",)
 
 
 class Config(Strict):
     """The model, the memories to choose from, and the ageing that is planted."""
 
-    experiment: Literal["paper2_online"]
+    experiment: Literal["paper2.online"]
     artefact: str
     caption: str
     outputs: int = Field(3, ge=0)

@@ -19,13 +19,13 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "alone", "collect", "run", "tasks"]
 
-SOURCES = ("paper2_pedal.py", "paper2_models.py", "paper2_data.py", "paper2_fits.py")
+SOURCES = ("models.py", "data.py", "fits.py")
 
 
 class Config(Strict):
     """One model, with the pedal among its inputs and without."""
 
-    experiment: Literal["paper2_pedal"]
+    experiment: Literal["paper2.pedal"]
     artefact: str
     caption: str
     model: str = "NARXP"

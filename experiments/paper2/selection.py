@@ -1,7 +1,7 @@
 """Choices of the NARX and of recurrent networks on trip 1 alone: by blocks of time and, of a NARX, the data's edge.
 
 The number that decides is the MSE of rows left out, one step ahead, of all that is left out, as a mean over starts;
-`paper2_choice` says which is best by it.
+`choice.py` says which is best by it.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from hdev_jax.learn.narx.selection import Score, by_blocks, validated
 
 __all__ = ["SOURCES", "Config", "Group", "collect", "run", "tasks"]
 
-SOURCES = ("paper2_selection.py", "paper2_models.py", "paper2_data.py", "paper2_fits.py")
+SOURCES = ("models.py", "data.py", "fits.py")
 
 
 class Group(Strict):
@@ -39,7 +39,7 @@ class Group(Strict):
 class Config(Strict):
     """Models of the tables, and what is tried of them."""
 
-    experiment: Literal["paper2_selection"]
+    experiment: Literal["paper2.selection"]
     artefact: str
     caption: str
     models: dict[str, Settings]

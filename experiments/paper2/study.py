@@ -18,13 +18,13 @@ from experiments.runner.config import Strict
 
 __all__ = ["SOURCES", "Config", "alone", "collect", "run", "tasks"]
 
-SOURCES = ("paper2.py", "paper2_models.py", "paper2_data.py", "paper2_fits.py")
+SOURCES = ("models.py", "data.py", "fits.py")
 
 
 class Config(Strict):
     """One table: its models, and the paper's numbers for them (keys as in `metrics.json`)."""
 
-    experiment: Literal["paper2"]
+    experiment: Literal["paper2.study"]
     artefact: str
     caption: str
     # what the table compares: keys of the metrics, the first decides which is better

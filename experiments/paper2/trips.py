@@ -15,14 +15,14 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ("paper2_trips.py", "paper2_data.py")
+SOURCES = ("data.py",)
 MILE_M = 1609.344  # the international mile (1959)
 
 
 class Config(Strict):
     """`table`: statistics by trip beside the paper's; `figure`: "speeds" (figure 4) or "signals" of `trip` (5-8)."""
 
-    experiment: Literal["paper2_trips"]
+    experiment: Literal["paper2.trips"]
     artefact: str
     caption: str
     figure: Literal["", "speeds", "signals"] = ""

@@ -5,16 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.runner.config import CONFIGS
 from experiments.runner.data import ORIGIN, MissingDataError, data_folder
-from hdev_jax.logs import TARGETS, by_distance, read_log
+from hdev_jax.logs import by_distance, read_log
 from hdev_jax.segments import Segments
+from hdev_jax.targets import TARGETS
 
 __all__ = ["BUSES", "SHEET", "Mission", "bus_files", "bus_sources", "buses", "read_mission"]
 
 BUSES = ("B183", "B208")
-_CONFIGS = Path(__file__).parents[1] / "configs"
-ADAPTER = _CONFIGS / "adapters" / "ztbus.toml"
-SHEET = _CONFIGS / "vehicles" / "ztbus_road.toml"
+ADAPTER = CONFIGS / "adapters" / "ztbus.toml"
+SHEET = CONFIGS / "vehicles" / "ztbus_road.toml"
 
 
 @dataclass(frozen=True)

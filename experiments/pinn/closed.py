@@ -28,7 +28,7 @@ from hdev_jax.inference import (
 )
 from hdev_jax.learn.pinn.model import Sized
 from hdev_jax.learn.pinn.rows import row_wise
-from hdev_jax.physics import LIBRARY, Effect, Parameter, Vehicle, at_null, most_group
+from hdev_jax.physics import LIBRARY, Effect, Parameter, Size, Switch, Vehicle, at_null, most_group
 from hdev_jax.segments import Segments
 
 __all__ = ["Closed", "closed", "kernel", "listed", "opened", "said", "sized", "trainable"]
@@ -40,8 +40,8 @@ _LEAST_GAIN = 10.0  # variances of the noise: what a threshold has to take off t
 
 def trainable(effects: Iterable[str]) -> tuple[str, ...]:
     """Those whose sizes a network may train: they have some, no threshold, and act within a row."""
-    kinds = {e: {p.kind for p in LIBRARY[e].parameters} for e in effects}
-    return tuple(e for e, k in kinds.items() if "size" in k and "limit" not in k and row_wise(LIBRARY[e]))
+    kinds = {e: {type(p) for p in LIBRARY[e].parameters} for e in effects}
+    return tuple(e for e, k in kinds.items() if Size in k and Switch not in k and row_wise(LIBRARY[e]))
 
 
 def sized(effects: Mapping[str, Mapping[str, float]]) -> tuple[Sized, ...]:
@@ -50,7 +50,7 @@ def sized(effects: Mapping[str, Mapping[str, float]]) -> tuple[Sized, ...]:
     for id, given in effects.items():
         kind = LIBRARY[id]
         groups = {"": 0, "road_surface": 4, "gear": 13}
-        sizes = tuple((p.name, groups[p.by]) for p in kind.parameters if p.kind == "size" and p.name not in given)
+        sizes = tuple((p.name, groups[p.by]) for p in kind.parameters if isinstance(p, Size) and p.name not in given)
         fixed = tuple((p.name, float(given.get(p.name, p.null))) for p in kind.parameters
                       if p.name not in dict(sizes))  # fmt: skip
         out.append(Sized(kind, sizes, fixed))
@@ -111,7 +111,7 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]], *, rows: int =
         _Search(id, p, row_s)
         for id, given in effects.items()
         for p in LIBRARY[id].parameters
-        if p.kind == "limit" and p.name not in given
+        if isinstance(p, Switch) and p.name not in given
     ]
     limits = {f"effects.{s.id}.{s.p.name}": True for s in searches}
     loose = "scale" in opened(effects, "mass_scale") and segments.has("mass_kg")
@@ -145,7 +145,7 @@ def listed(m: Member, effects: Mapping[str, Mapping[str, float]]) -> tuple[Vehic
     for id, given in effects.items():
         e = _as_given(id, given, m)
         car = car.plus(e)
-        sizes = [p.name for p in e.parameters if p.kind == "size" and p.name not in given]
+        sizes = [p.name for p in e.parameters if isinstance(p, Size) and p.name not in given]
         by = tuple(p.by for p in e.parameters if p.by)
         groups = tuple(str(g) for g in range(1, most_group(m.segments, by) + 1))
         table = table.plus(*effect_coefficients(e, sizes, shapes=False, groups=groups))

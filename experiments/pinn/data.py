@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,10 +20,7 @@ from hdev_jax.learn.pinn.rows import Rows, concatenated, rows_of
 from hdev_jax.physics import LIBRARY, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
 
-if TYPE_CHECKING:
-    from experiments.pinn.known import Known
-
-__all__ = ["Data", "Member", "load", "weighed"]
+__all__ = ["Data", "Known", "Member", "load", "weighed"]
 
 # What no network and no learner is told: it would tell the force of the drive, and with it the energy.
 TELLS = ("requested_torque_nm", "brake_pressure_pa", "halt_brake", "door_open", "passengers", "gear_middle")
@@ -50,6 +47,19 @@ class Member:
         return np.flatnonzero(self.use == use)
 
 
+class Known(NamedTuple):
+    """What networks take over from the closed form: a `vehicle`, as declared but with its thresholds that act within a
+    row; the vehicle with all effects that do, as the fleet has them (`fitted`; None without effects), at whose force
+    efficiencies are read; by row what effects that act across rows add (`across_wh`), what the mass is off by
+    (`payload`, a share) and what one standard deviation of a mass that nobody found out adds (`loose_wh`)."""
+
+    vehicle: Vehicle
+    fitted: Vehicle | None
+    across_wh: np.ndarray
+    payload: np.ndarray
+    loose_wh: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)  # the same data is the same object: `load` keeps it
 class Data:
     """Vehicles, those that are trained on first; `trained` is how many these are."""
@@ -57,9 +67,7 @@ class Data:
     vehicles: tuple[Member, ...]
     trained: int
 
-    def rows(
-        self, features: Sequence[str], effects: Sequence[str], known: Sequence["Known"]
-    ) -> tuple[Rows, np.ndarray]:
+    def rows(self, features: Sequence[str], effects: Sequence[str], known: Sequence[Known]) -> tuple[Rows, np.ndarray]:
         """Rows of all vehicles as networks read them, and the use of each.
 
         Efficiencies are read at the force of a vehicle that is calibrated on its own training rows (`calibrated`), with

@@ -41,7 +41,7 @@ def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
         if any(p.name in _OF_TRIPS for p in kind.parameters):
             continue
         having = [f[id] for f in found if id in f]
-        shapes = [p.name for p in kind.parameters if p.kind not in ("size", "limit")]
+        shapes = [p.name for p in kind.parameters if not p.has_column]
         out[id] = {n: float(np.median([h[n] for h in having if n in h])) for n in shapes if any(n in h for h in having)}
     return out
 

@@ -2,32 +2,19 @@
 
 import json
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.paper1.halves import MASS_SD
 from experiments.pinn.closed import closed, opened, said, trainable
-from experiments.pinn.data import Data, Member, weighed
+from experiments.pinn.data import Data, Known, Member, weighed
 from experiments.pinn.pooled import fleet
 from hdev_jax.learn.pinn.rows import row_wise
 from hdev_jax.physics import LIBRARY, Parameter, Vehicle
 
-__all__ = ["Known", "known", "of_fleet"]
-
-
-class Known(NamedTuple):
-    """What networks take over from the closed form: a `vehicle`, as declared but with its thresholds that act within a
-    row; the vehicle with all effects that do, as the fleet has them (`fitted`; None without effects), at whose force
-    efficiencies are read; by row what effects that act across rows add (`across_wh`), what the mass is off by
-    (`payload`, a share) and what one standard deviation of a mass that nobody found out adds (`loose_wh`)."""
-
-    vehicle: Vehicle
-    fitted: Vehicle | None
-    across_wh: np.ndarray
-    payload: np.ndarray
-    loose_wh: np.ndarray
+__all__ = ["known", "of_fleet"]
 
 
 @cache

@@ -21,7 +21,7 @@ from experiments.pinn.models import bayesian, boosted, names_of
 from experiments.pinn.networks import trained
 from experiments.pinn.scores import scores
 from experiments.runner.config import Strict
-from experiments.runner.data import MissingDataError, fingerprint
+from experiments.runner.data import fingerprint
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn.fit import PAPER_WEIGHTS
 from hdev_jax.learn.pinn.model import Choices
@@ -31,8 +31,8 @@ from hdev_jax.rundir import Run
 __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = (
-    "pinn.py", "pinn_closed.py", "pinn_data.py", "pinn_diagnosed.py", "pinn_known.py", "pinn_models.py",
-    "pinn_networks.py", "pinn_pooled.py", "pinn_scores.py", "pinn_buses.py", "paper1_halves.py",
+    "closed.py", "data.py", "diagnosed.py", "known.py", "models.py", "networks.py", "pooled.py", "scores.py",
+    "buses.py", "../paper1/halves.py",
 )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ class Model(Strict, Choices):  # pyright: ignore[reportGeneralTypeIssues]
 class Config(Strict):
     """Data, split, what is compared, and grids over seeds, loss weights and the amount of data."""
 
-    experiment: Literal["pinn"]
+    experiment: Literal["pinn.study"]
     artefact: str
     caption: str
     data: Literal["fleet", "ztbus"] = "fleet"
@@ -88,7 +88,10 @@ class Config(Strict):
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
-    """By fold and share of the data: vehicles one by one, then models by seed and weights. Raises `InputError`."""
+    """By fold and share of the data: vehicles one by one, then models by seed and weights.
+
+    **Raises:** `InputError`; `MissingDataError` where the data is of buses and is not there.
+    """
     _checked(config)
     for fold in config.folds:
         for share in config.shares:
@@ -97,10 +100,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
                 "share": share, "warmer_than": config.warmer_than_c, "fold": fold, "variants": config.variants,
             }  # fmt: skip
             if config.data == "ztbus":
-                try:
-                    data["files"] = fingerprint(bus_sources(config.routes))
-                except MissingDataError:
-                    return
+                data["files"] = fingerprint(bus_sources(config.routes))
             for name, model in chosen(config).items():
                 yield from _of_model(config, data, name, model)
 

@@ -12,16 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import plan_of
-from hdev_jax.diagnosis.noise.model import Noise
+from hdev_jax.diagnosis.noise.noise import Noise
 from hdev_jax.diagnosis.scores.evidence import Evidence
-from hdev_jax.diagnosis.scores.look import Loop, scored
-from hdev_jax.diagnosis.scores.ranking import plausible
-from hdev_jax.diagnosis.scores.settle import settle
-from hdev_jax.diagnosis.scores.sums import distance_from_table, evidence_of
+from hdev_jax.diagnosis.scores.gls import generalised
+from hdev_jax.diagnosis.scores.passes import distance_from_table, evidence_of
+from hdev_jax.diagnosis.scores.scores import plausible, scored
+from hdev_jax.diagnosis.settings import SETTINGS
+from hdev_jax.diagnosis.training import Training
 from hdev_jax.fleet import SyntheticLog
 from hdev_jax.fleet.driving import GEAR_RATIOS
 from hdev_jax.inference import Calibration, ParameterTable, calibrate, cluster_rows, effect_coefficients, padded
-from hdev_jax.physics import LIBRARY, Grouped, Vehicle, at_null, most_group
+from hdev_jax.physics import LIBRARY, Grouped, Switch, Vehicle, at_null, most_group
 from hdev_jax.problem import Problem, Split
 
 __all__ = ["confusable", "fitted_with", "noise_rmse", "oracle_rmse"]
@@ -40,10 +41,10 @@ def oracle_rmse(synthetic: SyntheticLog, problem: Problem, split: Split) -> floa
     """The oracle's error on the test trips; the noise there, where the library does not hold what was planted."""
     if any(_in_library(k, synthetic, split) is None for k in synthetic.vehicle.effects):
         return noise_rmse(synthetic, problem, split)
-    fit, loop = fitted_with(list(synthetic.vehicle.effects), synthetic, problem, split)
-    settled, _ = settle(loop.ground(fit, loop.noise(fit)))
+    fit, training = fitted_with(list(synthetic.vehicle.effects), synthetic, problem, split)
+    known, _ = generalised(training.baseline(fit))
     test = problem.rows(split.test)
-    return float(np.sqrt(np.mean((problem.measured - problem.predict(settled.vehicle))[test] ** 2)))
+    return float(np.sqrt(np.mean((problem.measured - problem.predict(known.vehicle))[test] ** 2)))
 
 
 def confusable(planted: Sequence[str], synthetic: SyntheticLog, problem: Problem, split: Split) -> dict[str, list[str]]:
@@ -53,25 +54,25 @@ def confusable(planted: Sequence[str], synthetic: SyntheticLog, problem: Problem
     less log-likelihood than `TELLS` would pass a test that knows both, in too many of the noises that might have been.
     All that is planted beside it is known. Other effects come in the best of the ways that the loop tries, linearly
     about a fit without the planted one, while the planted one is refitted; for large effects that difference counts as
-    evidence, even between identical columns (`planted_scores.TWINS`).
+    evidence, even between identical columns (`scores.TWINS`).
     """
     if not planted or any(_in_library(k, synthetic, split) is None for k in planted):
         return {}
     clean = replace(problem, measured=synthetic.truth["noise_free"].to_numpy())
-    known, loop = fitted_with(planted, synthetic, problem, split)
-    noise = loop.noise(known)
-    right, loop = fitted_with(planted, synthetic, clean, split)
-    most = _likelihood(right, _as_noisy(evidence_of(loop.ground(right, noise)), noise))
+    known, training = fitted_with(planted, synthetic, problem, split)
+    noise = training.noise(known)
+    right, training = fitted_with(planted, synthetic, clean, split)
+    most = _likelihood(right, _as_noisy(evidence_of(training.baseline(right, noise)), noise))
     out = {}
     for id_ in planted:
-        fit, loop = fitted_with([k for k in planted if k != id_], synthetic, clean, split)
-        ground = loop.ground(fit, noise)
-        view = scored(ground, plan_of(fit.vehicle, tuple(LIBRARY.values()), loop.facts, loop.target))
-        evidence = _as_noisy(view.evidence, noise)
+        fit, training = fitted_with([k for k in planted if k != id_], synthetic, clean, split)
+        plan = plan_of(fit.vehicle, tuple(LIBRARY.values()), training.facts, training.target)
+        scores = scored(training.baseline(fit, noise), plan, SETTINGS)
+        evidence = _as_noisy(scores.white, noise)
         base, totals = _likelihood(fit, evidence), evidence.totals()
         out[id_] = sorted(
-            k for k, s in view.best.items()
-            if k != id_ and k not in view.absorbed_by and plausible(s)
+            k for k, s in scores.best.items()
+            if k != id_ and k not in scores.absorbed_by and plausible(s, SETTINGS)
             and most - base - evidence.gain(totals, s.candidate.columns)[0] < TELLS
         )  # fmt: skip
     return out
@@ -90,9 +91,9 @@ def _likelihood(fit: Calibration, evidence: Evidence) -> float:
 
 def fitted_with(
     ids: Sequence[str], synthetic: SyntheticLog, problem: Problem, split: Split
-) -> tuple[Calibration, Loop]:
+) -> tuple[Calibration, Training]:
     """The declared vehicle with these of the planted effects, at their true shapes, calibrated on the training trips;
-    and the loop over those trips, without candidates. Raises `KeyError` where the library does not hold one."""
+    and those trips, without candidates. Raises `KeyError` where the library does not hold one."""
     vehicle, table = problem.vehicle, problem.table
     for id_ in ids:
         vehicle, table = _with(id_, synthetic, split, vehicle, table)
@@ -100,7 +101,7 @@ def fitted_with(
     real = problem.segments.take(train)
     rows, clusters = padded(real, problem.measured[train]), cluster_rows(real)
     fit = calibrate(vehicle, table, rows, problem.target, clusters)
-    return fit, Loop(rows, problem.target, clusters, (), 0.05, np.random.default_rng(0), most_group(real))
+    return fit, Training(rows, problem.target, clusters, {}, most_group(real))
 
 
 def _with(
@@ -111,10 +112,10 @@ def _with(
         raise KeyError(id_)
     kind, null = LIBRARY[id_], at_null(LIBRARY[id_])
     leaves: dict[str, Any] = {p.name: getattr(null, p.name) for p in kind.parameters}
-    leaves |= {p.name: None for p in kind.parameters if p.kind == "limit" and p.name not in values}
+    leaves |= {p.name: None for p in kind.parameters if isinstance(p, Switch) and p.name not in values}
     leaves |= {k: v if isinstance(v, Grouped) else np.asarray(float(v)) for k, v in values.items()}
     effect = kind(**leaves)
-    sized = [p.name for p in kind.parameters if p.kind in ("size", "limit") and values.get(p.name)]
+    sized = [p.name for p in kind.parameters if p.has_column and values.get(p.name)]
     by_gear = [v.values for v in values.values() if isinstance(v, Grouped) and v.by == "gear"]
     groups = [str(g) for v in by_gear for g in np.flatnonzero(np.asarray(v))]
     return vehicle.plus(effect), table.plus(*effect_coefficients(effect, sized, shapes=False, groups=groups))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
-from hdev_jax.diagnosis.scores.evidence import ABSORBED
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.physics import LIBRARY
 from hdev_jax.problem import Problem, Split
@@ -82,7 +82,7 @@ def run_rivals(names: list[str], problem: Problem, split: Split) -> dict[str, di
     trip = np.asarray(problem.segments.trip)[train]
     beyond = _projected(jac[train], matrix[train])
     y = _projected(jac[train], residual[train][:, None])[:, 0]
-    seen = np.sum(beyond**2, axis=0) > ABSORBED * np.sum(matrix[train] ** 2, axis=0)
+    seen = np.sum(beyond**2, axis=0) > SETTINGS.absorbed * np.sum(matrix[train] ** 2, axis=0)
     best = _best_ways([c for c in candidates if seen[list(c.columns)].all()], beyond, y)
     at = [k for c in best.values() for k in c.columns]
     ids = [id_ for id_, c in best.items() for _ in c.columns]

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from itertools import permutations
 from typing import Any
 
-from hdev_jax.diagnosis.result.summary import FAR
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.fleet import PLANTABLE
 from hdev_jax.physics import LIBRARY
 
@@ -63,13 +63,13 @@ def false(planted: Sequence[str], named: Sequence[Entry]) -> bool:
 
 def absorbed(planted: Sequence[str], result: Mapping[str, Any]) -> bool:
     """Whether nothing is named, and for each planted effect a coefficient that cannot be told from it is far off."""
-    far = [b for b in result["baseline"].values() if abs(b["prior_z"]) > FAR]
+    far = [b for b in result["baseline"].values() if abs(b["prior_z"]) > SETTINGS.far]
     return not result["named"] and all(any(k in b["absorbs"] for b in far) for k in planted)
 
 
 def untouched(result: Mapping[str, Any]) -> bool:
     """Whether nothing is named and every declared coefficient stays near its table's value."""
-    return not result["named"] and all(abs(b["prior_z"]) <= FAR for b in result["baseline"].values())
+    return not result["named"] and all(abs(b["prior_z"]) <= SETTINGS.far for b in result["baseline"].values())
 
 
 def not_decidable(planted: Sequence[str], result: Mapping[str, Any]) -> bool:

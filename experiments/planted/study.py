@@ -3,10 +3,10 @@
 One task is one log: made by the generator (which shares no code with the kernel), written and read as a customer's
 would be, diagnosed, and given to the rivals. *Size* is the RMS of what is planted after projecting off the declared
 coefficients, over the noise's. *Exactly it* is one entry: the planted id, or a class of at most three that holds it
-(`planted_scores`). A log's result keeps what was said of it, not how it scores.
+(`scores`). A log's result keeps what was said of it, not how it scores.
 
 An effect is planted where the log can separate it, but for three that have a twin in every log of road segments
-(`planted_scores.TWINS`): of them a class is asked for. A log in which an effect acts in one training trip only (rain, a
+(`scores.TWINS`): of them a class is asked for. A log in which an effect acts in one training trip only (rain, a
 limit that is met once) is drawn anew, and the table counts how many were. What no test could tell from it is kept
 beside (`oracle.confusable`).
 """
@@ -15,81 +15,30 @@ import tempfile
 import time
 from collections.abc import Iterator
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
 
+from experiments.planted.config import Config
 from experiments.planted.oracle import confusable, noise_rmse, oracle_rmse
 from experiments.planted.rivals import comparable, run_rivals
 from experiments.planted.tables import collect
-from experiments.runner.config import Strict
 from hdev_jax.diagnosis.diagnose import diagnose
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.fleet import PLANTABLE, SyntheticLog, synthetic_log
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY
 from hdev_jax.problem import Problem, Split, prepare, split_trips
 
-__all__ = ["SOURCES", "Case", "Config", "collect", "run", "tasks", "together"]
+__all__ = ["SOURCES", "Config", "collect", "run", "tasks", "together"]
 
-SOURCES = ("planted.py", "oracle.py", "rivals.py")  # that a log's result depends on, beside the package
+SOURCES = ("oracle.py", "rivals.py")
 
 LEAST_TRIPS = 2  # of training, that an effect acts in
 SHARE = 0.05  # of an effect's sum of squares, from which on a trip counts
 MOST_DRAWS = 20
 APART = 1_000_000  # seeds between one draw of a log and the next
-
-Noise = Literal["white", "ar1", "ar1_white", "trip_levels", "student_t", "trip_variance"]
-Rival = Literal["stlsq", "lasso_cv", "forward_bic", "lightgbm"]
-
-
-class Case(Strict):
-    """A block of logs: every effect set × size × number of trips × noise, `logs` of each."""
-
-    name: str
-    effects: list[list[str]] | str = Field(default_factory=lambda: [[]])  # or the name of one of the config's sets
-    parameters: dict[str, dict[str, float]] = Field(default_factory=dict)  # planted as they are: sizes are not asked
-    sizes: list[float] = Field(default_factory=lambda: [1.0])
-    trips: list[int] = Field(default_factory=lambda: [24])
-    noises: list[Noise] = Field(default_factory=lambda: ["ar1"])
-    logs: int = 10
-    rows_per_trip: int = 250
-    entry: Literal["road", "shaft", "wheel"] = "road"
-    mode: Literal["segments", "samples"] = "segments"
-    held: list[str] = Field(default_factory=list)  # channels of the weather that stay at the trip's mean
-    table_sd: dict[str, float] = Field(default_factory=dict)  # how well the sheet knows a coefficient
-    # what each log should say: the planted effects by name (nothing, where the library has no name for one of them);
-    # that a declared coefficient took them (with none planted: none is far off); that more trips would tell
-    asked: Literal["named", "absorbed", "not_decidable"] = "named"
-    wanted: float | None = None  # least share of logs that do as asked
-    # least share that name exactly what was planted, with no class; of all logs, and of what has no twin by itself
-    wanted_alone: float | None = None
-    wanted_unexplained: float | None = None  # least share in which something is called unexplained
-    wanted_pooled: float | None = None  # least share as asked over all settings of the case together
-
-
-class Config(Strict):
-    """The study: cases, and what is shared by all of them. `seed` is the first log's; every log has its own."""
-
-    experiment: Literal["planted"]
-    cases: dict[str, Case]
-    only: list[str] = Field(default_factory=list)  # cases to run; all where none is named
-    sets: dict[str, list[list[str]]] = Field(default_factory=dict)
-    seed: int = Field(1000, ge=0)
-    fdr: float = 0.05
-
-    @model_validator(mode="after")
-    def _sets_are_there(self) -> "Config":
-        for key, case in self.cases.items():
-            if isinstance(case.effects, str) and case.effects not in self.sets:
-                raise ValueError(
-                    f"cases.{key}.effects: one of {', '.join(self.sets)} is expected, found {case.effects!r}"
-                )
-        return self
-
-    ar_coefficient: float = 0.97
-    rivals: list[Rival] = Field(default_factory=list)
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
@@ -108,7 +57,7 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
                     "parameters": {k: case.parameters.get(k, {}) for k in effects},
                     "seed": seed - 1, "rows_per_trip": case.rows_per_trip, "entry": case.entry, "mode": case.mode,
                     "held": case.held, "table_sd": case.table_sd, "ar_coefficient": config.ar_coefficient,
-                    "fdr": config.fdr, "rivals": config.rivals,
+                    "fdr": config.fdr, "settings": config.settings, "rivals": config.rivals,
                 }  # fmt: skip
 
 
@@ -142,7 +91,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     else:
         return {"skipped": f"{MOST_DRAWS} draws: {', '.join(planted)} in fewer than {LEAST_TRIPS} training trips"}
     started = time.perf_counter()
-    result = diagnose(problem, split, LIBRARY, fdr=task["fdr"], seed=0)
+    result = diagnose(problem, split, LIBRARY, settings=Settings(**{"fdr": task["fdr"], **task["settings"]}), seed=0)
     seconds = time.perf_counter() - started
     summary = result.summary
     parameters = summary["baseline"]["parameters"]

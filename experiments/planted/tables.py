@@ -1,11 +1,12 @@
 """Tables of the planted study: one row for each setting, what was asked of it beside what came out."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from experiments.planted import scores as scores
+from experiments.planted.config import Config
 from experiments.planted.figures import confusion_figure, false_figure, power_figure
 from experiments.planted.rivals import comparable
 from experiments.planted.rivals_table import rival_rows
@@ -14,9 +15,6 @@ from experiments.planted.sizes import CAPTION as SIZED
 from experiments.planted.sizes import NEAR_ORACLE, sized_rows
 from experiments.runner.tables import wilson, write_tables
 from hdev_jax.rundir import Run
-
-if TYPE_CHECKING:
-    from experiments.planted.study import Config
 
 __all__ = ["collect"]
 
@@ -97,7 +95,7 @@ LEGEND = {  # of each table that is there; the first of every page
 }
 
 
-def collect(config: "Config", results: Group, run: Run) -> dict[str, Any]:
+def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     """Tables and figures of the study; `metrics.json`."""
     done = [(t, r) for t, r in results if "skipped" not in r]
     skipped = [{"seed": t["seed"], "effects": t["effects"], "why": r["skipped"]} for t, r in results if "skipped" in r]
@@ -178,7 +176,7 @@ def _short_of(row: dict[str, Any]) -> str:
     )  # fmt: skip
 
 
-def grouped(config: "Config", done: Group) -> list[tuple[str, Group]]:
+def grouped(config: Config, done: Group) -> list[tuple[str, Group]]:
     """Logs by setting: the case, the size, the number of trips and the noise."""
     groups: dict[tuple[str, str], Group] = {}
     for task, result in done:
@@ -215,7 +213,7 @@ def _with_classes(planted: Sequence[str], named: Sequence[scores.Entry]) -> bool
     return scores.exact(planted, named) and scores.with_twins(planted, named)
 
 
-def _by_twin(config: "Config", setting: str, group: Group) -> list[dict[str, Any]]:
+def _by_twin(config: Config, setting: str, group: Group) -> list[dict[str, Any]]:
     """Names in one setting's logs: of all, of what has no twin, and of what has one, for which a class is asked."""
     case = config.cases[group[0][0]["case"]]
     without = [(t, r) for t, r in group if not scores.has_twin(t["effects"])]
@@ -240,7 +238,7 @@ def _by_twin(config: "Config", setting: str, group: Group) -> list[dict[str, Any
     return rows
 
 
-def _row(config: "Config", setting: str, group: Group) -> dict[str, Any]:
+def _row(config: Config, setting: str, group: Group) -> dict[str, Any]:
     """What the table says of one setting."""
     case = config.cases[group[0][0]["case"]]
     n = len(group)

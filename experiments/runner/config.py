@@ -37,7 +37,7 @@ __all__ = [
     "typed",
 ]
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 C = TypeVar("C", bound=BaseModel)
 
 

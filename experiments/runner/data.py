@@ -24,7 +24,7 @@ def data_folder(name: str) -> Path:
 
     **Raises:** `MissingDataError` where it is absent or empty.
     """
-    base = Path(os.environ.get("HDEV_DATA") or Path(__file__).parents[2] / "shared" / "data")
+    base = Path(os.environ.get("HDEV_DATA") or Path(__file__).parents[3] / "shared" / "data")
     folder = base / name
     if not folder.is_dir() or not any(folder.iterdir()):
         raise MissingDataError(

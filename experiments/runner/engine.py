@@ -7,7 +7,7 @@ An experiment is a module with
   config uses and does not define;
 - `run(task)`: plain values;
 - `collect(config, results, run)`: writes tables and figures into the run's folder and returns its metrics;
-- `SOURCES`: the files beside it, by name, that a task's result depends on;
+- `SOURCES`: the files that a task's result depends on, beside its own: names relative to its folder;
 - if it likes, `together(task)`: tasks of the same key (None: none) are one job, run one after another in one process,
   where they share what it compiled; or with `run_together(tasks)` in one call, for small models that are faster in one
   program by `vmap`. A task's result is kept under the task alone, either way;

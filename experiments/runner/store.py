@@ -4,6 +4,7 @@ import ast
 import hashlib
 import importlib
 import json
+import os
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -16,22 +17,25 @@ from hdev_jax.rundir import atomic_file
 
 __all__ = ["experiment", "experiments_here", "keep", "place", "read", "sources", "sources_of"]
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
+PAGE = Path(__file__).with_name("page.py")
 PARTS = ("SOURCES", "Config", "tasks", "run", "collect")  # what an experiment is made of
 PACKAGES = {"hdev_jax": Path(hdev_jax.__file__).parent, "experiments": HERE}
 
 
 def experiments_here() -> list[str]:
-    """The experiments of this package: the modules that say which sources their tasks depend on."""
-    return sorted(p.stem for p in HERE.glob("*.py") if "\nSOURCES = " in p.read_text(encoding="utf-8"))
+    """The experiments of this package, as `folder.file`: the modules that say which sources their tasks depend on."""
+    files = [p for p in HERE.glob("*/*.py") if "\nSOURCES = " in p.read_text(encoding="utf-8")]
+    return sorted(f"{p.parent.name}.{p.stem}" for p in files)
 
 
 def experiment(name: Any, where: str | Path) -> ModuleType:
-    """The module of an experiment: one of this package, or by a dotted name one of your own on Python's path.
+    """The module of an experiment: `folder.file` of this package, or by its dotted name one of your own on Python's
+    path.
 
     **Raises:** `InputError` where there is none of that name; `where` is the config that names it.
     """
-    if isinstance(name, str) and name.isidentifier() and name in experiments_here():
+    if name in experiments_here():
         return importlib.import_module(f"experiments.{name}")
     if isinstance(name, str) and "." in name and all(part.isidentifier() for part in name.split(".")):
         try:
@@ -43,14 +47,14 @@ def experiment(name: Any, where: str | Path) -> ModuleType:
         return module
     here = ", ".join(experiments_here())
     raise InputError(
-        f"{where}, key experiment: one of {here}, or the dotted name of a module, is expected, found {name!r}"
+        f"{where}, key experiment: one of {here}, or the dotted name of your own module, is expected, found {name!r}"
     )
 
 
 def place(module: ModuleType, task: dict[str, Any], store: Path) -> Path:
     """Where the result of a task is kept under `store`."""
-    text = json.dumps([task, sources(module)], sort_keys=True)
-    return store / module.__name__.rpartition(".")[2] / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.json"
+    name = hashlib.sha256(json.dumps([task, sources(module)], sort_keys=True).encode()).hexdigest()[:24]
+    return store / module.__name__.removeprefix("experiments.") / f"{name}.json"
 
 
 def keep(at: Path, task: dict[str, Any], result: Any, seconds: float, together: int) -> None:
@@ -74,12 +78,12 @@ def read(at: Path) -> dict[str, Any]:
 def sources(module: ModuleType, *, collect: bool = False) -> str:
     """Fingerprint of the source files that an experiment's results depend on.
 
-    For a task: the module itself, those beside it that it names in `SOURCES`, and every file of the package that these
-    import, directly or not, without comments and docstrings: hours of tasks stay kept when a comment is mended. With
-    `collect`, for a whole run: whole files, also what they import under `experiments/`, and the page.
+    For a task: the module itself, those that it names in `SOURCES`, and every file of the package that these import,
+    directly or not, without comments and docstrings: hours of tasks stay kept when a comment is mended. With `collect`,
+    for a whole run: whole files, also what they import under `experiments/`, and the page.
     """
     itself = Path(str(module.__file__))
-    return _digest((itself, *(itself.parent / name for name in module.SOURCES)), collect)
+    return _digest((itself, *(Path(os.path.normpath(itself.parent / name)) for name in module.SOURCES)), collect)
 
 
 def sources_of(*files: Path) -> str:
@@ -90,9 +94,7 @@ def sources_of(*files: Path) -> str:
 @cache
 def _digest(starts: tuple[Path, ...], collect: bool) -> str:
     digest = hashlib.sha256()
-    for name, path in sorted(
-        (_name(p), p) for p in reached((*starts, HERE / "page.py") if collect else starts, collect)
-    ):
+    for name, path in sorted((_name(p), p) for p in reached((*starts, PAGE) if collect else starts, collect)):
         digest.update(name.encode() + b"\0" + (path.read_bytes() if collect else _code(path)))
     return digest.hexdigest()[:16]
 

@@ -33,7 +33,7 @@ from hdev_jax.physics.battery import RegenLimit
 from hdev_jax.physics.loads import AuxiliaryPower
 from hdev_jax.physics.losses import GearEfficiency
 from hdev_jax.physics.road import Headwind
-from hdev_jax.physics.sensors import GradeLag, MassScale, SamplingFilter, TimeSkew
+from hdev_jax.physics.sensors import GradeLag, MassScale, TimeSkew
 from hdev_jax.physics.tyres import RoadSurface, RollingSpeed
 
 
@@ -158,7 +158,6 @@ def planted(data, noise_wh, *effects, noise_share=0.0):
 @pytest.mark.parametrize(
     ("effects", "listed", "wanted"),
     [
-        ((SamplingFilter(0.0, 0.0, 20.0),), {"sampling_filter": {}}, {("sampling_filter", "tau_s"): (20.0, 0.5)}),
         (
             (TimeSkew(4.0, 0.0), GradeLag(6.0)), {"mass_scale": {}, "grade_lag": {}, "time_skew": {}},
             {("time_skew", "skew_s"): (4.0, 0.2), ("grade_lag", "lag_s"): (6.0, 0.3)},
@@ -172,7 +171,7 @@ def planted(data, noise_wh, *effects, noise_share=0.0):
         ((), {"regen_limit": {}, "time_skew": {}}, {("regen_limit", "power_w"): (1e12, 0.0),
                                                     ("time_skew", "skew_s"): (0.0, 0.0)}),
     ],
-    ids=["a filter", "two delays", "a cubic and a limit below the grid", "given", "none planted"],
+    ids=["two delays", "a cubic and a limit below the grid", "given", "none planted"],
 )  # fmt: skip
 def test_thresholds_are_found_wherever_they_lie_and_none_where_none_is(effects, listed, wanted):
     data = planted(load("fleet", 3, 24, ("B",), 1.0, None, 0, ("A", "B")), 3.0, *effects)

@@ -13,7 +13,7 @@ import pytest
 
 from experiments.runner.engine import run_config
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CONFIG = """
 experiment = "toy_studies.squares"
 count = 6
@@ -37,7 +37,7 @@ class Processes(ExitStack):
 
     def __init__(self, folder):
         super().__init__()
-        path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+        path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "experiments"), os.environ.get("PYTHONPATH", "")])
         self.folder, self.environment = folder, {**os.environ, "PYTHONPATH": path}
 
     def start(self, name, *words):

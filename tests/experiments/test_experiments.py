@@ -13,13 +13,13 @@ from experiments.runner import store
 from experiments.runner.compute import Asked, Where, compute
 from experiments.runner.config import CONFIGS, artefact, changes, every_config, expanded, listed, resolve, typed
 from experiments.runner.data import MissingDataError
-from experiments.runner.engine import run_config
+from experiments.runner.engine import plan, run_config
 from experiments.runner.log import Log
 from experiments.runner.page import write_docs
 from experiments.runner.tables import wilson
 from hdev_jax.errors import InputError
 
-STUDIES = Path(__file__).parents[1] / "configs" / "studies"
+STUDIES = Path(__file__).parents[2] / "configs" / "studies"
 
 
 def write(folder: Path, name: str, text: str) -> Path:
@@ -45,14 +45,19 @@ def test_a_sweep_is_a_grid_whose_points_share_nothing(tmp_path):
 @pytest.mark.parametrize(
     ("text", "sets", "words"),
     [
-        ('experiment = "planted"\nsed = 1\n[cases]\n', [], ["key sed", "known keys", "seed"]),
-        ('experiment = "planted"\nseed = "one"\n[cases]\n', [], ["key seed", "integer", "'one'"]),
-        ('experiment = "planted"\n[cases.a]\nname = "x"\nnoises = ["pink"]\n', [], ["cases.a.noises.0", "'pink'"]),
-        ('experiment = "unheard"\n', [], ["key experiment", "planted", "'unheard'"]),
+        ('experiment = "planted.study"\nsed = 1\n[cases]\n', [], ["key sed", "known keys", "seed"]),
+        ('experiment = "planted.study"\nseed = "one"\n[cases]\n', [], ["key seed", "integer", "'one'"]),
+        (
+            'experiment = "planted.study"\n[cases.a]\nname = "x"\nnoises = ["pink"]\n',
+            [],
+            ["cases.a.noises.0", "'pink'"],
+        ),
+        ('experiment = "unheard"\n', [], ["key experiment", "paper1.fig5", "planted.study", "'unheard'"]),
+        ('experiment = "planted.none"\n', [], ["key experiment", "planted.none cannot be imported"]),
         ("experiment = planted\n", [], ["not a TOML file"]),
         ('extends = "none.toml"\n', [], ["none.toml", "no such file"]),
-        ('experiment = "planted"\n[cases]\n', ["seed"], ["--set 'seed'", "key=value"]),
-        ('experiment = "planted"\nsweep = 3\n[cases]\n', [], ["sweep", "list of values"]),
+        ('experiment = "planted.study"\n[cases]\n', ["seed"], ["--set 'seed'", "key=value"]),
+        ('experiment = "planted.study"\nsweep = 3\n[cases]\n', [], ["sweep", "list of values"]),
     ],
 )
 def test_a_config_at_fault_is_one_line_with_its_place(tmp_path, text, sets, words):
@@ -150,9 +155,41 @@ def kept(tmp_path_factory):
     return tmp_path_factory.mktemp("kept")
 
 
+def needs_data(path: Path) -> bool:
+    return path.parent.name == "paper2" or resolve(path).get("data") == "ztbus"
+
+
+def parameters(paths):
+    return [pytest.param(p, id=artefact(p), marks=[pytest.mark.data] if needs_data(p) else []) for p in paths]
+
+
+@pytest.mark.parametrize("path", parameters(every_config()))
+def test_every_config_has_tasks_or_says_which_data_it_needs(path):
+    """At a tiny size: all of its keys are known, and what it is to compute is told before anything runs."""
+    try:
+        plans = plan(path, tiny=True)
+    except MissingDataError as e:
+        assert needs_data(path)
+        pytest.skip(str(e))
+    assert all(p.tasks for p in plans)
+
+
+# One config of each experiment, and of each kind of page that it makes; the planted study has tests of its own.
+RUN = (
+    "paper1/table1", "paper1/fig5", "paper1/table2", "studies/pinn_buses", "studies/pinn_data",
+    "studies/pinn_weights", "paper2/table2", "paper2/fig12", "paper2/selection", "paper2/table8", "paper2/pedal",
+    "paper2/online", "studies/coverage", "studies/linearity", "studies/maps", "studies/mass", "studies/ranks",
+)  # fmt: skip
+
+
+def test_each_experiment_has_a_config_that_tests_run():
+    run = {resolve(CONFIGS / f"{name}.toml")["experiment"] for name in RUN}
+    assert run | {"planted.study"} == set(store.experiments_here())
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", every_config(), ids=artefact)
-def test_every_config_runs_at_a_tiny_size(path, tmp_path, kept):
+@pytest.mark.parametrize("path", parameters(CONFIGS / f"{name}.toml" for name in RUN))
+def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept):
     try:
         runs = run_config(path, out=tmp_path / "out", kept=kept, tiny=True)
     except MissingDataError as e:

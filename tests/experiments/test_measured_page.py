@@ -1,26 +1,20 @@
 """The page of measured logs from small made-up results, and the withholding of a channel from a small made-up log."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import tomli_w
+from matplotlib.axes import Axes
 
+from experiments.measured import figures, logs, page
+from experiments.measured.tables import pooled_interval, pooled_rmse, size_rows, size_table
+from experiments.measured.told import changes, moved_sizes, new_names, sentences
+from experiments.measured.withheld import compare_logs, without_columns, write_adapter
 from hdev_jax.errors import InputError
 from hdev_jax.logs import read_log
-
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-
-
-@pytest.fixture(autouse=True)
-def _benchmarks(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    yield
-    for name in [n for n in sys.modules if n.startswith("real_")]:
-        del sys.modules[name]
 
 
 def block(rmse: float, trips=("A", "B")) -> dict:
@@ -39,7 +33,11 @@ def effect(id_: str, path: str, value: float, sd: float, unit: str, twins=()) ->
 
 
 def result(effects: list[dict], rmse: float = 9.0, turned_down=(), left: str | None = None) -> dict:
-    candidates = [{"id": i, "score": s, "q_value": 0.2, "why_not": w} for i, s, w in turned_down]
+    kinds = {True: "unavailable", False: "not_confirmed"}
+    candidates = [
+        {"id": i, "score": s, "q_value": 0.2, "kind": kinds[w.startswith("not tried")], "why_not": w}
+        for i, s, w in turned_down
+    ]
     return {
         "target": "battery_power_kw", "before": block(13.0), "after": block(rmse), "effects": effects,
         "split": {"train_trips": ["C", "D"], "test_trips": ["A", "B"], "unused_trips": []},
@@ -73,40 +71,36 @@ def results() -> dict:
     }
     niro = {f"niro_{k}": result([COPPER], 0.4, [("iron_loss", 3.0, "too few trips")]) for k in "12"}
     held = {
-        "ztbus_1_no_temperature": result([COPPER, LARGER], 11.0, NO_CHANNEL, left="levels that differ by trip"),
+        "ztbus_1_no_temperature": result([COPPER, LARGER], 11.0, NO_CHANNEL, left="random intercepts by trip"),
         "ztbus_1_no_steering": result([COPPER, OFFSET, HEATING], left="a 5-minute cycle"),
     }
     return {**niro, "niro_road": result([COPPER], 150.0), **folds, **held}
 
 
 def test_the_page_tells_all_runs_and_draws_them(results, tmp_path):
-    import real_page
-
     rest = {"temperature": {"rows": 2000, "trips": 2, "gone": ["ambient_temp_c"], "same": ["time_s"], "ledger": 3}}
-    text, figures = real_page.page(results, warm={"A": 3.0, "B": 20.0}, rest=rest)
+    text, drawn = page.page(results, warm={"A": 3.0, "B": 20.0}, rest=rest)
     for heading in ("Kia Niro: battery power", "Kia Niro: traction force", "Stability over folds", "Steering withheld"):
         assert heading in text
     assert "| **found**, 0.97 | **found**, 0.97 | 2 of 2 |" in text
     assert "| no: too few trips |" not in text  # only what some run found has a row
     assert "The same: sheet, split, seed" in text
     assert "`ambient_temp_c`. The other 1 columns are equal in all 2,000 rows" in text
-    assert set(figures) == {f"{n}.png" for n in (
+    assert set(drawn) == {f"{n}.png" for n in (
         "niro_errors", "niro_sizes", "ztbus_errors", "ztbus_sizes", "ztbus_withheld"
     )}  # fmt: skip
-    assert all(name in text for name in figures)
-    assert all(content.startswith(b"\x89PNG") and len(content) < 150_000 for content in figures.values())
-    old = tmp_path / real_page.FOLDER / "gone.png"
+    assert all(name in text for name in drawn)
+    assert all(content.startswith(b"\x89PNG") and len(content) < 150_000 for content in drawn.values())
+    old = tmp_path / page.FOLDER / "gone.png"
     old.parent.mkdir(parents=True)
     old.write_bytes(b"")
-    real_page.write(tmp_path, text, figures)
+    page.write(tmp_path, text, drawn)
     assert not old.exists()
     assert (tmp_path / "real_logs.md").read_text() == text
 
 
 def test_the_interval_of_a_pooled_error_is_of_trips():
     """Rows of one trip say nothing of the next: with few trips that differ it is wide, however many rows they have."""
-    from real_tables import pooled_interval, pooled_rmse
-
     errors = {"A": 1.0, "B": 2.0, "C": 1.5, "D": 1.2}
     blocks = {k: [{"mse": e**2, "n": 10**6}] * 3 for k, e in errors.items()}
     low, high = pooled_interval(blocks)
@@ -121,16 +115,12 @@ def test_the_interval_of_a_pooled_error_is_of_trips():
 
 
 def test_the_page_of_one_part_is_a_page(results):
-    import real_page
-
-    text, figures = real_page.page({"niro_1": results["niro_1"]}, warm={}, rest={})
+    text, drawn = page.page({"niro_1": results["niro_1"]}, warm={}, rest={})
     assert "ZTBus" not in text
-    assert set(figures) == {"niro_errors.png", "niro_sizes.png"}
+    assert set(drawn) == {"niro_errors.png", "niro_sizes.png"}
 
 
 def test_sizes_of_one_class_share_a_row_and_a_unit(results):
-    from real_tables import size_rows
-
     rows = {row.paths: row for row in size_rows({"1": results["ztbus_1"], "2": results["ztbus_2"]})}
     shared = rows["power_gain.offset_w", "auxiliary_power.power_w"]
     assert shared.unit == "W"
@@ -143,20 +133,14 @@ def test_sizes_of_one_class_share_a_row_and_a_unit(results):
 
 
 def test_a_size_at_the_end_of_its_range_is_marked_and_agrees_with_nothing():
-    import real_page
-    from real_tables import size_rows, size_table
-
     ends = {"1": 24.3, "2": 26.0}  # °C; hvac_power's heat_c ends at 26
     runs = {k: result([effect("hvac_power", "heat_c", v, 1.0, "°C")]) for k, v in ends.items()}
     assert size_rows(runs)[0].at_bound == {"2"}
     assert "| 24.3 ± 1.0 | 26.0 ± 1.0, at its bound | 1.2 sd |" in size_table(runs, "fold")[-1]
-    assert "Of 0 sizes found more than once, none at a bound, 0 agree" in real_page._agreement(runs, "")[0]
+    assert "Of 0 sizes found more than once, none at a bound, 0 agree" in page._agreement(runs, "")[0]
 
 
 def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
-    import real_page
-    from real_tables import size_rows
-
     def offsets(*values: float):
         sized = enumerate(values)
         return {str(k): result([effect("torque_offset", "offset_nm", v, 1.0, "Nm")]) for k, v in sized}
@@ -168,46 +152,35 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
         for factor, close in ((0.97, True), (1.03, False)):
             (row,) = size_rows(offsets(5.0, 5.0 + factor * bound, *[5.0 + 0.5 * bound] * (sets - 2)))
             assert row.agrees() == close
-    assert "Of 1 sizes found more than once, 1 agrees." in real_page._agreement(offsets(5.0, 5.5), "")[0]
-    assert (
-        "0 agree. Further apart: `torque_offset.offset_nm` (2.1 sd)." in real_page._agreement(offsets(5.0, 8.0), "")[0]
-    )
+    assert "Of 1 sizes found more than once, 1 agrees." in page._agreement(offsets(5.0, 5.5), "")[0]
+    assert "0 agree. Further apart: `torque_offset.offset_nm` (2.1 sd)." in page._agreement(offsets(5.0, 8.0), "")[0]
 
 
 def test_an_effect_whose_sign_turns_is_told_first(results):
-    import real_page
-
     offsets = {"niro_1": -5.5, "niro_2": 0.7}  # Nm
     turned = {k: result([effect("torque_offset", "offset_nm", v, 0.1, "Nm")]) for k, v in offsets.items()}
-    text, _ = real_page.page(turned, warm={}, rest={})
+    text, _ = page.page(turned, warm={}, rest={})
     assert "They do not agree on the sign of `torque_offset.offset_nm`." in text.partition("## Kia Niro")[0]
-    text, _ = real_page.page(results, warm={}, rest={})
+    text, _ = page.page(results, warm={}, rest={})
     assert "agree on the sign" not in text
 
 
 def test_bars_of_sizes_are_the_intervals_of_the_diagnosis(results, monkeypatch):
     """Few clusters: a size's distribution has heavier tails than its standard deviation says."""
-    import real_figures
-    from matplotlib.axes import Axes
-
     drawn = []
     monkeypatch.setattr(Axes, "errorbar", lambda self, x, y, xerr, **_: drawn.append((x, xerr)))
-    real_figures.sizes({"1": result([HEATING])}, "sizes", "fold")
+    figures.sizes({"1": result([HEATING])}, "sizes", "fold")
     ((value, ((below,), (above,))),) = drawn
     assert value == 550.0
     assert (below, above) == pytest.approx((240.0, 160.0))
 
 
 def test_sizes_of_effects_that_no_run_calls_one_class_stay_apart():
-    from real_tables import size_rows
-
     runs = {"1": result([OFFSET]), "2": result([STEP])}  # both in W
     assert len(size_rows(runs)) == 2
 
 
 def test_a_withheld_cause_and_where_it_went(results):
-    from real_told import changes, moved_sizes, sentences
-
     without, full, others = results["ztbus_1_no_temperature"], results["ztbus_1"], {"2": results["ztbus_2"]}
     assert changes(without, full) == (["hvac_power"], [], [("auxiliary_power", "power_gain")])
     assert [m[0] for m in moved_sizes(without, full)] == ["power_gain.offset_w"]
@@ -215,12 +188,10 @@ def test_a_withheld_cause_and_where_it_went(results):
     assert "cannot try cabin heating and cooling" in text
     assert "No false name takes the place of cabin heating and cooling" in text
     assert "lowers the test RMSE from 11.00 to 9.00" in text
-    assert "levels that differ by trip" in text
+    assert "random intercepts by trip" in text
 
 
 def test_a_false_name_is_called_one(results):
-    from real_told import new_names, sentences
-
     full, others = results["ztbus_1"], {"2": results["ztbus_2"]}
     without = result([COPPER, OFFSET, STEP], 10.0, NO_CHANNEL)
     assert new_names(without, full, others) == ["step_change"]
@@ -231,8 +202,6 @@ def test_a_false_name_is_called_one(results):
 
 
 def test_a_channel_that_nothing_reads_is_a_control(results):
-    from real_told import sentences
-
     text = " ".join(sentences("steering", results["ztbus_1_no_steering"], results["ztbus_1"], {}))
     assert "The run is a control." in text
     assert "finds the same effects" in text
@@ -241,20 +210,16 @@ def test_a_channel_that_nothing_reads_is_a_control(results):
 
 
 def test_what_two_runs_do_not_have_in_common_is_said(results):
-    import real_page
-
     results["ztbus_1_no_steering"]["ran"]["seed"] = 7
-    text, _ = real_page.page(results, warm={}, rest={})
+    text, _ = page.page(results, warm={}, rest={})
     assert text.count("**Not the same in both: seed.**") == 1
     del results["ztbus_1_no_temperature"]["ran"]["fdr"]  # what a run does not say, it does not share
-    assert "The same: sheet, split, seed.\n" in real_page.page(results, warm={}, rest={})[0]
+    assert "The same: sheet, split, seed.\n" in page.page(results, warm={}, rest={})[0]
 
 
 def test_runs_that_find_nothing_in_common(results):
-    import real_page
-
     results["niro_2"]["effects"] = []
-    text, _ = real_page.page(results, warm={}, rest={})
+    text, _ = page.page(results, warm={}, rest={})
     assert "There is no effect that all of them find." in text
 
 
@@ -290,8 +255,6 @@ def log(tmp_path) -> tuple[Path, Path]:
     ids=["temperature", "passengers and what is made from them"],
 )
 def test_a_withheld_channel_is_not_in_the_log(log, tmp_path, names, gone):
-    from real_withheld import compare_logs, write_adapter
-
     file, base = log
     adapter = write_adapter(base, names, tmp_path / "less" / "adapter.toml")
     full, less = read_log(file, base), read_log(file, adapter)
@@ -304,8 +267,6 @@ def test_a_withheld_channel_is_not_in_the_log(log, tmp_path, names, gone):
 
 
 def test_withholding_that_changes_more_is_refused(log, tmp_path):
-    from real_withheld import compare_logs, without_columns, write_adapter
-
     file, base = log
     table = without_columns(ADAPTER, ["ambient_temp_c"])
     table["columns"]["mass_kg"] = {"source": "passengers", "affine": [19000.0, 70.0]}
@@ -323,11 +284,9 @@ def test_withholding_that_changes_more_is_refused(log, tmp_path):
 
 
 def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, capsys):
-    import real_logs
-
-    monkeypatch.setattr(real_logs, "DATA", tmp_path / "none")
+    monkeypatch.setattr(logs, "DATA", tmp_path / "none")
     work, docs = tmp_path / "work", tmp_path / "docs"
-    jobs = real_logs.jobs(work)["niro"]
+    jobs = logs.jobs(work)["niro"]
     for name in ("niro_1", "niro_2"):
         (work / name).mkdir(parents=True)
         (work / name / "diagnosis.json").write_text(json.dumps(results[name]))
@@ -339,14 +298,14 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
         covariance = {"names": ["iron", "offset"], "matrix": [[1.0, -0.99], [-0.99, 1.0]]}
         (work / f"{name}.begun").write_text(next(j for j in jobs if j.name == name).made_of)
         (work / name / "predictive.json").write_text(json.dumps({"covariance": covariance}))
-    assert real_logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
-    page = (docs / "real_logs.md").read_text()
-    assert "trained on trip" in page
-    assert "- 2: iron and offset are known together far better than one by one (correlation -0.99)" in page
+    assert logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
+    text = (docs / "real_logs.md").read_text()
+    assert "trained on trip" in text
+    assert "- 2: iron and offset are strongly correlated (-0.99)" in text
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
     for end in ("", ".begun"):
         (work / f"niro_2{end}").rename(work / f"niro_3{end}")
     with pytest.raises(SystemExit, match="holds another run"):
-        real_logs.main(["--work", str(work), "--kept"])
-    monkeypatch.setattr(real_logs, "sources_of", lambda *_: "mended")  # runs of other code are none
-    assert all(real_logs.kept(job, work) is None for job in jobs)
+        logs.main(["--work", str(work), "--kept"])
+    monkeypatch.setattr(logs, "sources_of", lambda *_: "mended")  # runs of other code are none
+    assert all(logs.kept(job, work) is None for job in jobs)

@@ -1,6 +1,5 @@
 """Runs of the engine: what their folders hold, done once, resumed, shared; sweeps as tables; lists on one page."""
 
-import importlib
 import json
 import os
 import re
@@ -18,7 +17,7 @@ from experiments.runner.engine import run_config
 from experiments.runner.tables import read_markdown
 from hdev_jax.errors import InputError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -296,32 +295,59 @@ def test_only_code_counts_towards_what_is_kept(tmp_path):
     assert len(set(whole.values())) == len(edits), "a whole run tells every file as it is"
 
 
-@pytest.mark.parametrize("name", store.experiments_here())
-def test_what_a_task_depends_on_is_what_its_modules_load(name):
-    """Every file of the package that importing the sources loads is in the fingerprint; none that they do not name."""
-    module = importlib.import_module(f"experiments.{name}")
-    starts = [store.HERE / source for source in module.SOURCES]
-    files = {store._name(p) for p in store.reached(starts, experiments=True)}
-    code = "import sys, importlib; importlib.import_module(sys.argv[1]); print(*sys.modules)"
+LOADS = """
+import json, os, sys
+import jax, lightgbm, matplotlib, numpy, optimistix, pandas, pydantic, scipy.stats, sklearn  # what all of them share
+for name in sys.argv[1:]:
+    print(flush=True)
+    if not os.fork():
+        __import__(name)
+        print(json.dumps([name, [m for m in sys.modules if m.startswith(("hdev_jax.", "experiments."))]]), flush=True)
+        os._exit(0)
+    os.wait()
+"""
+
+
+@pytest.fixture(scope="module")
+def modules_loaded() -> dict[str, set[str]]:
+    """What importing an experiment loads of the tree, by the experiment's name, each in a process of its own."""
+    names = [f"experiments.{name}" for name in store.experiments_here()]
     done = subprocess.run(
-        [sys.executable, "-c", code, f"experiments.{name}"], cwd=ROOT, capture_output=True, text=True, check=True,
+        [sys.executable, "-W", "ignore", "-c", LOADS, *names], cwd=ROOT, capture_output=True, text=True, check=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    loaded = {m for m in done.stdout.split() if m.startswith(("hdev_jax.", "experiments."))}
+    return {name: set(loaded) for name, loaded in (json.loads(x) for x in done.stdout.splitlines() if x)}
+
+
+# Beside its SOURCES, a task's files may import what makes pages, what reads configs and data, and what has a
+# fingerprint of its own.
+PAGES = {"tables", "figures", "drawings", "choice", "pages", "gear_tables", "config"}
+OWN_FINGERPRINT = {"experiments/paper2/diagnosed.py"}
+
+
+@pytest.mark.parametrize("name", store.experiments_here())
+def test_what_a_task_depends_on_is_what_its_modules_load(name, modules_loaded):
+    """Every file of the package that importing the sources loads is in the fingerprint; none that they do not name."""
+    module = store.experiment(name, "a config")
+    itself = Path(str(module.__file__))
+    starts = [itself, *((itself.parent / source).resolve() for source in module.SOURCES)]
+    files = {store._name(p) for p in store.reached(starts, experiments=True)}
     reached = {f.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for f in files}
-    assert loaded <= reached
-    # what SOURCES import beside themselves is for pages, or has a fingerprint of its own
-    beside = {p.stem for start in starts for p in store._imports(start) if p.is_relative_to(store.HERE)}
-    pages = ("_tables", "_figures", "_drawings", "_choice", "_pages")
-    known = {
-        "__init__",
-        "config",
-        "data",
-        "tables",
-        "figures",
-        "paper2_diagnosed",
-        *(Path(s).stem for s in module.SOURCES),
-    }
-    assert {b for b in beside if not b.endswith(pages)} <= known
+    own_package = {module.__name__.rpartition(".")[0]}
+    assert modules_loaded[module.__name__] - own_package <= reached
+    beside = {p for start in starts for p in store._imports(start) if p.is_relative_to(store.HERE)} - {*starts}
+    rest = {p for p in beside if p.parent.name != "runner" and p.stem not in {"__init__", *PAGES}}
+    assert {store._name(p) for p in rest} <= OWN_FINGERPRINT
     tasks_need = {store._name(p) for p in store.reached(starts, experiments=False)}
-    assert not tasks_need & {"hdev_jax/cli.py", "hdev_jax/demo.py", "experiments/page.py"}
+    assert not tasks_need & {"hdev_jax/cli.py", "hdev_jax/verbs/demo.py", "experiments/runner/page.py"}
+
+
+def test_a_module_of_your_own_is_named_by_its_dotted_name_and_ours_goes_first(tmp_path, monkeypatch):
+    for folder, file in (("mine", "fig5"), ("paper1", "fig5")):
+        (tmp_path / folder).mkdir()
+        text = "SOURCES, Config, tasks, run, collect = (), None, None, None, None\n"
+        (tmp_path / folder / f"{file}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert store.experiment("mine.fig5", "a config").__file__ == str(tmp_path / "mine" / "fig5.py")
+    assert store.experiment("paper1.fig5", "a config").__name__ == "experiments.paper1.fig5"
+    assert store.place(squares, {}, tmp_path).parent == tmp_path / "toy_studies.squares"

@@ -9,7 +9,8 @@ from experiments.pinn.buses import ADAPTER, BUSES, SHEET, bus_files, bus_sources
 from experiments.pinn.study import Config, tasks
 from experiments.runner.config import CONFIGS, resolve, typed
 from experiments.runner.data import MissingDataError
-from hdev_jax.logs import TARGETS, read_log
+from hdev_jax.logs import read_log
+from hdev_jax.targets import TARGETS
 
 
 def test_a_mission_of_each_bus_keeps_the_energy_of_its_samples(data_dir, monkeypatch):
@@ -64,6 +65,9 @@ def test_a_task_on_buses_changes_with_any_file_that_its_rows_are_made_of(tmp_pat
     assert before != told()
     (tmp_path / "ztbus" / "B208_2021.grade.csv.gz").unlink()
     assert len(bus_sources()) == 5
+    (tmp_path / "ztbus" / "B208_2021.csv").unlink()
+    with pytest.raises(MissingDataError, match="no mission of B208"):
+        told()
 
 
 def test_a_mission_without_its_slope_is_missing_data(data_dir, tmp_path):
