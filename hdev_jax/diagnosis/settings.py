@@ -83,10 +83,16 @@ class Settings:
         0.05, "p-value above which an effect is not needed beside another of its class", "1", "Wald test, 5 %"
     )
     most_in_class: int = _number(2, "members of a class that are listed at most", "effects", "contract §4")
+    wider_p: float = _number(
+        1e-3, "p-value below which a size joins an effect that was found without it", "1", "as strict as `level`"
+    )
 
     # terms without a name
     unnamed_stricter: float = _number(
         5.0, "times lower FDR level for a term without a name", "1", "a description is not a cause"
+    )
+    mean_over_swing: float = _number(
+        2.0, "largest mean of a load over the amplitude of its cycle", "1", "a square wave that is on for 78 % of it"
     )
 
     # loads that switch in a cycle, modes of some trips
@@ -116,6 +122,9 @@ class Settings:
     far: float = _number(2.0, "|prior_z| above which a coefficient is flagged", "sd", "5 %, two-sided")
     suspicious: float = _number(
         8.0, "gain above which an undecided candidate is reported", "log-likelihood", "odds of 3,000 to 1"
+    )
+    hint: float = _number(
+        0.1, "p-value, before any correction, above which there is no sign of a candidate", "1", "a test at 10 %"
     )
     half: float = _number(
         0.5, "share of the trips' differences, and adjusted p-value, of effects reported as undecided", "1", "half"

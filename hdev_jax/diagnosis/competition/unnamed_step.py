@@ -19,7 +19,6 @@ from hdev_jax.targets import TARGETS
 __all__ = ["add_unnamed"]
 
 CYCLE = "derived:cycle"
-MEAN_OVER_SWING = 2.0  # of a load that is on for up to 78 % of its cycle, over the amplitude of its basic wave
 Made = list[tuple[Factor, ...]]
 
 
@@ -78,7 +77,7 @@ def _swing_w(training: Training, state: State) -> np.ndarray:
 def _is_more_than_its_mean(term: Term, scores: Scores) -> bool:
     """Whether the mean of a cycle comes out larger than a load with such a swing could have."""
     size = float(scores.best[Described.id].beta[0]) / term.scale
-    return CYCLE in term.channels and not 0.0 <= size <= MEAN_OVER_SWING
+    return CYCLE in term.channels and not 0.0 <= size <= scores.settings.mean_over_swing
 
 
 def _best(training: Training, state: State, made: Made) -> tuple[Term, Scores] | None:

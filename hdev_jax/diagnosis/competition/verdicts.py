@@ -12,8 +12,6 @@ from hdev_jax.diagnosis.scores.significance import clusters_needed, clusters_to_
 
 __all__ = ["verdicts_of"]
 
-HINT = 0.1  # p, before any correction, above which there is no sign of a candidate
-
 
 def verdicts_of(round_: Round, sought: Sequence[Verdict]) -> tuple[Verdict, ...]:
     """Why each candidate outside the model was not chosen; `sought`, verdicts of the searches without columns."""
@@ -49,7 +47,7 @@ def _needed(round_: Round, s: Score) -> int | None:
         return None
     level = scores.level(id_)
     p = max(s.p_model, s.p_cluster)
-    if s.p <= HINT or s.p_model <= level:
+    if s.p <= settings.hint or s.p_model <= level:
         return clusters_needed(p, k, count, level)
     if scores.baseline.clusters.kind != "trip" or not scores.between(s.candidate):
         return None
