@@ -5,7 +5,7 @@ would be, diagnosed, and given to the rivals. *Size* is the RMS of what is plant
 coefficients, over the noise's. *Exactly it* is one entry: the planted id, or a class of at most three that holds it
 (`scores`). A log's result keeps what was said of it, not how it scores.
 
-An effect is planted where the log can separate it, but for three that have a twin in every log of road segments
+An effect is planted where the log can separate it, but for two that have a twin in every log of road segments
 (`scores.TWINS`): of them a class is asked for. A log in which an effect acts in one training trip only (rain, a
 limit that is met once) is drawn anew, and the table counts how many were. What no test could tell from it is kept
 beside (`oracle.confusable`).

@@ -46,6 +46,13 @@ class Settings:
         3e-3, "share of a column outside the span of the fitted coefficients, below which it is absorbed", "1",
         "collinearity: standard error 18 times that of an orthogonal column",
     )  # fmt: skip
+    by_rows: float = _number(
+        1e-12, "p-value by rows alone below which shapes are estimated before clusters are asked", "1", "time"
+    )
+    agreed: float = _number(
+        0.25, "share of a size by ordinary least squares that generalised least squares must not exclude", "1",
+        "chosen on seeds 1-99",
+    )  # fmt: skip
     placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
     placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
     shifts: int = _number(

@@ -10,7 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FINAL_DRIVE", "GEAR_RATIOS", "WHEEL_RADIUS_M", "Drive", "drive_trips", "hold", "smooth_noise"]
+__all__ = [
+    "FINAL_DRIVE",
+    "GEAR_RATIOS",
+    "WHEEL_RADIUS_M",
+    "Drive",
+    "drive_trips",
+    "hold",
+    "smooth_noise",
+    "standard_density_kgpm3",
+]
 
 Columns = dict[str, np.ndarray]
 
@@ -124,7 +133,7 @@ def _weather(rng: np.random.Generator, t: np.ndarray, altitude: np.ndarray) -> C
     hours = hour + t / 3600
     temp = base + swing * (np.sin((hours - 9) * np.pi / 12) - np.sin((hour - 9) * np.pi / 12))
     temp = temp - 6.5e-3 * (altitude - altitude[0]) + 0.3 * slow(300.0)  # ISO 2533 lapse rate
-    pressure = 101325.0 * (1 - 2.25577e-5 * altitude) ** 5.25588 * rng.normal(1.0, 0.008)  # ISO 2533
+    pressure = rng.normal(1.0, 0.008)  # of the day, over the standard one
     mean_wind, gusty = rng.uniform(1.0, 8.0), rng.uniform(0.15, 0.3)
     wind = np.abs(mean_wind * (1 + gusty * slow(60.0)))
     from_rad = rng.uniform(0, 2 * np.pi) + 0.25 * slow(400.0)
@@ -132,7 +141,7 @@ def _weather(rng: np.random.Generator, t: np.ndarray, altitude: np.ndarray) -> C
     rain = 1 / (1 + np.exp(-4 * (slow(400.0) - 0.2)))
     return {
         "ambient_temp_c": temp,
-        "air_density_kgpm3": pressure / (287.05 * (temp + 273.15)),
+        "air_density_kgpm3": pressure * standard_density_kgpm3(altitude, temp),
         "wind_speed_mps": wind,
         "wind_from_rad": np.mod(from_rad, 2 * np.pi),
         "wet_road": rain if rainy else np.zeros_like(t),
@@ -141,6 +150,11 @@ def _weather(rng: np.random.Generator, t: np.ndarray, altitude: np.ndarray) -> C
         "gps_hdop": 0.9 + 0.25 * slow(120.0) ** 2,
         "tyre_pressure_kpa_display": np.round(850 + 8 * slow(1500.0) + 0.4 * (temp - base)),
     }
+
+
+def standard_density_kgpm3(altitude_m: np.ndarray, temperature_c: np.ndarray) -> np.ndarray:
+    """Density of the air at the standard pressure of an altitude (ISO 2533)."""
+    return 101325.0 * (1 - 2.25577e-5 * altitude_m) ** 5.25588 / (287.05 * (temperature_c + 273.15))
 
 
 def drive_trips(

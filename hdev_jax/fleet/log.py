@@ -11,7 +11,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from hdev_jax.fleet.driving import FINAL_DRIVE, GEAR_RATIOS, WHEEL_RADIUS_M, Drive, drive_trips, hold, smooth_noise
+from hdev_jax.fleet.driving import (
+    FINAL_DRIVE,
+    GEAR_RATIOS,
+    WHEEL_RADIUS_M,
+    Drive,
+    drive_trips,
+    hold,
+    smooth_noise,
+    standard_density_kgpm3,
+)
 from hdev_jax.fleet.noise import NOISES, noise_of_one, root_mean_square
 from hdev_jax.fleet.plants import PLANTABLE
 from hdev_jax.fleet.truth import Truth, power_w, shaft_channels
@@ -284,6 +293,8 @@ def synthetic_log(
     lengths = np.floor(rows_per_trip * route.uniform(0.7, 1.3, trips)).astype(int)
     lengths += np.diff(np.linspace(0, trips * rows_per_trip - lengths.sum(), trips + 1).round()).astype(int)
     drive = drive_trips(route, weather, rows=lengths, mode=mode, sample_s=float(sample_s))
+    c = drive.columns  # without a barometer in the log, a day's pressure would be noise that no row shows
+    c["air_density_kgpm3"] = standard_density_kgpm3(c["altitude_m"], c["ambient_temp_c"])
     hold(drive, held)
     draws = {k: getattr(Truth(), k) + sd * np.clip(vehicle.normal(), -1.5, 1.5) for k, sd in table_sd.items()}
     draws = {k: float(min(v, 0.97) if k.endswith("efficiency") else v) for k, v in draws.items()}

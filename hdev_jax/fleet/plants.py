@@ -14,7 +14,8 @@ class Plant:
 
     `null` is the value of `size` without the effect (infinite for a limit). `match` says which side gives way where a
     ratio of effect to noise is asked for: "noise" where another size would be implausible, or jumps. `like` is the
-    library's effect that comes nearest to one which the library does not hold in this form. `absorbed` are entries
+    library's effect that comes nearest to one which the library does not hold in this form; `partly` are effects that
+    a part of it is, as a constant load is of the mean of a cycle. `absorbed` are entries
     where declared coefficients take all of it: it can be planted there, but has no size beyond them.
     """
 
@@ -26,6 +27,7 @@ class Plant:
     match: str = "effect"
     in_library: bool = True
     like: str | None = None
+    partly: tuple[str, ...] = ()
     absorbed: tuple[str, ...] = ()
 
 
@@ -77,7 +79,9 @@ PLANTABLE: dict[str, Plant] = {
     "mode_change": Plant(
         {"regenerating_efficiency": 0.6, "share": 0.35}, ("regenerating_efficiency", "auxiliary_w", "c_rr", "cda_m2")
     ),
-    "outside_thermal_cycle": Plant({"power_w": 8000.0, "period_s": 1500.0}, ("power_w",), in_library=False),
+    "outside_thermal_cycle": Plant(
+        {"power_w": 8000.0, "period_s": 1500.0}, ("power_w",), in_library=False, partly=("auxiliary_power",)
+    ),
     "outside_humidity_load": Plant(
         {"power_w": 2500.0, "threshold_pct": 70.0}, ("power_w",), in_library=False, match="noise"
     ),

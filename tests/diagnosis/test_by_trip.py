@@ -52,7 +52,7 @@ def _score(grams, z) -> Score:
     d = grams.shape[-1]
     nothing = np.zeros((0, d)), np.zeros(0), np.zeros(0, dtype=int), np.zeros(1)
     evidence = Evidence(grams, *nothing, d - 2, np.zeros(d - 2), np.zeros(d - 2))
-    return _alone(evidence, 0, z).score(Candidate(ModeChange, ("regeneration",), (None,), (), "size", (0,)))
+    return _alone(evidence, 0).within(z).score(Candidate(ModeChange, ("regeneration",), (None,), (), "size", (0,)))
 
 
 def test_trips_are_split_where_their_sizes_differ():

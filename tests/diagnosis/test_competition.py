@@ -12,7 +12,8 @@ from planted import declared, diagnosed, found_in_turn, named, opened, training
 from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
 from hdev_jax.diagnosis.competition.compete import compete
 from hdev_jax.diagnosis.competition.forward import Round, forward
-from hdev_jax.diagnosis.competition.needed import backward, classes, exchanged
+from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
+from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import joined, refit, widened, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.rejection import Kind
@@ -127,7 +128,7 @@ def two(tmp_path_factory) -> tuple[Problem, Training]:
 def test_what_does_more_takes_the_place_of_what_was_found(wrong, two):
     problem, rows = two
     state = replace(found_in_turn(rows, problem, (wrong, "headwind")), refused=("rolling_speed",))
-    new = exchanged(round_of(rows, state))
+    new = one_exchanged(round_of(rows, state))
     assert new is not None
     assert new.ids == ("headwind", "standstill_load")
     assert new.removed[wrong].numbers["beside"] == "standstill_load"
@@ -136,7 +137,7 @@ def test_what_does_more_takes_the_place_of_what_was_found(wrong, two):
     assert not any(wrong in c.path for c in new.fit.table.rows)
     assert not new.fit.vehicle.has(wrong)
     assert new.fit.sigma < state.fit.sigma
-    assert exchanged(round_of(rows, replace(new, found=new.found[::-1]))) is None, "what does most stays"
+    assert one_exchanged(round_of(rows, replace(new, found=new.found[::-1]))) is None, "what does most stays"
 
 
 @pytest.mark.parametrize("why", ["newest", "told by trips", "out already", "at no level"])
@@ -152,7 +153,23 @@ def test_what_may_not_be_exchanged_is_not(why, two):
         state = replace(state, refused=("standstill_load", "auxiliary_power", "step_change", "rolling_speed"))
     if why == "at no level":
         rows = replace(rows, settings=replace(rows.settings, fdr=0.0))
-    assert exchanged(round_of(rows, state)) is None
+    assert one_exchanged(round_of(rows, state)) is None
+
+
+def test_two_that_together_stand_for_two_others_are_exchanged_at_once(tmp_path):
+    """Efficiency and grade together look like a rotating mass with friction brakes: none of the four is better alone."""
+    planted, proxies = ("rotating_mass", "friction_blending"), ("efficiency_scale", "grade_scale")
+    options = {"effects": {k: {} for k in planted}, "ratio": 0.5, "ar_coefficient": 0.97}
+    _, problem, _ = opened(tmp_path, seed=750126, trips=12, **options)
+    rows = training(problem, [*planted, *proxies])
+    state = found_in_turn(rows, problem, proxies)
+    assert one_exchanged(round_of(rows, state)) is None
+    new = two_exchanged(round_of(rows, state))
+    assert new is not None
+    assert sorted(new.ids) == sorted(planted)
+    assert new.barred >= {*proxies}
+    assert all(f.q_value < rows.settings.fdr for f in new.found)
+    assert two_exchanged(round_of(rows, new)) is None
 
 
 def test_the_competition_ends_with_what_is_there(two):

@@ -193,7 +193,7 @@ def test_ways_are_counted_by_what_the_declared_coefficients_leave_of_them():
     sums = Sums(12, 8, 0)
     sums.add(np.c_[np.ones(n), 1.0 + 0.1 * z, rng.normal(size=n)], np.repeat(np.arange(8), n // 8))
     ways = [candidate(k) for k in range(10)]
-    for prior_sd, expected in ((1e3, 10.0), (1e-6, 1.2)):  # a coefficient that its table holds fast takes nothing off
+    for prior_sd, expected in ((1e3, 10.0), (1e-6, 1.64)):  # a coefficient that its table holds fast takes nothing off
         evidence = sums.evidence(1, moved=np.zeros(1), prior_sd=np.array([prior_sd]))
         counted = best_of(evidence, evidence, ways, np.zeros(10, bool), SETTINGS)[1]["auxiliary_power"]
         assert counted == pytest.approx(expected, abs=0.1)
@@ -454,7 +454,7 @@ def test_ways_that_are_alike_are_one_test():
     alike = apart[:, :1] + 0.01 * rng.normal(size=(4000, 6))
     assert effective_number(apart.T @ apart) == pytest.approx(6.0, abs=0.1)
     assert effective_number(alike.T @ alike) == pytest.approx(1.0, abs=0.1)
-    assert 3.0 < effective_number((half := np.c_[apart[:, :3], alike[:, :3]]).T @ half) < 5.0
+    assert effective_number((half := np.c_[apart, apart]).T @ half) == pytest.approx(6.0, abs=0.1)
     assert effective_number(np.ones((1, 1))) == 1.0
 
 

@@ -56,8 +56,9 @@ def test_what_is_there_passes_every_gate(log, scores):
         ({"beta": np.ones(12)}, Kind.TOO_FEW_CLUSTERS, {"least": 14, "there": 10, "unit": "trips"}),
         ({"beta": np.array([-4000.0])}, Kind.IMPLAUSIBLE, {"sizes": [-4000.0]}),
         ({"left_out_gain": 1.0}, Kind.NOT_CONFIRMED, {"left_out_gain": 1.0, "unit": "trips"}),
-        ({"p_model": 0.4}, Kind.NOT_SIGNIFICANT, {"q": 1.0}),
-        ({"p_cluster": 0.4}, Kind.NOT_SIGNIFICANT, {"q": 1.0}),
+        ({"p_model": 1.0}, Kind.NOT_SIGNIFICANT, {"q": 1.0}),
+        ({"p_cluster": 1.0}, Kind.NOT_SIGNIFICANT, {"q": 1.0}),
+        ({"beta": np.array([9e4]), "plain": True}, Kind.CONTRADICTED, {"share": 0.25}),
         ({"gain": 2.0}, Kind.OUTSCORED, {"worth": -2.5}),
     ],
 )
@@ -111,7 +112,7 @@ def test_an_effect_without_a_column_has_none(log):
 
 NUMBERS = {
     "reason": "needs the channel gap_m", "by": "road.c_rr", "least": 3, "there": 2, "q": 0.21, "how": "its column",
-    "percent": 12.4, "beside": "headwind",
+    "percent": 12.4, "beside": "headwind", "share": 0.25,
 }  # fmt: skip
 
 
@@ -153,7 +154,7 @@ def test_only_trips_tell_what_lives_between_them(kind, log):
         return next(v.needed for v in verdicts if v.id == "hvac_power")
 
     k = len(score_all(rows, state.fit).best["hvac_power"].beta)
-    unclear = {"p_model": 0.1, "p_cluster": 0.1, "beta": np.full(k, 300.0)}
+    unclear = {"p_model": 0.2, "p_cluster": 0.2, "beta": np.full(k, 300.0)}
     assert (needed(True, **unclear) is None) == (kind == "block")
     assert kind == "block" or needed(True, **unclear) > rows.clusters.count
     assert needed(True, **{**unclear, "beta": np.full(k, -300.0)}) is None

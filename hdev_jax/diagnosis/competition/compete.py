@@ -7,9 +7,11 @@ import numpy as np
 
 from hdev_jax.diagnosis.candidates.unnamed import TERM
 from hdev_jax.diagnosis.competition.cycle import add_cycle
+from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
+from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.mode import add_mode
-from hdev_jax.diagnosis.competition.needed import backward, classes, exchanged
+from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import widened, without
 from hdev_jax.diagnosis.competition.state import State, Verdict
 from hdev_jax.diagnosis.competition.unnamed_step import add_unnamed
@@ -67,14 +69,14 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
     """One round: the first of forward, the searched candidates, exchange, a wider form, a term without a name, that
     changes something; then backward. `finished` where none does."""
     tell(f"scoring candidates, step {step}")
-    scores = score_all(training, state.fit)
+    scores = sharpened(training, score_all(training, state.fit))
     if step == 1:
         state = replace(state, absorbs=scores.absorbs)
     round_ = Round(training, state, scores, rng, tell)
     sought: list[Verdict] = []
     new = None
     if len(state.found) < training.settings.most_effects and step <= training.settings.most_effects + 1:
-        new = forward(round_, skip=state.refused)
+        new = two_exchanged(round_) or forward(round_, skip=state.refused)
         if new is None and state.refused:
             new = forward(round_, skip=tuple(round_.reasons))  # tried just now: no second time
         for add in (add_cycle, add_mode):
@@ -82,7 +84,7 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
             if new is None and not state.terms:
                 new, verdict = add(training, state, rng.spawn(1)[0])
                 sought += [verdict] if verdict is not None else []
-        new = new or exchanged(round_) or widened(training, state)
+        new = new or one_exchanged(round_) or widened(training, state)
         if new is None and (added := add_unnamed(round_)) is not None:
             training, new = added
             tell("added a term without a name")

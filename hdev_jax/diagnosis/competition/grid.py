@@ -8,11 +8,35 @@ from hdev_jax.diagnosis.scores.passes import both_looks
 from hdev_jax.diagnosis.scores.scores import Scores, best_of, plausible
 from hdev_jax.diagnosis.training import Training
 
-__all__ = ["refined"]
+__all__ = ["refined", "sharpened"]
+
+MOST = 3  # candidates whose shapes are looked at again in one step
 
 
-def refined(training: Training, s: Score, scores: Scores) -> Score:
-    """The same way to have the effect with its shapes on a finer grid: switches have many small optima.
+def sharpened(training: Training, scores: Scores) -> Scores:
+    """The scores with the tests at finer shapes of what rows show clearly and clusters do not.
+
+    A threshold that lies between two points of its grid does too much in some trips and too little in others.
+    """
+    settings = training.settings
+    doubted = [
+        s for id_, s in scores.best.items()
+        if scores.q[id_] > settings.fdr and s.p_model < settings.by_rows and not s.plain and s.candidate.shapes
+        and id_ not in scores.absorbed_by
+    ]  # fmt: skip
+    for s in sorted(doubted, key=lambda s: -s.gain)[:MOST]:
+        better, ways = refined(training, s, scores)
+        if better is not s and better.p * ways < s.p:
+            # places stay those of the coarse grid; a refit looks for finer shapes again
+            tests = {k: getattr(better, k) for k in ("p_model", "p_cluster", "left_out_gain")}
+            scores.ways[s.candidate.id] *= ways
+            scores.replaced(replace(s, **tests))
+    return scores
+
+
+def refined(training: Training, s: Score, scores: Scores) -> tuple[Score, float]:
+    """The same way to have the effect with its shapes on a finer grid: switches have many small optima; and how
+    many independent ways that grid tries.
 
     Where it differs between trips alone, the grid reaches a whole step to either side and ordinary least squares choose
     on it: thresholds of a few trips have many small optima, in which the joint refit could end.
@@ -22,7 +46,7 @@ def refined(training: Training, s: Score, scores: Scores) -> Score:
     if "at_trip" in grids:
         grids["at_trip"] = facts.steps_near(dict(s.candidate.shapes)["at_trip"])
     if all(len(g) == 1 for g in grids.values()):
-        return s
+        return s, 1.0
     plan = plan_of(scores.baseline.fit.vehicle, [s.candidate.effect], facts, training.target, grids)
     own = (s.candidate.sizes, s.candidate.groups)
     only = [c.only([g in s.candidate.groups for g in c.groups]) for c in plan.candidates]
@@ -33,11 +57,11 @@ def refined(training: Training, s: Score, scores: Scores) -> Score:
         fits = [(*plain.gain(totals, c.columns), c) for c in same]
         inside = [(gain, b, c) for gain, b, c in fits if plausible(replace(s, candidate=c, beta=b), settings)]
         if not inside:
-            return s
+            return s, 1.0
         _, beta, c = max(inside, key=lambda f: f[0])
-        return replace(s, candidate=c, beta=beta)  # its p stays that of the way it started from
-    best, _ = best_of(white, plain, same, slow, settings)
+        return replace(s, candidate=c, beta=beta), 1.0  # its p stays that of the way it started from
+    best, ways = best_of(white, plain, same, slow, settings)
     finest = best.get(s.candidate.id)
     if finest is None or finest.plain or finest.gain <= s.gain or finest.candidate.groups != s.candidate.groups:
-        return s
-    return finest
+        return s, 1.0
+    return finest, ways[s.candidate.id]

@@ -78,12 +78,12 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
     if (why := _against(best[1], lasting[k], len(every), level, settings)) is not None:
         return no(Kind.NOT_SIGNIFICANT, why, gain, q)
     column = replace(c, columns=(0,))
-    in_mode = _alone(evidence, c.columns[0], z).score(column)
-    if _alone(evidence, plan.width, z).score(column).gain > in_mode.gain - settings.ahead:
+    alone = _alone(evidence, c.columns[0])
+    in_mode = alone.within(z).score(column)
+    if _alone(evidence, plan.width).within(z).score(column).gain > in_mode.gain - settings.ahead:
         why = "in those trips a gain of the whole power explains as much as this coefficient"
         return no(Kind.OUTSCORED, why, gain, q)
-    # which mode a trip is in that was left out is not known beforehand: either is as likely
-    left_out = in_mode.left_out_gain - len(z) * float(np.log(2.0))
+    left_out = alone.left_out_gain_of_mode(z)
     if left_out <= settings.ahead or in_mode.p_cluster > settings.fdr:
         return None, Verdict(ID, gain, q, Rejection(Kind.NOT_CONFIRMED, {"left_out_gain": left_out}))
     names = [int(training.trip[s.start]) for s in slices]
@@ -102,14 +102,10 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
     return replace(state, fit=fit, found=(*state.found, found)), None
 
 
-def _alone(evidence: Evidence, column: int, z: np.ndarray | None = None) -> Evidence:
-    """The evidence of one column alone, in the trips `z` where those are given."""
+def _alone(evidence: Evidence, column: int) -> Evidence:
+    """The evidence of one column alone."""
     at = np.r_[np.arange(evidence.base), evidence.base + column, evidence.grams.shape[-1] - 1]
-    grams = evidence.grams[:, at[:, None], at[None, :]]
-    if z is not None:
-        grams[:, evidence.base, :] *= z[:, None]
-        grams[:, :, evidence.base] *= z[:, None]
-    return replace(evidence, grams=grams, levels=evidence.levels[:, at])
+    return replace(evidence, grams=evidence.grams[:, at[:, None], at[None, :]], levels=evidence.levels[:, at])
 
 
 def _solved(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:

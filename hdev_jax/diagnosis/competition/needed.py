@@ -10,27 +10,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
-from hdev_jax.diagnosis.competition.forward import Round, forward
-from hdev_jax.diagnosis.competition.refit import gained, refit, without
+from hdev_jax.diagnosis.competition.refit import without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import alike
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of
-from hdev_jax.diagnosis.scores.scores import Scores, plausible, score_all, worth
+from hdev_jax.diagnosis.scores.scores import Scores, worth
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
 
-__all__ = ["backward", "classes", "exchanged", "needed"]
+__all__ = ["backward", "can_be_asked", "classes", "model_without", "needed"]
 
 
 @dataclass(frozen=True)
 class Without:
-    """The evidence of a model without one of its effects, and that effect as a candidate in it."""
+    """The evidence of a model without some of its effects, and those as candidates in it."""
 
     evidence: Evidence
-    own: Candidate
+    each: tuple[Candidate, ...]
     shift: int  # of the other candidates' places
+
+    @property
+    def own(self) -> Candidate:
+        """The one effect that is out."""
+        (own,) = self.each
+        return own
 
     def rivals(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Other candidates at their places in this evidence."""
@@ -48,20 +53,25 @@ class Without:
         return [c for _, c in best.values()]
 
 
-def model_without(evidence: Evidence, fit: Calibration, f: Found) -> Without:
-    """The model without a found effect; its shapes are held where they are."""
-    prefix = f"effects.{f.id}."
-    mine = [k for k, c in enumerate(fit.table.free) if c.path.startswith(prefix)]
-    sizes = [k for k in mine if fit.table.free[k].path.removeprefix(prefix) in f.score.candidate.sizes]
-    order = [*sizes, *(k for k in mine if k not in sizes)]
-    nulls = [f.score.candidate.parameter(fit.table.free[k].path.removeprefix(prefix)).null for k in sizes]
-    values = np.r_[fit.values[sizes] - nulls, np.zeros(len(order) - len(sizes))]
-    names = tuple(fit.table.free[k].path.removeprefix(prefix) for k in sizes)
-    groups = tuple(fit.table.free[k].group for k in sizes)
-    own = replace(f.score.candidate, sizes=names, groups=groups, columns=tuple(range(len(sizes))))
-    freed = evidence.freed(order, values)
+def model_without(evidence: Evidence, fit: Calibration, *out: Found) -> Without:
+    """The model without found effects; their shapes are held where they are."""
+    sizes: list[int] = []
+    shapes: list[int] = []
+    each, nulls = [], []
+    for f in out:
+        c, prefix = f.score.candidate, f"effects.{f.id}."
+        mine = {k: row.path.removeprefix(prefix) for k, row in enumerate(fit.table.free) if row.path.startswith(prefix)}
+        own = [k for k, name in mine.items() if name in c.sizes]
+        places = tuple(range(len(sizes), len(sizes) + len(own)))
+        names, groups = tuple(mine[k] for k in own), tuple(fit.table.free[k].group for k in own)
+        each.append(replace(c, sizes=names, groups=groups, columns=places))
+        nulls += [c.parameter(n).null for n in names]
+        sizes += own
+        shapes += [k for k in mine if k not in own]
+    values = np.r_[fit.values[sizes] - nulls, np.zeros(len(shapes))]
+    freed = evidence.freed([*sizes, *shapes], values)
     assert isinstance(freed, Evidence)
-    return Without(freed, own, len(order))
+    return Without(freed, tuple(each), len(sizes) + len(shapes))
 
 
 def needed(evidence: Evidence, fit: Calibration, f: Found) -> Score:
@@ -70,10 +80,14 @@ def needed(evidence: Evidence, fit: Calibration, f: Found) -> Score:
     return (w.evidence.plain_score if f.score.plain else w.evidence.score)(w.own)
 
 
-def _can_be_asked(f: Found) -> bool:
-    """Whether it has columns that can be tested: a switch is either there or not, and searched effects have none."""
-    c = f.score.candidate
-    return c.kind == "size" and not c.effect.searched
+def _has_columns(f: Found) -> bool:
+    """Whether it has columns that can be tested: a switch is either there or not."""
+    return f.score.candidate.kind == "size"
+
+
+def can_be_asked(f: Found) -> bool:
+    """Whether it can be tested against others: effects with a search of their own are no candidates like others."""
+    return _has_columns(f) and not f.score.candidate.effect.searched
 
 
 def backward(training: Training, state: State, *, newest: bool = False) -> State:
@@ -81,16 +95,16 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
 
     The newest has just passed every gate beside the others and is not tested, unless `newest`: the others have changed.
     Beside a term without a name an effect has to be as significant as when it entered, unless it reads the same channel
-    (the two may be parts of one cause) or is a constant load.
+    (the two may be parts of one cause) or is a constant load; and so has a constant load beside a cycle.
     """
     settings = training.settings
-    while asked := [f for f in (state.found if newest or state.terms else state.found[:-1]) if _can_be_asked(f)]:
+    while asked := [f for f in (state.found if newest or state.terms else state.found[:-1]) if _has_columns(f)]:
         evidence = evidence_of(training.baseline(state.fit))
         worst: tuple[float, Found] | None = None
         for f in asked:
-            score = needed(evidence, state.fit, f)
-            allowed = settings.fdr / max(len(training.library), 1) if _beside_unnamed(state, f) else settings.keep
-            p = max(score.p_model, score.p_cluster) if _beside_unnamed(state, f) else score.p_cluster
+            p = needed(evidence, state.fit, f).p
+            strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
+            allowed = settings.fdr / max(len(training.library), 1) if strictly else settings.keep
             if p > allowed and (worst is None or p / allowed > worst[0]):
                 worst = (p / allowed, f)
         if worst is None:
@@ -104,10 +118,19 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
     return state
 
 
+def _constant(f: Found) -> bool:
+    return all(f.score.candidate.parameter(size).constant for size in f.score.candidate.sizes)
+
+
+def _beside_cycle(state: State, f: Found) -> bool:
+    """Whether it is a constant load beside a cycle: the cycle's mean is known as well as its duty only."""
+    return _constant(f) and any(g.score.candidate.effect.searched == "spectrum" for g in state.found)
+
+
 def _beside_unnamed(state: State, f: Found) -> bool:
-    c = f.score.candidate
-    if all(c.parameter(size).constant for size in c.sizes):  # never gives way to a term without a name
+    if _constant(f):  # never gives way to a term without a name
         return False
+    c = f.score.candidate
     reads = c.effect.reads()
     return any(not reads & {*t.channels} for t in state.terms)
 
@@ -119,7 +142,7 @@ def classes(scores: Scores, state: State) -> tuple[Found, ...]:
     """
     out = []
     for f in state.found:
-        if not _can_be_asked(f):
+        if not can_be_asked(f):
             out.append(f)
             continue
         w = model_without(scores.plain if f.score.plain else scores.white, scores.baseline.fit, f)
@@ -127,60 +150,3 @@ def classes(scores: Scores, state: State) -> tuple[Found, ...]:
         rivals = w.best_ways([c for c in scores.source.candidates if c.id in scores.best], scores)
         out.append(replace(f, alike=alike(w.evidence, w.own, rivals, own.gain, scores, plain=f.score.plain)))
     return tuple(out)
-
-
-def exchanged(round_: Round) -> State | None:
-    """The state with a found effect exchanged for another that explains clearly more in its place, or None.
-
-    An effect added early may have been a proxy for one that was not in the model yet. All but the newest are tested;
-    an exchange passes every gate of an addition, and is well ahead in the joint refits too.
-    """
-    training, state, scores = round_.training, round_.state, round_.scores
-    for f in state.found[:-1]:
-        if not _can_be_asked(f):
-            continue
-        w = model_without(scores.plain if f.score.plain else scores.white, scores.baseline.fit, f)
-        score_of = w.evidence.plain_scores if f.score.plain else w.evidence.scores
-        out = {*state.barred, *state.refused, *round_.reasons}
-        ids = [id_ for id_, s in scores.best.items() if id_ not in out and s.plain == f.score.plain]
-        rivals = score_of(w.rivals([scores.best[id_].candidate for id_ in ids]))
-        own = scores.worth(score_of([w.own])[0])
-        ahead = [s.candidate.id for s in rivals if _well_ahead(round_, scores.worth(s), own) and _bears(round_, s)]
-        if not ahead:
-            continue
-        round_.tell(f"testing {' and '.join(ahead)} in place of {f.id}")
-        start = replace(without(training, state, f.id), refused=())
-        fresh = Round(training, start, score_all(training, start.fit), round_.rng, round_.tell)
-        own = _own_worth(fresh, state, f)
-        while ahead and (new := forward(fresh, only=ahead)) is not None:
-            first = new.found[-1]
-            if _well_ahead(round_, fresh.scores.worth(replace(first.score, gain=first.gain)), own):
-                round_.tell(f"exchanged {f.id} for {first.id}")
-                why = Rejection(Kind.SUPERFLUOUS, {"beside": first.id, "times": 2})
-                return replace(new, refused=state.refused, removed={**state.removed, f.id: why})
-            ahead.remove(first.id)
-    return None
-
-
-def _bears(round_: Round, s: Score) -> bool:
-    """Whether a rival by itself is plausible, significant and confirmed by cross-validation over clusters."""
-    settings, id_ = round_.training.settings, s.candidate.id
-    q = s.p * round_.scores.ways[id_] * len(round_.scores.best)
-    return plausible(s, settings) and q <= settings.fdr and s.left_out_gain > settings.ahead
-
-
-def _well_ahead(round_: Round, one: float, other: float) -> bool:
-    """By more than the margin of the choice among leaders, and by more than chance."""
-    settings = round_.training.settings
-    return settings.close * one > other and one - other > settings.ahead
-
-
-def _own_worth(fresh: Round, state: State, f: Found) -> float:
-    """What a found effect is worth in its place: the best of as found, as scored now, and as refitted now."""
-    scores = fresh.scores
-    ways = [scores.worth(replace(f.score, gain=gained(fresh.training, state.fit, scores)))]
-    if (own := scores.best.get(f.id)) is not None:
-        ways.append(scores.worth(own))
-        if (again := refit(fresh.training, fresh.state, own, scores)).fit is not None:
-            ways.append(scores.worth(replace(own, gain=again.gain)))
-    return max(ways)

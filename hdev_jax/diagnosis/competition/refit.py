@@ -59,7 +59,7 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
     better = generalise and bool(np.all(settings.known * white_sd <= plain_sd))
     # one linear step predicts the result of a refit, unless thresholds and time constants are free to move
     least_squares = bool(np.any(clear)) or shaped or s.plain or c.kind == "limit"
-    start = refined(training, s, scores) if shaped or least_squares else s
+    start = refined(training, s, scores)[0] if shaped or least_squares else s
     noise = scores.baseline.noise
     ways = [noise] * better + [None] * least_squares + [noise] * (generalise and not better)
     fewer = None

@@ -67,6 +67,17 @@ def _significant(a: Asked) -> Rejection | None:
     return Rejection(Kind.NOT_SIGNIFICANT, {"q": float(q)}) if q > a.scores.settings.fdr else None
 
 
+def _agreed(a: Asked) -> Rejection | None:
+    """Slow noise looks like a slow cause where only clusters count; weights that suit the noise leave some of one."""
+    s, share = a.score, a.scores.settings.agreed
+    if not s.plain:
+        return None
+    white, sd = a.scores.white.estimate(s.candidate)
+    if np.any(np.sign(s.beta) * white + 2.0 * sd >= share * np.abs(s.beta)):
+        return None
+    return Rejection(Kind.CONTRADICTED, {"share": share})
+
+
 def _worthwhile(a: Asked) -> Rejection | None:
     worth = a.scores.worth(a.score)
     return Rejection(Kind.OUTSCORED, {"worth": float(worth)}) if worth <= 0 else None
@@ -109,7 +120,15 @@ def _stable(a: Asked) -> Rejection | None:
     return Rejection(Kind.UNSTABLE, {"percent": 100.0 * share, "unit": a.unit})
 
 
-SCORE_GATES: tuple[Gate, ...] = (_not_absorbed, _enough_clusters, _plausible, _confirmed, _significant, _worthwhile)
+SCORE_GATES: tuple[Gate, ...] = (
+    _not_absorbed,
+    _enough_clusters,
+    _plausible,
+    _confirmed,
+    _significant,
+    _agreed,
+    _worthwhile,
+)
 DRAWN_GATES: tuple[Gate, ...] = (_beats_placebos, _stable)
 
 

@@ -18,6 +18,7 @@ class Kind(StrEnum):
     IMPLAUSIBLE = "implausible"
     NOT_CONFIRMED = "not_confirmed"
     NOT_SIGNIFICANT = "not_significant"
+    CONTRADICTED = "contradicted"
     OUTSCORED = "outscored"
     REFIT = "refit"
     PLACEBO = "placebo"
@@ -49,6 +50,7 @@ SENTENCES = {
     Kind.IMPLAUSIBLE: "its best estimate has the wrong sign or is out of range",
     Kind.NOT_CONFIRMED: "not confirmed by cross-validation: does not lower the error on {unit} left out of the fit",
     Kind.NOT_SIGNIFICANT: "not significant over the whole library (FDR-adjusted p = {q:.2g})",
+    Kind.CONTRADICTED: "generalised least squares exclude {share:.0%} of its size by ordinary least squares",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
     Kind.PLACEBO: "a placebo ({how}) does as well",

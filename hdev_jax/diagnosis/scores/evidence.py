@@ -37,8 +37,8 @@ class Score:
 
     @property
     def p(self) -> float:
-        """Both tests have to agree; twice that, since ordinary and generalised least squares are both tried."""
-        return min(1.0, 2.0 * max(self.p_model, self.p_cluster))
+        """Both tests have to agree."""
+        return max(self.p_model, self.p_cluster)
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,8 @@ class Evidence(NormalEquations):
             k = at.shape[-1]
             likelihood, x = self._fit(totals, at)
             full, beta = self._jackknife(at, 0), x[0, :, self.base :]
-            p = wald(beta, full[..., self.base :])
+            rests_on = np.array([np.min(self.bearing(candidates[i])) for i in places])
+            p = wald(beta, full[..., self.base :], np.clip(rests_on, k + 1, g) - k)
             # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
             statistic = np.zeros(len(places))
             if g >= least_clusters(k):
@@ -156,6 +157,24 @@ class Evidence(NormalEquations):
         grams[:, at[:, None], at[None, :]] = inner
         levels[:, at] *= sign[self.home][:, None]
         return replace(self, grams=grams, levels=levels)
+
+    def within(self, on: Float[np.ndarray, " cluster"]) -> "Evidence":
+        """The same evidence of candidates that act in the clusters `on` alone."""
+        grams, k = self.grams.copy(), np.arange(self.base, self.grams.shape[-1] - 1)
+        grams[:, k, :] *= on[:, None, None]
+        grams[:, :, k] = np.swapaxes(grams[:, k, :], 1, 2)
+        return replace(self, grams=grams)
+
+    def left_out_gain_of_mode(self, on: Float[np.ndarray, " cluster"]) -> float:
+        """Gain in log-likelihood, over clusters left out in turn, of one column that acts in the clusters `on` alone.
+
+        Whether a cluster that is left out has it is not known: it is as likely as among the others.
+        """
+        x = self.within(on)._jackknife(np.array([self.base]), 0)
+        index, share = np.arange(self.base + 1), (np.sum(on) - on) / (len(on) - 1)
+        with_it, without = (self._loss(x * np.r_[np.ones(self.base), k], index, 0) for k in (1.0, 0.0))
+        either = np.logaddexp(np.log(share) - with_it, np.log1p(-share) - without)
+        return float(np.sum(self._base_loss(0) + either))
 
     def sign_placebos(self, s: Score, rng: np.random.Generator, draws: int) -> Float[np.ndarray, " draw"]:
         """Gains of the same columns with each cluster's sign drawn at random: what no consistent effect would give."""

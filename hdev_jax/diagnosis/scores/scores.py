@@ -33,7 +33,8 @@ def plausible(s: Score, settings: Settings) -> bool:
         least = 0.05 * settings.switch_low if first.smooth else settings.switch_low
         return bool(least <= s.beta[0] <= settings.switch_high and size >= first.least)
     each = [(c.parameter(n), b) for n, b in zip(c.sizes, s.beta, strict=True)]
-    return all(p.lower <= p.null + b <= p.upper for p, b in each) and any(abs(b) >= p.least for p, b in each)
+    enough = any if None not in c.groups else all  # a gear may have nothing; a gain of 0 beside an offset is a load
+    return all(p.lower <= p.null + b <= p.upper for p, b in each) and enough(abs(b) >= p.least for p, b in each)
 
 
 def without_idle(c: Candidate, beta: np.ndarray) -> Candidate | None:
@@ -121,8 +122,8 @@ class Scores:
         return bool(self.slow[list(candidate.columns)].all())
 
     def level(self, id_: str) -> float:
-        """What a p-value of one test has to be, by Bonferroni over the library and over the two kinds of evidence."""
-        return self.settings.fdr / (2.0 * len(self.best) * self.ways[id_])
+        """What a p-value of one test has to be, by Bonferroni over the library and the ways to have the effect."""
+        return self.settings.fdr / (len(self.best) * self.ways[id_])
 
 
 def score_all(training: Training, fit: Calibration, made: Source | None = None) -> Scores:
@@ -173,6 +174,7 @@ def best_of(
         looks = [_clearest(by_rows[id_], settings)]
         if scores := by_trips[id_]:
             looks.append(_clearest(scores, settings))
+            ways[id_] *= 2.0  # both ordinary and generalised least squares are tried
         # where both show it, generalised least squares estimate it better
         able = [s for s in looks if plausible(s, settings) and s.left_out_gain > settings.ahead] or looks[:1]
         best[id_] = min(able, key=lambda s: (s.p > CERTAIN, s.p if s.p > CERTAIN else 0.0))
@@ -194,19 +196,19 @@ def _all_inside(
 
 
 def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
-    return sorted(entries, key=lambda e: _falling(e[0]))[:LEADING]
+    return sorted(entries, key=lambda e: -_rounded(e[0]))[:LEADING]
 
 
 def _in_order(scores: Sequence[Score], settings: Settings) -> list[Score]:
-    return sorted(scores, key=lambda s: _falling(worth(s.gain, s.candidate, settings)))
+    return sorted(scores, key=lambda s: -_rounded(worth(s.gain, s.candidate, settings)))
 
 
-def _falling(value: float) -> float:
-    """For sorting from the best: ways that come to the same but for rounding keep the order of the library's grids.
+def _rounded(value: float) -> float:
+    """For sorting: ways that come to the same but for rounding keep the order of the library's grids.
 
     A delay of a row by linear and by cubic interpolation is one column, but where a refit starts from differs.
     """
-    return -float(f"{value:.9g}")
+    return float(f"{value:.6g}")
 
 
 def _clearest(scores: list[Score], settings: Settings) -> Score:
@@ -220,7 +222,7 @@ def _clearest(scores: list[Score], settings: Settings) -> Score:
         return (able or scores)[0]
     bar = settings.close * worth(able[0].gain, able[0].candidate, settings)
     close = (s for s in able if worth(s.gain, s.candidate, settings) >= bar)
-    return min(close, key=lambda s: s.p, default=able[0])
+    return min(close, key=lambda s: _rounded(s.p), default=able[0])
 
 
 def _absorption(

@@ -12,8 +12,13 @@ def least_clusters(k: int) -> int:
     return k + 2
 
 
-def wald(beta: Float[np.ndarray, "*way k"], left_out: Float[np.ndarray, "cluster *way k"]) -> Float[np.ndarray, "*way"]:
-    """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F)."""
+def wald(
+    beta: Float[np.ndarray, "*way k"],
+    left_out: Float[np.ndarray, "cluster *way k"],
+    freedom: Float[np.ndarray, "*way"] | None = None,
+) -> Float[np.ndarray, "*way"]:
+    """p of coefficients against zero, their covariance from clusters left out in turn (Hotelling's F); `freedom` of the
+    covariance, where clusters are not alike."""
     g, k = left_out.shape[0], left_out.shape[-1]
     if g < least_clusters(k):
         return np.ones(beta.shape[:-1])
@@ -22,7 +27,7 @@ def wald(beta: Float[np.ndarray, "*way k"], left_out: Float[np.ndarray, "cluster
     d = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 1e-300))
     inverse = np.linalg.pinv(covariance / (d[..., :, None] * d[..., None, :]), rcond=1e-10)
     w = np.einsum("...i,...ij,...j->...", beta / d, inverse, beta / d)
-    return np.asarray(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k))
+    return np.asarray(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k if freedom is None else freedom))
 
 
 def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
@@ -59,15 +64,14 @@ def ruled_out(share: float, p: float, k: int, clusters: int, level: float = 0.05
 
 
 def effective_number(gram: Float[np.ndarray, "k k"]) -> float:
-    """How many independent tests columns amount to, by the eigenvalues of their correlations (Nyholt 2004).
+    """How many independent tests columns amount to, by the eigenvalues of their correlations: (Σ√λ)²/Σλ (Galwey,
+    Genetic Epidemiology 33, 2009).
 
     One where all are alike (or there is none), their number where none is like another. The same threshold at
-    neighbouring values of a grid is nearly the same test. Their mean is 1 and their squares add up to those of the
-    correlations, so that their variance needs no eigenvalue.
+    neighbouring values of a grid is nearly the same test.
     """
     d = np.sqrt(np.diag(gram))
-    count = len(d)
-    if count < 2:
+    if len(d) < 2:
         return 1.0
-    variance = (np.sum((gram / np.outer(d, d)) ** 2) - count) / (count - 1)
-    return float(1.0 + (count - 1) * (1.0 - variance / count))
+    each = np.maximum(np.linalg.eigvalsh(gram / np.outer(d, d)), 0.0)
+    return float(np.sum(np.sqrt(each)) ** 2 / np.sum(each))

@@ -1,0 +1,142 @@
+"""Exchanges: a found effect, or two at once, for others that explain clearly more in their place.
+
+An effect added early may have been a proxy for one that was not in the model yet, and two of them for two others: of
+which none by itself is better than either.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.competition.forward import Round, forward
+from hdev_jax.diagnosis.competition.needed import Without, can_be_asked, model_without
+from hdev_jax.diagnosis.competition.refit import gained, refit, without
+from hdev_jax.diagnosis.competition.state import Found, State
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.scores import Scores, plausible, score_all, worth
+
+__all__ = ["one_exchanged", "two_exchanged"]
+
+
+def one_exchanged(round_: Round) -> State | None:
+    """The state with a found effect exchanged for another, or None.
+
+    All but the newest are tested; an exchange passes every gate of an addition, and is well ahead in the joint refits
+    too.
+    """
+    training, state, scores = round_.training, round_.state, round_.scores
+    for f in state.found[:-1]:
+        if not can_be_asked(f):
+            continue
+        w = model_without(scores.plain if f.score.plain else scores.white, scores.baseline.fit, f)
+        score_of = w.evidence.plain_scores if f.score.plain else w.evidence.scores
+        out = {*state.barred, *state.refused, *round_.reasons}
+        ids = [id_ for id_, s in scores.best.items() if id_ not in out and s.plain == f.score.plain]
+        rivals = score_of(w.rivals([scores.best[id_].candidate for id_ in ids]))
+        own = scores.worth(score_of([w.own])[0])
+        ahead = [s.candidate.id for s in rivals if _well_ahead(round_, scores.worth(s), own) and _bears(round_, s)]
+        if not ahead:
+            continue
+        round_.tell(f"testing {' and '.join(ahead)} in place of {f.id}")
+        start = replace(without(training, state, f.id), refused=())
+        fresh = Round(training, start, score_all(training, start.fit), round_.rng, round_.tell)
+        own = _own_worth(fresh, state, f)
+        while ahead and (new := forward(fresh, only=ahead)) is not None:
+            first = new.found[-1]
+            if _well_ahead(round_, fresh.scores.worth(replace(first.score, gain=first.gain)), own):
+                round_.tell(f"exchanged {f.id} for {first.id}")
+                why = Rejection(Kind.SUPERFLUOUS, {"beside": first.id, "times": 2})
+                return replace(new, refused=state.refused, removed={**state.removed, f.id: why})
+            ahead.remove(first.id)
+    return None
+
+
+def two_exchanged(round_: Round) -> State | None:
+    """The state with two found effects exchanged for two others, each of which passes every gate beside the other."""
+    training, state, scores = round_.training, round_.state, round_.scores
+    asked = [f for f in state.found if can_be_asked(f) and not f.score.plain]
+    for f, g in combinations(asked, 2):
+        ahead = _best_pair(round_, model_without(scores.white, scores.baseline.fit, f, g), {f.id, g.id})
+        if ahead is None:
+            continue
+        a, b = (c.id for c in ahead)
+        round_.tell(f"testing {a} and {b} in place of {f.id} and {g.id}")
+        start = replace(without(training, state, f.id, g.id), refused=())
+        fresh = Round(training, start, score_all(training, start.fit), round_.rng, round_.tell)
+        ab, ba = _beside(fresh, a, b), _beside(fresh, b, a)
+        if ab is None or ba is None:
+            continue
+        own = _together(fresh.scores, gained(training, state.fit, fresh.scores), [f.score.candidate, g.score.candidate])
+        if _well_ahead(round_, _together(fresh.scores, gained(training, ab.fit, fresh.scores), ahead), own):
+            round_.tell(f"exchanged {f.id} and {g.id} for {a} and {b}")
+            why = Rejection(Kind.SUPERFLUOUS, {"beside": f"{a} and {b}", "times": 2})
+            found = (*start.found, ba.found[-1], ab.found[-1])
+            return replace(ab, found=found, refused=state.refused, removed={**state.removed, f.id: why, g.id: why})
+    return None
+
+
+def _best_pair(round_: Round, w: Without, out: set[str]) -> list[Candidate] | None:
+    """The plausible pair that explains most in place of those that are `out`; None where it is not well ahead."""
+    scores, settings = round_.scores, round_.training.settings
+    out = {*out, *round_.state.barred, *scores.absorbed_by}
+    ways = w.rivals([s.candidate for id_, s in scores.best.items() if id_ not in out and not s.plain])
+    totals, pairs = w.evidence.totals(), list(combinations(ways, 2))
+    own = _together(scores, w.evidence.gain(totals, [k for c in w.each for k in c.columns])[0], w.each)
+    gains = w.evidence.gains(totals, [(*a.columns, *b.columns) for a, b in pairs])
+    worths = np.array([_together(scores, float(x), pair) for x, pair in zip(gains, pairs, strict=True)])
+    for k in np.argsort(-worths):
+        if not _well_ahead(round_, float(worths[k]), own):
+            return None
+        a, b = pairs[int(k)]
+        beta = np.split(w.evidence.gain(totals, (*a.columns, *b.columns))[1], [len(a.columns)])
+        each = [replace(scores.best[c.id], beta=x) for c, x in zip((a, b), beta, strict=True)]
+        if all(plausible(s, settings) for s in each):
+            return [a, b]
+    return None
+
+
+def _beside(start: Round, first: str, second: str) -> State | None:
+    """The state with `second` added by every gate where `first` is in the model."""
+    if first not in start.scores.best:
+        return None
+    s = start.scores.best[first]
+    came = refit(start.training, start.state, s, start.scores)
+    if came.fit is None:
+        return None
+    found = Found(first, came.score, 1.0, 0.0, (), came.gain)
+    there = replace(start.state, fit=came.fit, found=(*start.state.found, found))
+    fresh = Round(start.training, there, score_all(start.training, there.fit), start.rng, start.tell)
+    return forward(fresh, only=[second])
+
+
+def _together(scores: Scores, gain: float, candidates: Sequence[Candidate]) -> float:
+    """What the gain of some candidates together is worth."""
+    return gain + sum(worth(0.0, c, scores.settings) for c in candidates)
+
+
+def _bears(round_: Round, s: Score) -> bool:
+    """Whether a rival by itself is plausible, significant and confirmed by cross-validation over clusters."""
+    settings, id_ = round_.training.settings, s.candidate.id
+    q = s.p * round_.scores.ways[id_] * len(round_.scores.best)
+    return plausible(s, settings) and q <= settings.fdr and s.left_out_gain > settings.ahead
+
+
+def _well_ahead(round_: Round, one: float, other: float) -> bool:
+    """By more than the margin of the choice among leaders, and by more than chance."""
+    settings = round_.training.settings
+    return settings.close * one > other and one - other > settings.ahead
+
+
+def _own_worth(fresh: Round, state: State, f: Found) -> float:
+    """What a found effect is worth in its place: the best of as found, as scored now, and as refitted now."""
+    scores = fresh.scores
+    ways = [scores.worth(replace(f.score, gain=gained(fresh.training, state.fit, scores)))]
+    if (own := scores.best.get(f.id)) is not None:
+        ways.append(scores.worth(own))
+        if (again := refit(fresh.training, fresh.state, own, scores)).fit is not None:
+            ways.append(scores.worth(replace(own, gain=again.gain)))
+    return max(ways)
