@@ -11,8 +11,8 @@ from planted import declared, diagnosed, found_in_turn, named, opened, training
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
 from hdev_jax.diagnosis.competition.compete import compete
-from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
+from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import joined, refit, widened, without
 from hdev_jax.diagnosis.competition.state import Found, State
@@ -157,7 +157,7 @@ def test_what_may_not_be_exchanged_is_not(why, two):
 
 
 def test_two_that_together_stand_for_two_others_are_exchanged_at_once(tmp_path):
-    """Efficiency and grade together look like a rotating mass with friction brakes: none of the four is better alone."""
+    """Efficiency and grade together look like a rotating mass with friction brakes: none of these is better alone."""
     planted, proxies = ("rotating_mass", "friction_blending"), ("efficiency_scale", "grade_scale")
     options = {"effects": {k: {} for k in planted}, "ratio": 0.5, "ar_coefficient": 0.97}
     _, problem, _ = opened(tmp_path, seed=750126, trips=12, **options)
