@@ -4,7 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hdev_jax.logs import read_log
+    from hdev_jax.inference.sheet import Sheet, read_sheet
+    from hdev_jax.logs import Log, read_log
     from hdev_jax.physics.vehicle import Vehicle
     from hdev_jax.segments import Segments
     from hdev_jax.verbs.calibrate import calibrate
@@ -12,12 +13,18 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.diagnose import diagnose
     from hdev_jax.verbs.effects import effects
     from hdev_jax.verbs.predict import predict
+    from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
     from hdev_jax.verbs.simulate import simulate
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "CalibrationResult",
+    "Diagnosis",
+    "Log",
+    "Prediction",
     "Segments",
+    "Sheet",
     "Vehicle",
     "__version__",
     "calibrate",
@@ -26,10 +33,17 @@ __all__ = [
     "effects",
     "predict",
     "read_log",
+    "read_sheet",
     "simulate",
 ]
 
 _HOME = {
+    "CalibrationResult": "hdev_jax.verbs.result",
+    "Diagnosis": "hdev_jax.verbs.result",
+    "Log": "hdev_jax.logs",
+    "Prediction": "hdev_jax.verbs.result",
+    "Sheet": "hdev_jax.inference.sheet",
+    "read_sheet": "hdev_jax.inference.sheet",
     "Segments": "hdev_jax.segments",
     "Vehicle": "hdev_jax.physics.vehicle",
     "read_log": "hdev_jax.logs",

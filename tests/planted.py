@@ -13,7 +13,7 @@ import pandas as pd
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State
-from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
+from hdev_jax.diagnosis.diagnose import Outcome, diagnose
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.fleet import SyntheticLog, synthetic_log
@@ -45,14 +45,14 @@ SHORT = {"trips": 12, "rows_per_trip": 120, "ar_coefficient": 0.97}
 _runs = 0
 
 
-def run(seed: int, **options) -> tuple[SyntheticLog, Diagnosis]:
+def run(seed: int, **options) -> tuple[SyntheticLog, Outcome]:
     """Write a short log and its sheet, read them back, and run the whole loop on the default split."""
     with tempfile.TemporaryDirectory() as folder:
         synthetic, problem, split = opened(Path(folder), seed=seed, **SHORT | options)
     return synthetic, diagnosed(problem, split)
 
 
-def diagnosed(problem: Problem, split: Split, library: Mapping[str, type[Effect]] = LIBRARY, **options) -> Diagnosis:
+def diagnosed(problem: Problem, split: Split, library: Mapping[str, type[Effect]] = LIBRARY, **options) -> Outcome:
     """The whole loop, with what a process that compiles for every log has to forget now and then."""
     global _runs
     _runs += 1
@@ -76,7 +76,7 @@ def opened(
     return synthetic, prepare(split.log, read_sheet(files["sheet"]), target), split
 
 
-def named(result: Diagnosis) -> list[str]:
+def named(result: Outcome) -> list[str]:
     """Ids of what was found, in order."""
     return [e["id"] for e in result.summary["effects"]]
 
@@ -106,7 +106,7 @@ def found_in_turn(training: Training, problem: Problem, ids: Iterable[str], **on
     return state
 
 
-def breaches(diagnosis: Diagnosis) -> list[str]:
+def breaches(diagnosis: Outcome) -> list[str]:
     """What the contract's own checker says of it; nothing where the checker is not at hand."""
     if not CHECKER.exists():
         return []

@@ -24,14 +24,14 @@ from hdev_jax.physics import Effect, Vehicle, most_group
 from hdev_jax.problem import Problem, Split
 from hdev_jax.targets import TARGETS
 
-__all__ = ["Diagnosis", "diagnose", "training_of"]
+__all__ = ["Outcome", "diagnose", "training_of"]
 
 Tell = Callable[[str], None]
 Checkpoint = Callable[[str, Callable[[], Any]], Any]
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Outcome:
     """What came out: `summary` is diagnosis.json, `before` and `after` the two vehicles, the columns for figures."""
 
     problem: Problem
@@ -54,13 +54,13 @@ def diagnose(
     seed: int = 0,
     tell: Tell = lambda _: None,
     checkpoint: Checkpoint = lambda _, compute: compute(),
-) -> Diagnosis:
+) -> Outcome:
     """What the declared vehicle lacks. Test trips are held out: they are used once, when everything has been chosen.
 
     **Arguments:** `library`, the candidates by id; `settings`, every number that decides; `seed` of placebos,
     resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
 
-    **Returns:** a `Diagnosis`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
+    **Returns:** a `Outcome`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
     """
     # 1. The training rows, and the effects that could act on this target
     training, excluded = training_of(problem, split, library, settings)
@@ -105,7 +105,7 @@ def diagnose(
     # a sheet's numbers belong together: sizes as estimated at the shapes that it holds
     sheet = {f.id: parameters_of(f, steps[-1], {}, summary["clusters"]["count"]) for f in named.found}
     found = {k: {n: (p["value"], p["sd"], p["unit"]) for n, p in v.items()} for k, v in sheet.items()}
-    return Diagnosis(
+    return Outcome(
         problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
     )
 

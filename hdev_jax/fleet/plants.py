@@ -15,7 +15,7 @@ class Plant:
     `null` is the value of `size` without the effect (infinite for a limit). `match` says which side gives way where a
     ratio of effect to noise is asked for: "noise" where another size would be implausible, or jumps. `like` is the
     library's effect that comes nearest to one which the library does not hold in this form; `partly` are effects that
-    a part of it is, as a constant load is of the mean of a cycle. `absorbed` are entries
+    a part of it is, as a constant load is the mean of one that switches. `absorbed` are entries
     where declared coefficients take all of it: it can be planted there, but has no size beyond them.
     """
 
@@ -83,7 +83,11 @@ PLANTABLE: dict[str, Plant] = {
         {"power_w": 8000.0, "period_s": 1500.0}, ("power_w",), in_library=False, partly=("auxiliary_power",)
     ),
     "outside_humidity_load": Plant(
-        {"power_w": 2500.0, "threshold_pct": 70.0}, ("power_w",), in_library=False, match="noise"
+        {"power_w": 2500.0, "threshold_pct": 70.0},
+        ("power_w",),
+        in_library=False,
+        match="noise",
+        partly=("auxiliary_power",),
     ),
     # what the library holds in another form
     "squared_hvac_power": Plant({"w_per_k2": 20.0, "at_c": 17.0}, ("w_per_k2",), in_library=False, like="hvac_power"),

@@ -1,12 +1,11 @@
 """From a run's results to what the page, the figures and the terminal show."""
 
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.diagnose import Diagnosis
+from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.inference import padded
 from hdev_jax.physics.across import distance_since_start
 from hdev_jax.problem import Problem, Split
@@ -46,7 +45,7 @@ def report_data(
     )  # fmt: skip
 
 
-def of_diagnosis(result: Diagnosis, command: str, started: float) -> ReportData:
+def of_diagnosis(result: Outcome, command: str, started: float) -> ReportData:
     problem, split = result.problem, result.split
     breakdown = {}
     if TARGETS[problem.target].of_battery:
@@ -64,7 +63,8 @@ def of_diagnosis(result: Diagnosis, command: str, started: float) -> ReportData:
     )
 
 
-def answer_text(data: ReportData, out: Path) -> str:
+def answer_text(data: ReportData) -> str:
+    """The answer in plain text: what is missing, errors before and after, effects with their sizes, what remains."""
     s = data.summary
     lines = [answer(data), "", f"{'':10s}{'test RMSE':>12s}{'energy/work error':>20s}   [{data.unit}]"]
     for when in ("before", "after"):
@@ -79,5 +79,4 @@ def answer_text(data: ReportData, out: Path) -> str:
     lines += next_drives(s)
     lines.append(s["unexplained"]["signature"])
     lines += [f"note: {note}" for note in s.get("notes", [])]
-    lines.append(str(out / "report.html"))
     return "\n".join(lines)

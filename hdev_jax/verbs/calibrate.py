@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,39 +12,42 @@ from hdev_jax import progress
 from hdev_jax.diagnosis.result.summary import baseline_block
 from hdev_jax.errors import InputError
 from hdev_jax.inference import cluster_rows, padded
-from hdev_jax.inference.posterior.methods import METHODS, Outcome, calibrated
+from hdev_jax.inference.posterior.methods import METHODS, Method, Outcome, calibrated
 from hdev_jax.inference.sheet import augmented_sheet
 from hdev_jax.problem import Problem, Split, metrics
 from hdev_jax.report.build import report_data
 from hdev_jax.report.page import write_calibration_report
-from hdev_jax.rundir import open_run
-from hdev_jax.verbs.opening import Paths, command_line, known_effects, opened
-from hdev_jax.verbs.predict import write_predictive
+from hdev_jax.rundir import Run, open_run
+from hdev_jax.verbs.opening import Effects, Logs, Opening, Vehicles, command_line, known_effects, opened
+from hdev_jax.verbs.predict import BESIDE, predictive_of, sheet_digest
+from hdev_jax.verbs.result import CalibrationResult, keep, kept
 
 __all__ = ["calibrate"]
 
 
 def calibrate(
-    logs: Paths,
-    vehicle: str | Path,
+    logs: Logs,
+    vehicle: Vehicles,
     adapter: str | Path | None = None,
     target: str | None = None,
     train_trips: Sequence[str] | None = None,
     test_trips: Sequence[str] | None = None,
-    effects: str | Path | None = None,
-    method: str = "map",
-    noise: str = "normal",
+    effects: Effects = None,
+    method: Method = "map",
+    noise: Literal["normal", "student_t"] = "normal",
     *,
-    out: str | Path,
+    out: str | Path | None = None,
     seed: int = 0,
-) -> str:
+) -> CalibrationResult:
     """Coefficients of the sheet with uncertainty, from their tabular priors and the training trips of the logs.
 
     `method` "map": Levenberg-Marquardt to the most probable values, standard errors clustered by trip. "linear":
     Bayesian linear regression in closed form. "nuts": draws, from sufficient statistics where they are enough and by
     NUTS through the kernel otherwise; `posterior.nc` holds them for ArviZ. `noise` "student_t" weighs outliers down.
-    **Returns:** a table as text; `calibration.json`, a report and `calibrated_vehicle.toml` are in `out`. Raises
-    `InputError`.
+
+    **Arguments:** `logs`: a path or several, a `Log`, or a table in memory; `vehicle`: a sheet's path or a `Sheet`;
+    `out`: a folder for `calibration.json`, a report and `calibrated_vehicle.toml`. **Returns:** a `CalibrationResult`;
+    `str()` is a table. **Raises:** `InputError`.
     """
     if method not in METHODS:
         raise InputError(f"--method {method!r}: accepted are {', '.join(METHODS)}")
@@ -54,40 +57,58 @@ def calibrate(
     start = opened(
         "calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known_effects(effects)
     )
-    problem, split = start.problem, start.split
-    if not problem.table.free:
+    if not start.problem.table.free:
         raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")
+    if out is None:
+        return _calibrated(start, method, noise, seed, started)
     config = {**start.config, "method": method, "noise": noise}
     with open_run(out, config, seed=seed) as run:
         if run.done:
-            return (run.work / "answer.txt").read_text()
-        progress.step(f"{start.read}; calibrating")
-        train = problem.rows(split.train)
-        segments = problem.segments.take(train)
-        clusters = cluster_rows(segments)
-        outcome = calibrated(
-            problem.vehicle, problem.table, padded(segments, problem.measured[train]), problem.target, clusters, method,
-            noise=noise, vehicles=len(problem.log.vehicle_names), seed=seed,
-        )  # fmt: skip
-        fit = outcome.fit
-        predicted = problem.predict(fit.vehicle)
-        summary = _summary(problem, split, outcome, predicted, method, noise)
-        values = {c.name: (float(v), float(s)) for c, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)}
-        sheet = run.path("calibrated_vehicle.toml")
-        sheet.write_text(augmented_sheet(start.sheet, values, {}))
-        summary["notes"] += write_predictive(run, sheet, problem, split, fit, noise)
-        run.path("calibration.json").write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
-        if outcome.draws is not None:
-            outcome.draws.write(run.path("posterior.nc"))
-        data = report_data(problem, split, summary, predicted, predicted, command_line("calibrate", run), started)
-        write_calibration_report(data, run.work)
-        lines = [f"{name:32s} {v:12.6g} ± {s:.3g}" for name, (v, s) in values.items()]
-        lines += [] if outcome.good else [f"NOT A GOOD FIT: {fit.message}"]
-        lines += [f"note: {note}" for note in summary["notes"]]
-        test_rmse = summary["before"]["test"]["rmse"]
-        answer = "\n".join([*lines, f"test RMSE {test_rmse:.4g} {problem.unit}; {fit.message}; {out}/report.html"])
-        run.path("answer.txt").write_text(answer)
-    return answer
+            folder = run.work
+            summary, predictive = (json.loads((folder / f).read_text()) for f in ("calibration.json", BESIDE))
+            sheet = (folder / "calibrated_vehicle.toml").read_text()
+            answer = (folder / "answer.txt").read_text()
+            return CalibrationResult(answer, summary, sheet, predictive, lambda: kept(folder))
+        result = _calibrated(start, method, noise, seed, started, run)
+        run.path("calibrated_vehicle.toml").write_text(result.sheet)
+        run.path(BESIDE).write_text(json.dumps(result.predictive, indent=1, allow_nan=False) + "\n")
+        run.path("calibration.json").write_text(json.dumps(result.summary, indent=1, allow_nan=False) + "\n")
+        if result.draws is not None:
+            result.draws.write(run.path("posterior.nc"))
+        write_calibration_report(result.data, run.work)
+        keep(run, result.data)
+        result.add_line(f"{Path(out) / 'report.html'}")
+        run.path("answer.txt").write_text(str(result))
+    return result
+
+
+def _calibrated(
+    start: Opening,
+    method: Method, noise: Literal["normal", "student_t"], seed: int, started: float,
+    run: Run | None = None,
+) -> CalibrationResult:  # fmt: skip
+    """The calibration in memory."""
+    problem, split = start.problem, start.split
+    progress.step(f"{start.read}; calibrating")
+    train = problem.rows(split.train)
+    segments = problem.segments.take(train)
+    outcome = calibrated(
+        problem.vehicle, problem.table, padded(segments, problem.measured[train]), problem.target,
+        cluster_rows(segments), method, noise=noise, vehicles=len(problem.log.vehicle_names), seed=seed,
+    )  # fmt: skip
+    fit = outcome.fit
+    predicted = problem.predict(fit.vehicle)
+    summary = _summary(problem, split, outcome, predicted, method, noise)
+    values = {c.name: (float(v), float(s)) for c, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)}
+    sheet = augmented_sheet(start.sheet, values, {})
+    predictive, notes = predictive_of(problem, split, fit, noise, sheet_digest(sheet))
+    summary["notes"] += notes
+    data = report_data(problem, split, summary, predicted, predicted, command_line("calibrate", run), started)
+    lines = [f"{name:32s} {v:12.6g} ± {s:.3g}" for name, (v, s) in values.items()]
+    lines += [] if outcome.good else [f"NOT A GOOD FIT: {fit.message}"]
+    lines += [f"note: {note}" for note in summary["notes"]]
+    lines.append(f"test RMSE {summary['before']['test']['rmse']:.4g} {problem.unit}; {fit.message}")
+    return CalibrationResult("\n".join(lines), summary, sheet, predictive, lambda: data, outcome.draws)
 
 
 def _summary(

@@ -4,20 +4,19 @@ from pathlib import Path
 
 import numpy as np
 
-from hdev_jax.inference.sheet import read_sheet
-from hdev_jax.logs import read_log, write_adapter_skeleton
+from hdev_jax.logs import write_adapter_skeleton
 from hdev_jax.problem import prepare
 from hdev_jax.targets import TARGETS
-from hdev_jax.verbs.opening import Paths, known_effects
+from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of
 
 __all__ = ["check"]
 
 
 def check(
-    logs: Paths,
-    vehicle: str | Path | None = None,
+    logs: Logs,
+    vehicle: Vehicles | None = None,
     adapter: str | Path | None = None,
-    effects: str | Path | None = None,
+    effects: Effects = None,
     skeleton: bool = False,
 ) -> str:
     """What was read: columns, units, trips, kWh/km by trip, what was dropped, filled or clipped. Nothing is fitted.
@@ -25,8 +24,8 @@ def check(
     With `skeleton`, an adapter to fill in instead. Raises `InputError`.
     """
     if skeleton:
-        return write_adapter_skeleton(Path(next(iter(logs))))
-    log = read_log(list(logs), adapter)
+        return write_adapter_skeleton(Path(logs if isinstance(logs, str | Path) else next(iter(logs))))
+    log = log_of(logs, adapter)
     s = log.segments
     lines = [f"{len(log)} rows, {len(log.trip_names)} trips, {len(log.vehicle_names)} vehicles"]
     lines += ["", "columns"] + [f"  {c.source:34s} {c.unit or '-':10s} -> {c.name}" for c in log.columns]
@@ -43,7 +42,7 @@ def check(
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
     if vehicle is not None:
-        sheet = read_sheet(vehicle, library=known_effects(effects))
+        sheet = sheet_of(vehicle, known_effects(effects))
         problem = prepare(log, sheet, None, need_measured=bool(log.targets))
         free = ", ".join(c.name for c in problem.table.free) or "none"
         lines += ["", f"vehicle: {sheet.name}; chain entered at the {problem.vehicle.entry}; estimated: {free}"]

@@ -1,44 +1,66 @@
-"""The verb `diagnose`: the loop on a user's logs, into a folder."""
+"""The verb `diagnose`: the method on a user's logs, in memory or into a folder."""
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from hdev_jax import progress
-from hdev_jax.diagnosis.diagnose import Diagnosis
-from hdev_jax.diagnosis.diagnose import diagnose as run_loop
+from hdev_jax.diagnosis.diagnose import Outcome
+from hdev_jax.diagnosis.diagnose import diagnose as run_method
 from hdev_jax.diagnosis.result.stages import add_stages
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
+from hdev_jax.physics import Effect
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.report.page import write_report
-from hdev_jax.rundir import open_run
-from hdev_jax.verbs.opening import Paths, chosen_effects, command_line, known_effects, opened
-from hdev_jax.verbs.predict import write_predictive
+from hdev_jax.rundir import Run, open_run
+from hdev_jax.verbs.opening import (
+    Effects,
+    Logs,
+    Opening,
+    Vehicles,
+    chosen_effects,
+    command_line,
+    known_effects,
+    opened,
+)  # fmt: skip
+from hdev_jax.verbs.predict import BESIDE, predictive_of, sheet_digest
+from hdev_jax.verbs.result import Diagnosis, keep, kept
 
 __all__ = ["diagnose"]
 
 
 def diagnose(
-    logs: Paths,
-    vehicle: str | Path,
+    logs: Logs,
+    vehicle: Vehicles,
     adapter: str | Path | None = None,
     target: str | None = None,
     train_trips: Sequence[str] | None = None,
     test_trips: Sequence[str] | None = None,
-    effects: str | Path | None = None,
+    effects: Effects = None,
     only: Sequence[str] | None = None,
     exclude: Sequence[str] | None = None,
     fdr: float = 0.05,
     *,
-    out: str | Path,
+    out: str | Path | None = None,
     seed: int = 0,
-) -> str:
-    """Find what the vehicle's model misses in these logs: the loop, into the folder `out`.
+) -> Diagnosis:
+    """Find what the vehicle's model misses in these logs.
 
-    **Arguments:** as the options of `hdev diagnose`. **Returns:** the answer as text; everything else is in `out`:
-    `diagnosis.json`, `report.html`, `augmented_vehicle.toml`, figures. Raises `InputError` for faults of the input.
+    ```python
+    found = hdev_jax.diagnose(frame, hdev_jax.Sheet(mass_kg=18e3, road={"c_rr": (0.006, 0.0008), "cda_m2": (5.6, 0.5)}))
+    print(found)
+    found.effects
+    found.report("bus.html")
+    ```
+
+    **Arguments:** as the options of `hdev diagnose`. `logs`: a path or several, a `Log`, or a table in memory;
+    `vehicle`: a sheet's path or a `Sheet`; `effects`: a Python file or classes of your own effects; `out`: a folder for
+    `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`, from which a run that was stopped goes on.
+
+    **Returns:** a `Diagnosis`; `str()` is the answer as text. **Raises:** `InputError` for faults of the input.
     """
     started = time.time()
     known = known_effects(effects)
@@ -46,7 +68,11 @@ def diagnose(
     start = opened(
         "diagnose", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known, *candidates
     )
-    problem, split = start.problem, start.split
+    why = {k: "--exclude" if k in (exclude or ()) else "not in --only" for k in known if k not in candidates}
+    excluded = [{"id": k, "why": w} for k, w in why.items() if not start.problem.vehicle.has(k)]
+    if out is None:
+        progress.step(start.read)
+        return _diagnosed(start, candidates, excluded, fdr, seed, started)
     config = {
         **start.config,
         "only": None if only is None else list(only),
@@ -55,30 +81,45 @@ def diagnose(
     }
     with open_run(out, config, seed=seed) as run:
         if run.done:
-            return (run.work / "answer.txt").read_text()
+            folder = run.work
+            summary, predictive = (json.loads((folder / f).read_text()) for f in ("diagnosis.json", BESIDE))
+            sheet = (folder / "augmented_vehicle.toml").read_text()
+            return Diagnosis((folder / "answer.txt").read_text(), summary, sheet, predictive, lambda: kept(folder))
         progress.step(start.read)
-        how = {"settings": Settings(fdr=fdr), "seed": seed, "tell": progress.step, "checkpoint": run.checkpoint}
-        result = run_loop(problem, split, candidates, **how)
-        add_stages(result, candidates, **how)
-        progress.step("writing the report")
-        why = {k: "--exclude" if k in (exclude or ()) else "not in --only" for k in known if k not in candidates}
-        result.summary["excluded"] += [{"id": k, "why": w} for k, w in why.items() if not problem.vehicle.has(k)]
-        sheet = run.path("augmented_vehicle.toml")
-        sheet.write_text(_augmented(result, start.sheet))
-        result.summary["notes"] += write_predictive(run, sheet, problem, split, result.fit, "normal")
-        data = of_diagnosis(result, command_line("diagnose", run), started)
+        result = _diagnosed(start, candidates, excluded, fdr, seed, started, run)
+        run.path("augmented_vehicle.toml").write_text(result.sheet)
+        run.path(BESIDE).write_text(json.dumps(result.predictive, indent=1, allow_nan=False) + "\n")
         run.path("diagnosis.json").write_text(json.dumps(result.summary, indent=1, allow_nan=False) + "\n")
-        write_report(data, run.work)
-        answer = answer_text(data, Path(out))
-        run.path("answer.txt").write_text(answer)
-    return answer
+        write_report(result.data, run.work)
+        keep(run, result.data)
+        result.add_line(f"{Path(out) / 'report.html'}")
+        run.path("answer.txt").write_text(str(result))
+    return result
 
 
-def _augmented(result: Diagnosis, sheet: Sheet) -> str:
-    fit = result.fit
+def _diagnosed(
+    start: Opening, candidates: dict[str, type[Effect]], excluded: list[dict[str, str]], fdr: float, seed: int,
+    started: float, run: Run | None = None,
+) -> Diagnosis:  # fmt: skip
+    """The diagnosis in memory; with a run, each stage is kept in its folder."""
+    checkpoint: Callable[[str, Callable[[], Any]], Any] = (lambda _, c: c()) if run is None else run.checkpoint
+    how = {"settings": Settings(fdr=fdr), "seed": seed, "tell": progress.step, "checkpoint": checkpoint}
+    outcome = run_method(start.problem, start.split, candidates, **how)
+    add_stages(outcome, candidates, **how)
+    outcome.summary["excluded"] += excluded
+    sheet = _augmented(outcome, start.sheet)
+    predictive, notes = predictive_of(start.problem, start.split, outcome.fit, "normal", sheet_digest(sheet))
+    outcome.summary["notes"] += notes
+    progress.step("writing the report")
+    data = of_diagnosis(outcome, command_line("diagnose", run), started)
+    return Diagnosis(answer_text(data), outcome.summary, sheet, predictive, lambda: data)
+
+
+def _augmented(outcome: Outcome, sheet: Sheet) -> str:
+    fit = outcome.fit
     values = {
         c.name: (float(v), float(s))
         for c, v, s in zip(fit.table.free, fit.values, fit.sd, strict=True)
-        if c.path.rpartition(".")[0].removeprefix("effects.") not in result.found
+        if c.path.rpartition(".")[0].removeprefix("effects.") not in outcome.found
     }
-    return augmented_sheet(sheet, values, result.found)
+    return augmented_sheet(sheet, values, outcome.found)

@@ -3,7 +3,9 @@
 import difflib
 import hashlib
 import importlib.util
+import inspect
 import shlex
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,25 +21,51 @@ from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import computed
 from hdev_jax.errors import InputError
 from hdev_jax.inference import padded
-from hdev_jax.inference.sheet import Sheet, read_sheet
-from hdev_jax.logs import read_log
+from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
+from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.library import DECLARED
 from hdev_jax.problem import Problem, Split, prepare, split_trips
 from hdev_jax.rundir import Run
+from hdev_jax.verbs.result import Result
 
-__all__ = ["Opening", "Paths", "chosen_effects", "command_line", "digest", "known_effects", "opened", "tried"]
+__all__ = [
+    "Effects", "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest", "known_effects", "log_of",
+    "opened", "sheet_of", "tried",
+]  # fmt: skip
 
-Paths = Sequence[str | Path]
+Logs = Any  # a path or several, a `Log`, or a table in memory (pandas, polars, pyarrow, a mapping of arrays)
+Vehicles = str | Path | Sheet | Result  # a sheet's path, a sheet, or a result with a fitted one
+Effects = str | Path | Sequence[type[Effect]] | None  # a Python file of a user's own effects, or their classes
 HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
 ROUNDING = 1e4  # units in the last place of the largest prediction, for two that count as equal
 
 
-def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
-    """The library with a user's own effects: every `Effect` class that the Python file defines."""
+def log_of(logs: Logs, adapter: str | Path | None = None) -> Log:
+    """The log in files, in memory, or as it is. Raises `InputError`, or `TypeError` for what is none of these."""
+    if isinstance(logs, Log):
+        return logs
+    if isinstance(logs, str | Path):
+        return read_log(logs, adapter)
+    if isinstance(logs, Sequence) and all(isinstance(p, str | Path) for p in logs):
+        return read_log(list(logs), adapter)
+    return log_from_frame(logs, adapter=adapter)
+
+
+def sheet_of(vehicle: Vehicles, library: Mapping[str, type[Effect]]) -> Sheet:
+    """The sheet in a file, from Python, or as a result fitted it. Raises `InputError`."""
+    if isinstance(vehicle, Result):
+        return Sheet(library=library, path="fitted sheet", **tomllib.loads(vehicle.sheet))
+    return vehicle if isinstance(vehicle, Sheet) else read_sheet(vehicle, library=library)
+
+
+def known_effects(file: Effects) -> dict[str, type[Effect]]:
+    """The library with a user's own effects: classes, or every `Effect` class that a Python file defines."""
     if file is None:
         return dict(LIBRARY)
+    if not isinstance(file, str | Path):
+        return _joined(list(file), "effects")
     path = Path(file)
     spec = importlib.util.spec_from_file_location("hdev_user_effects", path)
     if not path.is_file() or spec is None or spec.loader is None:
@@ -53,13 +81,19 @@ def known_effects(file: str | Path | None) -> dict[str, type[Effect]]:
     ]  # fmt: skip
     if not own:
         raise InputError(f"--effects {file}: defines no subclass of hdev_jax.physics.Effect with an id")
+    return _joined(own, f"--effects {file}")
+
+
+def _joined(own: Sequence[type[Effect]], where: str) -> dict[str, type[Effect]]:
     for c in own:
+        if not (isinstance(c, type) and issubclass(c, Effect) and hasattr(c, "id")):
+            raise InputError(f"{where}: {c!r} is no subclass of hdev_jax.physics.Effect with an id")
         if why := _malformed(c):
-            raise InputError(f"--effects {file}: class {c.__name__}: {why}")
+            raise InputError(f"{where}: class {c.__name__}: {why}")
     try:
         return library(own)
     except ValueError as e:
-        raise InputError(f"--effects {file}: {e}") from e
+        raise InputError(f"{where}: {e}") from e
 
 
 def _malformed(effect: type[Effect]) -> str | None:
@@ -115,7 +149,7 @@ def _texts(names: Any) -> bool:
     return isinstance(names, tuple | list) and all(isinstance(n, str) for n in names)
 
 
-def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path | None, *candidates: str) -> None:
+def tried(problem: Problem, known: Mapping[str, type[Effect]], file: Effects, *candidates: str) -> None:
     """Compute the columns of a user's own effects on every row of the log, before anything is fitted: of those that
     are `candidates` or that the vehicle has.
 
@@ -129,7 +163,7 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: str | Path 
     rows, facts = padded(problem.segments, problem.measured), facts_of(problem.segments)
     plain = problem.predict(car)
     for c in own:
-        where = f"--effects {file}: class {c.__name__}"
+        where = f"{f'--effects {file}' if isinstance(file, str | Path) else 'effects'}: class {c.__name__}"
         bad = np.zeros(rows.rows, dtype=bool)
         try:
             plan = plan_of(car, [c], facts, problem.target, searched=True)
@@ -180,6 +214,23 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
+def _named(given: Any) -> str:
+    """What a configuration calls an argument: a path as given, a thing in memory by its kind."""
+    return str(given) if isinstance(given, str | Path) else type(given).__name__
+
+
+def _digest_of_vehicle(vehicle: Vehicles, sheet: Sheet) -> str:
+    if isinstance(vehicle, str | Path):
+        return digest(Path(vehicle))
+    return hashlib.sha256(augmented_sheet(sheet, {}, {}).encode()).hexdigest()
+
+
+def _digest_of_effects(effects: Effects) -> str | None:
+    if effects is None or isinstance(effects, str | Path):
+        return None if effects is None else digest(Path(effects))
+    return hashlib.sha256("".join(map(inspect.getsource, effects)).encode()).hexdigest()
+
+
 @dataclass(frozen=True)
 class Opening:
     """What `diagnose` and `calibrate` start from: the log in its trips, the vehicle, the configuration."""
@@ -197,13 +248,13 @@ class Opening:
 
 def opened(
     verb: str,
-    logs: Paths,
-    vehicle: str | Path,
+    logs: Logs,
+    vehicle: Vehicles,
     adapter: str | Path | None,
     target: str | None,
     train_trips: Sequence[str] | None,
     test_trips: Sequence[str] | None,
-    effects: str | Path | None,
+    effects: Effects,
     seed: int,
     known: Mapping[str, type[Effect]],
     *candidates: str,
@@ -212,34 +263,37 @@ def opened(
 
     **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried.
     """
-    sheet = read_sheet(vehicle, library=known)
+    sheet = sheet_of(vehicle, known)
     with progress.busy("reading the logs"):
-        log = read_log(list(logs), adapter)
+        log = log_of(logs, adapter)
         split = split_trips(log, train_trips, test_trips)
         problem = prepare(split.log, sheet, target)
     tried(problem, known, effects, *candidates)
     config = {
         "verb": verb,
-        "logs": [str(p) for p in logs],
+        "logs": [_named(p) for p in (logs if isinstance(logs, list | tuple) else [logs])],
         "log_sha256": problem.log.fingerprint(),
-        "vehicle": str(vehicle),
-        "vehicle_sha256": digest(Path(vehicle)),
+        "vehicle": _named(vehicle),
+        "vehicle_sha256": _digest_of_vehicle(vehicle, sheet),
         "adapter": None if adapter is None else str(adapter),
         "target": problem.target,
         "train_trips": split.names(split.train),
         "test_trips": split.names(split.test),
         "asked_train": None if train_trips is None else list(train_trips),
         "asked_test": None if test_trips is None else list(test_trips),
-        "effects_file": None if effects is None else str(effects),
-        "effects_sha256": None if effects is None else digest(Path(effects)),
+        "effects_file": None if effects is None else _named(effects),
+        "effects_sha256": _digest_of_effects(effects),
         "seed": seed,
         "x64": bool(jax.config.read("jax_enable_x64")),
     }
     return Opening(sheet, problem, split, config)
 
 
-def command_line(verb: str, run: Run) -> str:
-    """The command that makes this run again: the split as the user gave it, and options that are not defaults."""
+def command_line(verb: str, run: Run | None) -> str:
+    """The command that makes this run again: the split as the user gave it, and options that are not defaults; the
+    function, where there is no folder."""
+    if run is None:
+        return f"hdev_jax.{verb}(log, sheet)"
     c = run.config
     parts = ["hdev", verb, *c["logs"], "--vehicle", c["vehicle"], "--target", c["target"]]
     lists = {"train-trips": "asked_train", "test-trips": "asked_test", "only": "only", "exclude": "exclude"}

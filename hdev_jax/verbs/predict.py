@@ -1,5 +1,6 @@
 """The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips outside the fit."""
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, fields
@@ -11,14 +12,13 @@ from jaxtyping import Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, left_out, padded, spread_of, sums_of
-from hdev_jax.inference.sheet import read_sheet
-from hdev_jax.logs import read_log
 from hdev_jax.problem import Problem, Split, derivable, prepare
-from hdev_jax.rundir import Run, atomic_file
+from hdev_jax.rundir import atomic_file
 from hdev_jax.targets import TARGETS
-from hdev_jax.verbs.opening import Paths, digest, known_effects, tried
+from hdev_jax.verbs.opening import Effects, Logs, Vehicles, digest, known_effects, log_of, sheet_of, tried
+from hdev_jax.verbs.result import Prediction, Result
 
-__all__ = ["predict", "strongly_correlated", "write_predictive"]
+__all__ = ["predict", "predictive_of", "sheet_digest", "strongly_correlated"]
 
 BESIDE = "predictive.json"  # what a fitted sheet has beside it
 Noise = Literal["normal", "student_t"]
@@ -26,30 +26,31 @@ STRONG = 0.95  # correlation of two coefficients, above which neither is read by
 LIKE = 1.5  # times as long: rows of another log with about the same noise
 
 
-def write_predictive(
-    run: Run, sheet: Path, problem: Problem, split: Split, fit: Calibration, noise: Noise
-) -> list[str]:
-    """Write beside a fitted sheet what intervals need: the coefficients' covariance and the noise.
-
-    **Returns:** notes for the user.
-    """
+def predictive_of(
+    problem: Problem, split: Split, fit: Calibration, noise: Noise, sheet_sha256: str
+) -> tuple[dict[str, Any], list[str]]:
+    """What intervals need beside a fitted sheet: the coefficients' covariance and the noise; and notes for the user."""
     train = problem.rows(split.train)
     rows = padded(problem.segments.take(train), problem.measured[train])
     spread, clusters = left_out(fit, rows, problem.target, problem.weight()[train], noise)
     known = {
         "schema": "hdev-predictive/1",
-        "sheet_sha256": digest(sheet),
+        "sheet_sha256": sheet_sha256,
         "target": problem.target,
         "covariance": {"names": [c.name for c in fit.table.free], "matrix": np.asarray(fit.covariance).tolist()},
         "spread": asdict(spread),
     }
-    run.path(BESIDE).write_text(json.dumps(known, indent=1, allow_nan=False) + "\n")
     notes = strongly_correlated([c.name for c in fit.table.free], np.asarray(fit.covariance))
     if clusters.kind == "block":
         notes.append(
             "there is one training trip: the intervals of hdev predict do not include differences between trips"
         )
-    return notes
+    return known, notes
+
+
+def sheet_digest(text: str) -> str:
+    """SHA-256 of a sheet as it is written to a file."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def strongly_correlated(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[str]:
@@ -65,22 +66,25 @@ def strongly_correlated(names: Sequence[str], covariance: Float[np.ndarray, "k k
 
 
 def predict(
-    logs: Paths,
-    vehicle: str | Path,
+    logs: Logs,
+    vehicle: Vehicles,
     adapter: str | Path | None = None,
     target: str | None = None,
-    effects: str | Path | None = None,
+    effects: Effects = None,
     level: float = 0.9,
     *,
-    out: str | Path,
-) -> str:
-    """One line for each row of the logs: `trip_id, time_s, predicted, lower, upper, level` in the target's unit.
+    out: str | Path | None = None,
+) -> Prediction:
+    """One row for each row of the logs: `trip_id, time_s, predicted, lower, upper, level` in the target's unit.
 
     The interval has the uncertainty of the coefficients (covariance from the `predictive.json` beside a fitted sheet,
     else their sds in the sheet) and the noise of a row: by cross-validation over trips of that fit, else from this log
     where it measures the target. The interval of a trip's total is from errors of whole trips, by a Student t with as
-    many degrees of freedom as there were trips; for a single trip, from its autocorrelation. **Returns:** the total of
-    each trip with its interval, as text. Raises `InputError`.
+    many degrees of freedom as there were trips; for a single trip, from its autocorrelation.
+
+    **Arguments:** `vehicle`: a sheet's path, a `Sheet`, or what `diagnose` or `calibrate` returned; `out`, a file to
+    write (.csv, .csv.gz or .parquet). **Returns:** a `Prediction`: its `rows`, and as text the total of each trip with
+    its interval. **Raises:** `InputError`.
     """
     import pandas as pd
     from scipy import stats
@@ -88,9 +92,11 @@ def predict(
     if not 0 < level < 1:
         raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
     library = known_effects(effects)
-    log = read_log(list(logs), adapter)
-    sheet = read_sheet(vehicle, library=library)
-    beside = _beside(Path(vehicle))
+    log = log_of(logs, adapter)
+    sheet = sheet_of(vehicle, library)
+    beside = vehicle.predictive if isinstance(vehicle, Result) else {}
+    if isinstance(vehicle, str | Path):
+        beside = _beside(Path(vehicle))
     measures = target in log.targets if target else bool(log.targets)
     name = target or (log.default_target if measures else beside.get("target", "energy_wh"))
     measures = measures or derivable(log, name)
@@ -114,14 +120,17 @@ def predict(
             "level": level,
         }
     )
+    lines = [_whence(level, spread, bool(known)), *_totals(problem, predicted, x, spread, level)]
+    lines += _warnings(problem, spread, beside, known)
+    if out is None:
+        return Prediction(frame, "\n".join([*lines, f"{len(frame)} rows of {name}"]))
     with atomic_file(out) as temporary:
         if str(out).endswith(".parquet"):
             frame.to_parquet(temporary, index=False)
         else:
             compression: Any = "gzip" if str(out).endswith(".gz") else None
             frame.to_csv(temporary, index=False, float_format="%.8g", compression=compression)
-    lines = [_whence(level, spread, bool(known)), *_totals(problem, predicted, x, spread, level)]
-    return "\n".join([*lines, *_warnings(problem, spread, beside, known), f"{len(frame)} rows of {name} -> {out}"])
+    return Prediction(frame, "\n".join([*lines, f"{len(frame)} rows of {name} -> {out}"]))
 
 
 def _whence(level: float, spread: Spread | None, known: bool) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from planted import breaches, named, run
 
-from hdev_jax.diagnosis.diagnose import Diagnosis
+from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.fleet import SyntheticLog
 
@@ -62,7 +62,7 @@ SCENARIOS = {
 
 
 @cache
-def outcome(name: str) -> tuple[SyntheticLog, Diagnosis]:
+def outcome(name: str) -> tuple[SyntheticLog, Outcome]:
     s = SCENARIOS[name]
     return run(s.seed, effects=s.effects, **s.options)
 

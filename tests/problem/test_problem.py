@@ -10,7 +10,7 @@ import pytest
 
 from hdev_jax.diagnosis.candidates.candidate import columns
 from hdev_jax.diagnosis.candidates.facts import facts_of
-from hdev_jax.diagnosis.diagnose import Diagnosis
+from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded, predict
 from hdev_jax.inference.sheet import Sheet, read_sheet
@@ -150,7 +150,7 @@ def test_the_page_shows_the_test_part_as_a_part_of_its_trip(tmp_path):
     fit = calibrate(problem.vehicle, problem.table, rows, problem.target, cluster_rows(segments))
     car = fit.vehicle.plus(*ACROSS_ROWS)
     predicted = problem.predict(car)
-    result = Diagnosis(problem, split, {"target": problem.target}, car, car, fit, predicted, predicted, {})
+    result = Outcome(problem, split, {"target": problem.target}, car, car, fit, predicted, predicted, {})
     data = of_diagnosis(result, "", 0.0)
     assert sum(data.breakdown["after"].values()) == pytest.approx(np.sum(predicted[test]) / 1e3, rel=1e-9)
     since = data.row("distance_since_start_m")

@@ -25,7 +25,7 @@ CHECKER = Path(__file__).parents[3] / "shared" / "check_diagnosis.py"
 ONLY = ["--only", "headwind,auxiliary_power"]  # two candidates: quick
 FILES = {
     "diagnosis.json", "report.html", "augmented_vehicle.toml", "answer.txt", "config.toml", "environment.json",
-    "figures", "predictive.json",
+    "figures", "predictive.json", "data.npz",
 }  # fmt: skip
 
 # A user's own effect: what it adds is linear in the time since the start, which nothing in the library is.
@@ -273,7 +273,7 @@ def test_the_same_command_is_done_at_once(first, given, monkeypatch):
     """The text is the same, and nothing is computed for it."""
     folder, text = first
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
-    monkeypatch.setattr("hdev_jax.verbs.diagnose.run_loop", lambda *a, **k: pytest.fail("the loop ran again"))
+    monkeypatch.setattr("hdev_jax.verbs.diagnose.run_method", lambda *a, **k: pytest.fail("the loop ran again"))
     assert hdev("diagnose", *given, *ONLY, "--out", folder) == (0, text)
     assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == before
 

@@ -7,7 +7,7 @@ force at the wheels, and from there to the battery. Each has its own suspects, a
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from hdev_jax.diagnosis.diagnose import Diagnosis, diagnose
+from hdev_jax.diagnosis.diagnose import Outcome, diagnose
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.errors import InputError
 from hdev_jax.physics import Effect
@@ -18,7 +18,7 @@ __all__ = ["add_stages"]
 
 
 def add_stages(
-    result: Diagnosis,
+    result: Outcome,
     library: Mapping[str, type[Effect]],
     *,
     settings: Settings,

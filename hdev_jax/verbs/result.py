@@ -1,0 +1,236 @@
+"""What the verbs return: the answer as text, numbers, frames and figures; in memory, or read from a folder."""
+
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hdev_jax.checkpoints import load, packed
+from hdev_jax.errors import InputError
+from hdev_jax.report.data import ReportData
+from hdev_jax.rundir import Run
+from hdev_jax.targets import TARGETS
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from hdev_jax.inference.posterior.draws import Draws
+
+__all__ = ["CalibrationResult", "Diagnosis", "Prediction", "Result", "keep", "kept"]
+
+DATA = "data.npz"  # rows and channels that a report is made of
+
+
+def keep(run: Run, data: ReportData) -> None:
+    """Write what a report is made of into a run's folder, for `kept`; channels in single precision."""
+    channels = {k: np.asarray(v, dtype=np.float32) for k, v in data.channels.items()}
+    with open(run.path(DATA), "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **packed({**vars(data), "channels": channels}))
+
+
+def kept(folder: Path) -> ReportData:
+    """What `keep` wrote. Raises `InputError` where it is not there, or is damaged."""
+    try:
+        return ReportData(**load(folder / DATA))
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{folder / DATA}: cannot be read ({e}); run the command again into a new folder") from e
+
+
+class Result:
+    """An answer with what is behind it. `str()` is the answer as the command line prints it.
+
+    - `summary`: what the JSON file of the command holds (contract, section 4).
+    - `sheet`: the vehicle sheet as fitted, TOML.
+    - `predictive`: covariance and noise for the intervals of `hdev_jax.predict`, what `predictive.json` holds.
+    - `data`: rows, channels and errors that the report shows.
+    """
+
+    def __init__(
+        self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
+        data: Callable[[], ReportData],
+    ):  # fmt: skip
+        self.summary, self.sheet, self.predictive = dict(summary), sheet, dict(predictive)
+        self._answer, self._data = answer, data
+
+    @property
+    def _unit(self) -> str:
+        return TARGETS[self.summary["target"]].unit
+
+    @cached_property
+    def data(self) -> ReportData:
+        """Rows, channels and errors that the report shows."""
+        return self._data()
+
+    def __str__(self) -> str:
+        return self._answer
+
+    def add_line(self, line: str) -> None:
+        """A line more at the end of the answer: where it was written."""
+        self._answer = f"{self._answer}\n{line}"
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        return f"<pre>{escape(self._answer)}</pre>"
+
+    @property
+    def before(self) -> dict[str, Any]:
+        """Errors of the declared model on the held-out test trips: `rmse`, `mse`, `bias`, `pe_percent`, `n`."""
+        return self.summary["before"]["test"]
+
+    @property
+    def residual(self) -> "pd.DataFrame":
+        """One row for each row of the log, in the target's unit: `trip_id`, `time_s`, `measured`, `before`, `after`,
+        `residual_before`, `residual_after` (measured − predicted), `test`."""
+        import pandas as pd
+
+        d = self.data
+        names = np.asarray(d.trip_names, dtype=object)
+        columns = {k: d.row(k) for k in ("time_s", "measured", "before", "after")}
+        residuals = {f"residual_{k}": d.residual(k) for k in ("before", "after")}
+        return pd.DataFrame({"trip_id": names[d.row("trip")], **columns, **residuals, "test": d.row("test")})
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report: one page where `path` ends in .html, else a folder with `report.html` and `figures/`.
+
+        **Returns:** the page's path.
+        """
+        path = Path(path)
+        if path.suffix != ".html":
+            self._write_report(path)
+            return path / "report.html"
+        with tempfile.TemporaryDirectory() as folder:
+            self._write_report(Path(folder))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(Path(folder) / "report.html", path)
+        return path
+
+    def _write_report(self, folder: Path) -> None:
+        raise NotImplementedError
+
+    def plot_coefficients(self) -> "Figure | None":
+        """The coefficients against their tabular values; None where none was estimated."""
+        from hdev_jax.report.figures import coefficients
+
+        return self._drawn(coefficients)
+
+    def plot_trips(self) -> "Figure | None":
+        """Error of each trip."""
+        from hdev_jax.report.figures import trip_errors
+
+        return self._drawn(trip_errors)
+
+    def _drawn(self, figure: Callable[[ReportData], Any]) -> Any:
+        from hdev_jax.report.canvas import style
+
+        with style():
+            return figure(self.data)
+
+
+class Diagnosis(Result):
+    """What a model lacked: effects with their sizes, the error before and after on held-out test trips."""
+
+    def __repr__(self) -> str:
+        unit, found = self._unit, ", ".join(e["id"] for e in self.summary["effects"]) or "no effect"
+        return f"Diagnosis({found}; test RMSE {self.before['rmse']:.4g} -> {self.after['rmse']:.4g} {unit})"
+
+    @property
+    def effects(self) -> "pd.DataFrame":
+        """One row for each parameter of each effect found, in the order of finding: `effect`, `parameter`, `value`,
+        `sd`, `low`, `high` (90 %), `unit`, `q_value`, `stability`, `indistinguishable_from`, `rmse_after`."""
+        import pandas as pd
+
+        columns = ["effect", "parameter", "value", "sd", "low", "high", "unit", "q_value", "stability",
+                   "indistinguishable_from", "rmse_after"]  # fmt: skip
+        rows = []
+        for e in self.summary["effects"]:
+            for name, p in e["parameters"].items():
+                low, high = p.get("interval_90", (None, None))
+                rows.append([e["id"], name, p["value"], p["sd"], low, high, p["unit"], e["q_value"], e["stability"],
+                             ", ".join(e["indistinguishable_from"]), e["test_rmse_after"]])  # fmt: skip
+        return pd.DataFrame(rows, columns=columns)
+
+    @property
+    def after(self) -> dict[str, Any]:
+        """Errors of the model with the effects on the held-out test trips, as `before`."""
+        return self.summary["after"]["test"]
+
+    @property
+    def unexplained(self) -> dict[str, Any]:
+        """What remains: whether it is significant, its share of the test variance, what it depends on."""
+        return self.summary["unexplained"]
+
+    def plot_before_after(self) -> "Figure":
+        """Measured, before and after: the error of each trip and of its energy."""
+        from hdev_jax.report.figures import before_after
+
+        return self._drawn(before_after)
+
+    def plot_residual(self) -> "Figure | None":
+        """The residual of a test trip in time, before and after."""
+        from hdev_jax.report.residuals import residual_in_time
+
+        return self._drawn(residual_in_time)
+
+    def plot_channels(self) -> "Figure | None":
+        """The residual against the channels that it depends on most."""
+        from hdev_jax.report.residuals import panels, residual_by_channel
+
+        return self._drawn(lambda data: residual_by_channel(data, panels(data)[0]))
+
+    def plot_energy(self) -> "Figure | None":
+        """Energy by effect over the test trips; None for a target that the battery lies behind."""
+        from hdev_jax.report.figures import energy_by_effect
+
+        return self._drawn(energy_by_effect)
+
+    def _write_report(self, folder: Path) -> None:
+        from hdev_jax.report.page import write_report
+
+        write_report(self.data, folder)
+
+
+class CalibrationResult(Result):
+    """A sheet's coefficients with their uncertainty. `draws`: those of the posterior, where it was sampled."""
+
+    def __init__(
+        self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
+        data: Callable[[], ReportData], draws: "Draws | None" = None,
+    ):  # fmt: skip
+        super().__init__(answer, summary, sheet, predictive, data)
+        self.draws = draws
+
+    def __repr__(self) -> str:
+        count, test = len(self.summary["baseline"]["parameters"]), self.before["rmse"]
+        return f"CalibrationResult({count} coefficients; test RMSE {test:.4g} {self._unit})"
+
+    @property
+    def coefficients(self) -> "pd.DataFrame":
+        """One row for each coefficient: `value`, `sd`, `unit`; of its table `prior_value`, `prior_sd`, `prior_z`."""
+        import pandas as pd
+
+        rows = pd.DataFrame(self.summary["baseline"]["parameters"]).T
+        return rows.drop(columns="absorbs", errors="ignore")
+
+    def _write_report(self, folder: Path) -> None:
+        from hdev_jax.report.page import write_calibration_report
+
+        write_calibration_report(self.data, folder)
+
+
+class Prediction:
+    """What a sheet predicts. `rows`: `trip_id, time_s, predicted, lower, upper, level`, a row for each of the log's."""
+
+    def __init__(self, rows: "pd.DataFrame", answer: str):
+        self.rows, self._answer = rows, answer
+
+    def __str__(self) -> str:
+        return self._answer
+
+    def __repr__(self) -> str:
+        return f"Prediction({len(self.rows)} rows of {self.rows['trip_id'].nunique()} trips)"

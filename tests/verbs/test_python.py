@@ -1,0 +1,117 @@
+"""From Python: a frame and a sheet in, an answer with frames, figures and a report out; no folder is needed."""
+
+import matplotlib.figure
+import numpy as np
+import pandas as pd
+import pytest
+
+import hdev_jax
+from hdev_jax.errors import InputError
+from hdev_jax.fleet import demo_log
+from hdev_jax.physics import Effect, Size
+
+ONLY = ["headwind", "auxiliary_power"]
+
+
+class Nothing(Effect):
+    """A load while the speed is negative: never."""
+
+    id = "nothing_at_all"
+    stage = "battery"
+    equation = "P·[v < 0]"
+    parameters = (Size("power_w", "W", 0.0, 100.0),)
+    power_w: float
+
+    def power(self, row, car, point):
+        return self.power_w * (row.speed_mps < 0.0)
+
+
+@pytest.fixture(scope="module")
+def log():
+    """The demo's log (synthetic) with its sheet's path."""
+    return demo_log(3, trips=8)
+
+
+@pytest.fixture(scope="module")
+def sheet(log, tmp_path_factory):
+    return hdev_jax.read_sheet(log.write(tmp_path_factory.mktemp("log"), truth=False)["sheet"])
+
+
+@pytest.fixture(scope="module")
+def found(log, sheet):
+    return hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing])
+
+
+def test_a_frame_and_a_sheet_are_enough(found):
+    assert repr(found).startswith("Diagnosis(headwind; test RMSE ")
+    assert "headwind (scale" in str(found)
+    assert found.after["rmse"] < found.before["rmse"]
+    (row,) = found.effects.to_dict("records")
+    assert row["effect"] == "headwind"
+    assert row["low"] < row["value"] < row["high"]
+    assert found.unexplained["significant"] is False
+    assert {"id": "nothing_at_all", "why": "not in --only"} in found.summary["excluded"]
+
+
+def test_the_residual_is_a_frame_as_long_as_the_log(found, log):
+    frame = found.residual
+    assert len(frame) == len(log.frame)
+    assert list(frame["trip_id"]) == list(log.frame["trip_id"])
+    np.testing.assert_allclose(frame["measured"], log.frame["energy_wh"])
+    test = frame[frame["test"]]
+    assert np.sqrt(np.mean(test["residual_after"] ** 2)) == pytest.approx(found.after["rmse"])
+
+
+@pytest.mark.parametrize("name", ["before_after", "residual", "channels", "energy", "trips", "coefficients"])
+def test_each_figure_is_drawn(name, found):
+    assert isinstance(getattr(found, f"plot_{name}")(), matplotlib.figure.Figure)
+
+
+def test_the_report_is_one_page_or_a_folder(found, tmp_path):
+    page = found.report(tmp_path / "deep" / "page.html")
+    assert page.read_text() == found.report(tmp_path / "folder").read_text()
+    assert {p.name for p in (tmp_path / "folder").iterdir()} == {"report.html", "figures"}
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["page.html"]
+
+
+def test_a_folder_gives_the_same_result_again(found, log, sheet, tmp_path, monkeypatch):
+    first = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
+    monkeypatch.setattr("hdev_jax.verbs.diagnose.run_method", lambda *a, **k: pytest.fail("it ran again"))
+    again = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
+    assert str(again) == str(first) == f"{found}\n{tmp_path / 'out' / 'report.html'}"
+    pd.testing.assert_frame_equal(again.residual, found.residual)
+    assert again.effects.equals(found.effects)
+    assert again.sheet == found.sheet
+    (tmp_path / "out" / "data.npz").write_bytes(b"nothing")
+    broken = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
+    with pytest.raises(InputError, match="data.npz: cannot be read"):
+        _ = broken.residual
+
+
+def test_a_result_predicts_as_its_folder_does(found, log, sheet, tmp_path):
+    out = tmp_path / "out"
+    hdev_jax.diagnose(log.frame, sheet, only=ONLY, out=out)
+    here = hdev_jax.predict(log.frame, found)
+    there = hdev_jax.predict(log.frame, out / "augmented_vehicle.toml")
+    pd.testing.assert_frame_equal(here.rows, there.rows)
+    assert str(here) == str(there)
+    inside = (here.rows["lower"] < log.frame["energy_wh"]) & (log.frame["energy_wh"] < here.rows["upper"])
+    assert 0.85 < inside.mean() < 0.97
+    assert "cross-validation over the fit's training trips" in str(here)
+
+
+def test_a_calibration_has_its_coefficients_in_a_frame(log, sheet):
+    result = hdev_jax.calibrate(log.frame, sheet, method="linear")
+    assert repr(result).startswith("CalibrationResult(2 coefficients; test RMSE ")
+    assert list(result.coefficients.index) == ["road.c_rr", "road.cda_m2"]
+    assert result.coefficients.loc["road.c_rr", "prior_value"] == 0.006
+    assert result.draws is None
+
+
+def test_what_is_no_log_or_effect_is_said(sheet, log):
+    with pytest.raises(TypeError):
+        hdev_jax.diagnose(3.0, sheet)
+    with pytest.raises(InputError, match="effects: .*Effect'> is no subclass"):
+        hdev_jax.diagnose(log.frame, sheet, effects=[Effect])
+    with pytest.raises(InputError, match="column"):
+        hdev_jax.diagnose(log.frame.drop(columns="speed_start_mps"), sheet)
