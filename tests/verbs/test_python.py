@@ -84,7 +84,7 @@ def test_a_folder_gives_the_same_result_again(found, log, sheet, tmp_path, monke
     assert again.sheet == found.sheet
     (tmp_path / "out" / "data.npz").write_bytes(b"nothing")
     broken = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
-    with pytest.raises(InputError, match="data.npz: cannot be read"):
+    with pytest.raises(InputError, match=r"data\.npz: cannot be read"):
         _ = broken.residual
 
 
@@ -111,7 +111,7 @@ def test_a_calibration_has_its_coefficients_in_a_frame(log, sheet):
 def test_what_is_no_log_or_effect_is_said(sheet, log):
     with pytest.raises(TypeError):
         hdev_jax.diagnose(3.0, sheet)
-    with pytest.raises(InputError, match="effects: .*Effect'> is no subclass"):
+    with pytest.raises(InputError, match=r"effects: .*Effect.> is no subclass"):
         hdev_jax.diagnose(log.frame, sheet, effects=[Effect])
     with pytest.raises(InputError, match="column"):
         hdev_jax.diagnose(log.frame.drop(columns="speed_start_mps"), sheet)
