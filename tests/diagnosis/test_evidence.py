@@ -276,8 +276,8 @@ def test_plain_rows_count_clusters_alone():
     assert one.plain
     assert one.p_cluster == pytest.approx(other.p_cluster, rel=1e-5)
     np.testing.assert_allclose(one.beta, other.beta, rtol=1e-6)
-    g = rows.clusters.count
-    f = stats.f.isf(one.p_cluster, 1, g - 1)
+    g, evidence = rows.clusters.count, sums.evidence(BASE, **wide)
+    f = stats.f.isf(one.p_cluster, 1, min(evidence.rests_on(candidate(0)), g) - 1)
     # the likelihood ratio of g observations whose F is this
     assert one.gain == pytest.approx(0.5 * g * np.log1p(f / (g - 1)), rel=1e-6)
 

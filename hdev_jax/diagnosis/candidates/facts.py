@@ -20,12 +20,14 @@ LEAST_SHARE = 0.02  # of the rows, for a group to have a coefficient of its own
 class Facts:
     """What of a whole log its candidates depend on; the rows themselves may come a chunk at a time.
 
-    `sample` is one row (which channels there are), `trips` the ids in order, `row_s` the median duration of a row
-    [s], `groups` how many rows each id of a grouping channel has, `gears` the highest such id (at least 1).
+    `sample` is one row (which channels there are), `trips` the ids in order, `vehicles` whose each is, `row_s` the
+    median duration of a row [s], `groups` how many rows each id of a grouping channel has, `gears` the highest such id
+    (at least 1).
     """
 
     sample: Segments
     trips: Int[np.ndarray, " trip"]
+    vehicles: Int[np.ndarray, " trip"]
     rows: int
     row_s: float
     groups: Mapping[str, Mapping[int, int]]
@@ -34,13 +36,18 @@ class Facts:
     @property
     def steps(self) -> tuple[float, ...]:
         """Ids of trips from which on something may have changed."""
-        # three trips on either side at least: with fewer, one odd trip would be a step
-        return thinned(self.trips[3:-2]) if len(self.trips) >= 6 else ()
+        return thinned(self._open)
+
+    @property
+    def _open(self) -> Int[np.ndarray, " trip"]:
+        """Trips with three of the same vehicle on either side: fewer are odd trips, and vehicles differ."""
+        own = self.trips[len(self.trips) - np.argmin(np.r_[self.vehicles[::-1] == self.vehicles[-1], False]) :]
+        return own[3:-2]
 
     def steps_near(self, at: float) -> tuple[float, ...]:
         """The trips between the two steps beside `at`; `at` alone where every trip is a step already."""
         steps = self.steps
-        if at not in steps or len(steps) == len(self.trips[3:-2]):
+        if at not in steps or len(steps) == len(self._open):
             return (at,)
         k = steps.index(at)
         low, high = steps[max(k - 1, 0)], steps[min(k + 1, len(steps) - 1)]
@@ -74,7 +81,9 @@ def facts_of(segments: Segments, rows: int | None = None) -> Facts:
             ids, counts = np.unique(np.maximum(x[np.isfinite(x)].astype(int), 0), return_counts=True)
             groups[name] = {int(k): int(c) for k, c in zip(ids, counts, strict=True)}
     row_s = float(np.median(np.asarray(part.duration_s)))
-    return Facts(segments.take(np.arange(1)), np.unique(np.asarray(part.trip)), n, row_s, groups, most_group(part))
+    trips, first = np.unique(np.asarray(part.trip), return_index=True)
+    vehicles = np.asarray(part.vehicle)[first]
+    return Facts(segments.take(np.arange(1)), trips, vehicles, n, row_s, groups, most_group(part))
 
 
 def merged(parts: Iterable[Facts], duration_s: Float[np.ndarray, " row"]) -> Facts:
@@ -91,6 +100,7 @@ def merged(parts: Iterable[Facts], duration_s: Float[np.ndarray, " row"]) -> Fac
         for name, counts in f.groups.items():
             for k, n in counts.items():
                 groups[name][k] = groups[name].get(k, 0) + n
-    trips = np.unique(np.concatenate([f.trips for f in every]))
-    rows = sum(f.rows for f in every)
-    return Facts(first.sample, trips, rows, float(np.median(duration_s)), groups, max(f.gears for f in every))
+    trips, at = np.unique(np.concatenate([f.trips for f in every]), return_index=True)
+    vehicles = np.concatenate([f.vehicles for f in every])[at]
+    rows, gears = sum(f.rows for f in every), max(f.gears for f in every)
+    return Facts(first.sample, trips, vehicles, rows, float(np.median(duration_s)), groups, gears)

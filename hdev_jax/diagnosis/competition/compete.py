@@ -96,7 +96,8 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
         tell(f"taking {id_} out again: {kept.removed[id_]}")
     trail = {**kept.trail, ",".join(kept.ids): [float(x) for x in kept.fit.values]} if not kept.terms else kept.trail
     refused = tuple(dict.fromkeys((*kept.refused, *round_.reasons)))
-    return replace(kept, verdicts=verdicts_of(round_, sought), trail=trail, refused=refused)
+    tested = (*kept.tested, *round_.tested)
+    return replace(kept, verdicts=verdicts_of(round_, sought), trail=trail, refused=refused, tested=tested)
 
 
 def named_alone(training: Training, state: State) -> State:

@@ -64,6 +64,9 @@ def two_exchanged(round_: Round) -> State | None:
         if ahead is None:
             continue
         a, b = (c.id for c in ahead)
+        if (test := f"{a}+{b}+{f.id}+{g.id}") in state.tested:
+            continue
+        round_.tested.append(test)
         round_.tell(f"testing {a} and {b} in place of {f.id} and {g.id}")
         start = replace(without(training, state, f.id, g.id), refused=())
         fresh = Round(training, start, score_all(training, start.fit), round_.rng, round_.tell)
@@ -82,19 +85,25 @@ def two_exchanged(round_: Round) -> State | None:
 def _best_pair(round_: Round, w: Without, out: set[str]) -> list[Candidate] | None:
     """The plausible pair that explains most in place of those that are `out`; None where it is not well ahead."""
     scores, settings = round_.scores, round_.training.settings
-    out = {*out, *round_.state.barred, *scores.absorbed_by}
-    ways = w.rivals([s.candidate for id_, s in scores.best.items() if id_ not in out and not s.plain])
-    totals, pairs = w.evidence.totals(), list(combinations(ways, 2))
-    own = _together(scores, w.evidence.gain(totals, [k for c in w.each for k in c.columns])[0], w.each)
-    gains = w.evidence.gains(totals, [(*a.columns, *b.columns) for a, b in pairs])
+    out = {*out, *round_.state.barred, *round_.state.refused, *round_.reasons, *scores.absorbed_by}
+    open_ = [s.candidate for id_, s in scores.best.items() if id_ not in out and not s.plain]
+    pairs = list(combinations(w.rivals([c for c in open_ if c.kind == "size"]), 2))
+
+    def score(pair: Sequence[Candidate]) -> Score:
+        return w.evidence.score(replace(pair[0], columns=tuple(k for c in pair for k in c.columns)))
+
+    own = score(w.each)
+    gains = w.evidence.gains(w.evidence.totals(), [(*a.columns, *b.columns) for a, b in pairs])
     worths = np.array([_together(scores, float(x), pair) for x, pair in zip(gains, pairs, strict=True)])
     for k in np.argsort(-worths):
-        if not _well_ahead(round_, float(worths[k]), own):
+        if not _well_ahead(round_, float(worths[k]), _together(scores, own.gain, w.each)):
             return None
         a, b = pairs[int(k)]
-        beta = np.split(w.evidence.gain(totals, (*a.columns, *b.columns))[1], [len(a.columns)])
-        each = [replace(scores.best[c.id], beta=x) for c, x in zip((a, b), beta, strict=True)]
-        if all(plausible(s, settings) for s in each):
+        new = score((a, b))
+        each = zip((a, b), np.split(new.beta, [len(a.columns)]), strict=True)
+        fine = all(plausible(replace(scores.best[c.id], beta=x), settings) for c, x in each)
+        fine = fine and _well_ahead(round_, new.left_out_gain, own.left_out_gain)
+        if fine and all(w.evidence.beside(x.columns, y.columns) <= scores.level(y.id) for x, y in ((a, b), (b, a))):
             return [a, b]
     return None
 

@@ -18,7 +18,8 @@ __all__ = ["Round", "forward"]
 
 @dataclass
 class Round:
-    """One step of the competition: the scores of all candidates, why some were turned down, and its random draws."""
+    """One step of the competition: the scores of all candidates, why some were turned down, which exchanges of two were
+    tested, and its random draws."""
 
     training: Training
     state: State
@@ -26,6 +27,7 @@ class Round:
     rng: np.random.Generator
     tell: Callable[[str], None] = lambda _: None
     reasons: dict[str, Rejection] = field(default_factory=dict)
+    tested: list[str] = field(default_factory=list)
 
     def asked(self, s: Score) -> Asked:
         """What the gates look at for a candidate of this round."""

@@ -50,8 +50,8 @@ class State:
     """The vehicle as fitted so far, the effects found in order, and the verdicts on all others.
 
     `terms` are those without a name; `removed` says why added effects were removed again; `refused` passed the gates of
-    their scores but not the later ones, and are tried again only before the end; `trail` holds the values
-    of fits by the effects that they had.
+    their scores but not the later ones, and are tried again only before the end; `tested` are exchanges of two that
+    failed; `trail` holds the values of fits by the effects that they had.
     """
 
     fit: Calibration
@@ -61,6 +61,7 @@ class State:
     absorbs: Mapping[str, list[str]] = field(default_factory=dict)
     removed: Mapping[str, Rejection] = field(default_factory=dict)
     refused: tuple[str, ...] = ()
+    tested: tuple[str, ...] = ()
     trail: Mapping[str, list[float]] = field(default_factory=dict)
     finished: bool = False
 

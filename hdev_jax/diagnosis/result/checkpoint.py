@@ -34,6 +34,7 @@ def to_plain(state: State) -> dict[str, Any]:
         "absorbs": {k: list(v) for k, v in state.absorbs.items()},
         "removed": {k: _rejection(v) for k, v in state.removed.items()},
         "refused": list(state.refused),
+        "tested": list(state.tested),
         "trail": dict(state.trail),
         "finished": state.finished,
     }
@@ -61,6 +62,7 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, training: Training) 
         dict(plain["absorbs"]),
         {k: _from_rejection(v) for k, v in plain["removed"].items()},
         tuple(plain["refused"]),
+        tuple(plain["tested"]),
         dict(plain["trail"]),
         bool(plain["finished"]),
     )

@@ -87,14 +87,22 @@ class Evidence(NormalEquations):
         variance w'X'Xw (Carter, Schnepel and Steigerwald, Review of Economics and Statistics 99, 2017; rows of a
         cluster taken as independent). What two trips show is known by two, however many others there are.
         """
+        return 1.0 / np.maximum(np.sum(self._shares(candidate) ** 2, axis=1), 1e-300)
+
+    def rests_on(self, candidate: Candidate) -> float:
+        """How many clusters a candidate's coefficients rest on together, as `bearing` of each."""
+        return 1.0 / max(float(np.sum(np.mean(self._shares(candidate), axis=0) ** 2)), 1e-300)
+
+    def _shares(self, candidate: Candidate) -> Float[np.ndarray, "k cluster"]:
+        """The share that each cluster has in the variance of each coefficient."""
         at, totals = self.base + np.asarray(candidate.columns), self.totals()
         v = int(np.argmax(self._fit(totals, at)[0]))
         index = self._with_base(at)
         normal = self._normal(totals[v], at)[0]
         weights = np.stack([solved(normal, e) for e in np.eye(len(index))[self.base :]])
         variance = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
-        share = variance / np.maximum(np.sum(variance, axis=1, keepdims=True), 1e-300)
-        return 1.0 / np.maximum(np.sum(share**2, axis=1), 1e-300)
+        variance = np.maximum(variance, 0.0)  # rounding of what the levels take off
+        return variance / np.maximum(np.sum(variance, axis=1, keepdims=True), 1e-300)
 
     def traded(self, own: Sequence[int], other: int) -> Float[np.ndarray, " k"]:
         """What a unit of another column adds to the coefficients of a candidate's own."""
@@ -118,8 +126,7 @@ class Evidence(NormalEquations):
             k = at.shape[-1]
             likelihood, x = self._fit(totals, at)
             full, beta = self._jackknife(at, 0), x[0, :, self.base :]
-            rests_on = np.array([np.min(self.bearing(candidates[i])) for i in places])
-            p = wald(beta, full[..., self.base :], np.clip(rests_on, k + 1, g) - k)
+            p = wald(beta, full[..., self.base :])
             # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
             statistic = np.zeros(len(places))
             if g >= least_clusters(k):
@@ -131,6 +138,8 @@ class Evidence(NormalEquations):
             whole = np.max(likelihood, axis=0) - self.base_likelihood(totals)
             kept = np.sum(better, axis=0) / np.maximum(whole, 1e-300)
             left_out = np.where(t > 1.0, gain * np.minimum(kept, 1.0), 0.0)
+            rests_on = np.array([self.rests_on(candidates[i]) for i in places])
+            p = wald(beta, full[..., self.base :], np.clip(rests_on, k + 1, g) - k)
             for i, j in enumerate(places):
                 out[int(j)] = Score(
                     candidates[j], beta[i], float(gain[i]), float(p[i]), float(p[i]), float(left_out[i]),
