@@ -14,7 +14,7 @@ __all__ = ["compile_quickly", "compiles_long", "keep_compiled"]
 FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
 PACKED = 5  # times smaller than that, where a file is compressed
-KEPT_BYTES = 1_000_000_000  # of compiled programs; those not used for longest go first
+KEPT_BYTES = 40_000_000  # some 2,000 programs; JAX looks at each when it adds one; those not used for longest go first
 _COMPRESSED = {".gz", ".parquet", ".mat", ".zip", ".xz", ".bz2"}
 
 

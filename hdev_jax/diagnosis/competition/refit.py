@@ -1,6 +1,6 @@
 """Joint refits: the vehicle with a candidate, every free coefficient refitted; is the candidate significant there?"""
 
-from collections.abc import Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,12 +108,28 @@ def fitted(training: Training, near: Calibration, vehicle: Vehicle, table: Param
     """A fit of a vehicle by a table; sizes known by generalised least squares beside other effects are estimated again.
 
     Such a value has a small standard error, and would be held where it no longer is with an effect more or less.
-    Ordinary least squares where the steps do not settle. `near` is a fit of these rows.
+    Ordinary least squares where the steps do not settle. Limits that would end out of order stay where they are.
+    `near` is a fit of these rows.
     """
     if names := {c.name for c in table.free if c.known}:
         known = _by_gls(training, near, vehicle, table, training.noise(near), names)
         table = known or ParameterTable(tuple(replace(c, known=None) for c in table.rows))
-    return training.calibrate(vehicle, table)
+    fit = training.calibrate(vehicle, table)
+    if crossed := _crossed(fit):
+        held = ParameterTable(tuple(replace(c, free=c.free and c.path not in crossed) for c in table.rows))
+        fit = training.calibrate(vehicle, held)
+    return fit
+
+
+def _crossed(fit: Calibration) -> set[str]:
+    """Fitted limits that ended out of order, by path."""
+    at, out = {c.path: float(v) for c, v in zip(fit.table.free, fit.values, strict=True)}, set[str]()
+    for e in fit.vehicle.effects:
+        for pair in e.ordered:
+            low, high = (f"effects.{e.id}.{n}" for n in pair)
+            if low in at and high in at and at[low] >= at[high]:
+                out |= {low, high}
+    return out
 
 
 def without(training: Training, state: State, *ids: str) -> State:
@@ -150,7 +166,8 @@ def as_reported(training: Training, state: State) -> Calibration:
     predicted = np.concatenate(
         [np.asarray(predict(known.vehicle, c.segments, training.target))[: c.rows] for c in training.chunks]
     )
-    table = _known(fit.table, known.values, error, {c.name for c in fit.table.free})
+    each = zip(fit.table.free, known.values, error, strict=True)
+    table = _known(fit.table, {c.name: (float(x), float(e)) for c, x, e in each})
     known = replace(
         known, table=table, sd=error, covariance=covariance, predicted=predicted,
         sigma=float(np.sqrt(np.mean((training.measured - predicted) ** 2))),
@@ -211,11 +228,8 @@ def widened(training: Training, state: State) -> State | None:
     return None
 
 
-def _known(
-    table: ParameterTable, values: Float[np.ndarray, " free"], error: Float[np.ndarray, " free"], names: Set[str]
-) -> ParameterTable:
-    """The table with these values and standard errors as known, for its free coefficients of these names alone."""
-    known = {c.name: (float(x), float(e)) for c, x, e in zip(table.free, values, error, strict=True) if c.name in names}
+def _known(table: ParameterTable, known: Mapping[str, tuple[float, float]]) -> ParameterTable:
+    """The table with these values and standard errors as known, by coefficient; no others are."""
     return ParameterTable(tuple(replace(c, known=known.get(c.name)) for c in table.rows))
 
 
@@ -227,13 +241,18 @@ def _by_gls(
     One linear step is not enough: the coefficients that it starts from may have been fitted without the effect. None
     where the steps do not settle.
     """
-    values, nothing = table.values(vehicle), np.zeros((len(table.free), len(table.free)))
-    start = replace(near, vehicle=vehicle, table=table, values=values, sd=np.diag(nothing), covariance=nothing)
-    fit, covariance = generalised(training.baseline(start, noise))
-    error = np.sqrt(np.diag(covariance))
-    if not all(np.isfinite(e) for c, e in zip(table.free, error, strict=True) if c.name in names):
-        return None
-    return _known(table, fit.values, error, names)
+    thresholds = {f"effects.{e.id}.{p.name}" for e in vehicle.effects for p in e.parameters if isinstance(p, Switch)}
+    held = ParameterTable(tuple(replace(c, free=c.free and c.path not in thresholds) for c in table.rows))
+    for tried in dict.fromkeys((table, held)):  # a threshold may jump from row to row, and no step settles
+        values, nothing = tried.values(vehicle), np.zeros((len(tried.free), len(tried.free)))
+        start = replace(near, vehicle=vehicle, table=tried, values=values, sd=np.diag(nothing), covariance=nothing)
+        fit, covariance = generalised(training.baseline(start, noise))
+        error = np.sqrt(np.diag(covariance))
+        known = [np.isfinite(e) for c, e in zip(tried.free, error, strict=True) if c.name in names]
+        if known and all(known):
+            by_name = {c.name: (float(x), float(e)) for c, x, e in zip(tried.free, fit.values, error, strict=True)}
+            return _known(table, {n: by_name[n] for n in names if n in by_name})
+    return None
 
 
 def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) -> tuple[Coefficient, ...]:

@@ -85,7 +85,7 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
     evidence = plain if s.plain else white
     same = [k for k in plan.candidates if (k.sizes, k.groups) == (c.sizes, c.groups)]
     totals = evidence.totals()
-    points = []
+    points, found, inside = [], np.array([np.nan]), np.array([np.nan])
     for k in same:
         gain, beta = evidence.gain(totals, k.columns)
         shapes = np.array([dict(k.shapes)[n] for n in names])
