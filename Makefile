@@ -11,7 +11,7 @@ PIP := $(PY) -m pip --disable-pip-version-check --no-input install -qq -c constr
 .DELETE_ON_ERROR:
 
 demo: $(READY)
-	@$(PY) -m hdev_jax.verbs.demo --out out/demo
+	@$(PY) -m hdev_jax.cli demo --out out/demo
 
 paper: $(READY)
 	@$(PY) -m experiments configs/paper.toml --out out/paper --workers 0 $(ARGS)

@@ -30,6 +30,7 @@ cause, adds it, and shows the error before and after."""
 
 _EXAMPLES = """\
 to begin:
+  hdev demo                                     a synthetic truck's log, diagnosed: open hdev_demo/result/report.html
   hdev check trips.csv                          what was read from the log, no fit
   hdev check other.csv --skeleton > a.toml      a log with other column names: fill in a.toml ...
   hdev check other.csv --adapter a.toml         ... and look again
@@ -44,6 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; argparse's own exits (`--help`, usage) raise SystemExit."""
     arguments = vars(parser().parse_args(argv))
     verb = arguments.pop("verb")
+    if verb is None:
+        print(f"{_ABOUT}\n\n{_EXAMPLES}")
+        return 0
     try:
         _print(_run(verb, arguments))
     except KeyboardInterrupt:
@@ -64,7 +68,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line: one subparser a verb, whose options are the arguments of the function of that name."""
     top = _Parser(prog="hdev", description=_ABOUT, epilog=_EXAMPLES)
     top.add_argument("--version", action="version", version=f"hdev {__version__}")
-    verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
+    verbs = top.add_subparsers(dest="verb", metavar="VERB")
 
     check = verbs.add_parser(
         "check",
@@ -165,6 +169,17 @@ def parser() -> argparse.ArgumentParser:
     )
     simulate.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
 
+    demo = verbs.add_parser(
+        "demo",
+        help="a synthetic truck's log with an effect that its sheet does not declare, and its diagnosis",
+        description="Write a synthetic log and a sheet into a folder, diagnose them, and say what was planted.",
+        epilog="example:\n  hdev demo --out tour",
+    )
+    demo.add_argument(
+        "--out", type=Path, default=Path("hdev_demo"), metavar="DIR", help="the folder (default: hdev_demo)"
+    )
+    demo.add_argument("--seed", type=_count, default=3, metavar="N", help="random seed of the log (default: 3)")
+
     verbs.add_parser(
         "effects",
         help="the library of effects: id, stage, equation, parameters and units, channels needed",
@@ -264,7 +279,7 @@ class _Help(argparse.HelpFormatter):
 
 
 def _run(verb: str, arguments: dict[str, Any]) -> Any:
-    if "logs" in arguments and compiles_long(arguments["logs"]):
+    if verb == "demo" or ("logs" in arguments and compiles_long(arguments["logs"])):
         compile_quickly()
     import jax
 

@@ -104,13 +104,13 @@ def test_not_decidable_holds_the_planted_effect_with_how_many_would_do():
 
 
 def test_a_rival_is_credited_by_the_same_classes_as_we_are():
-    """auxiliary_power and a power sensor's offset are one column: for whoever names either."""
+    """mass_scale and a power sensor's gain are one column, beside a drag area that is open."""
     others = {
-        "stlsq": {"named": ["power_gain"]}, "lasso_cv": {"named": ["auxiliary_power", "power_gain"]},
+        "stlsq": {"named": ["power_gain"]}, "lasso_cv": {"named": ["mass_scale", "power_gain"]},
         "forward_bic": {"named": ["power_gain", "headwind"]},
     }  # fmt: skip
-    log = result(["power_gain", "auxiliary_power"], rivals=others)
-    planted = ["auxiliary_power"]
+    log = result(["power_gain", "mass_scale"], rivals=others)
+    planted = ["mass_scale"]
     assert outcome(planted, log, "ours") == (True, False)
     assert outcome(planted, log, "ours_first") == (False, True)
     assert outcome(planted, log, "stlsq") == (True, False)
@@ -122,9 +122,9 @@ def test_a_rival_is_credited_by_the_same_classes_as_we_are():
     some = {"stlsq": {"named": ["crosswind"]}}  # and one that so few rows leave
     assert outcome(["headwind"], result(rivals=some, alike={"headwind": ["crosswind"]}), "stlsq") == (True, False)
     assert outcome(["headwind"], result(rivals=some), "stlsq") == (False, True)
-    two = result(["power_gain", "auxiliary_power"], ["headwind"], rivals=others)
-    assert outcome(["auxiliary_power", "headwind"], two, "forward_bic") == (True, False)
-    assert outcome(["auxiliary_power", "headwind"], two, "stlsq") == (False, False)
+    two = result(["power_gain", "mass_scale"], ["headwind"], rivals=others)
+    assert outcome(["mass_scale", "headwind"], two, "forward_bic") == (True, False)
+    assert outcome(["mass_scale", "headwind"], two, "stlsq") == (False, False)
 
 
 def test_what_has_no_column_is_not_compared():
@@ -301,9 +301,9 @@ def test_the_oracle_of_slow_noise_is_better_than_rows_of_equal_weight(tmp_path):
 
 @pytest.mark.slow
 def test_what_one_column_cannot_tell_apart_is_one_class(tmp_path):
-    effects = {"auxiliary_power": {"power_w": 8000.0}}
+    effects = {"mass_scale": {"scale": 0.05}}
     synthetic, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
-    assert "power_gain" in confusable(["auxiliary_power"], synthetic, problem, split)["auxiliary_power"]
+    assert "power_gain" in confusable(["mass_scale"], synthetic, problem, split)["mass_scale"]
 
 
 @pytest.mark.slow

@@ -22,7 +22,9 @@ ROAD = [effect for (effect,) in typed(Config, resolve(STUDY), STUDY).sets["road"
 
 # what else may stand in a twin's class: little is left of the column beside it
 THIRD = {
-    "auxiliary_power": ("inverter_loss",), "mass_scale": ("voltage_dependence",), "power_gain": ("voltage_dependence",)
+    # power_gain's offset, which is never had by itself
+    "auxiliary_power": ("inverter_loss", "power_gain"), "mass_scale": ("voltage_dependence",),
+    "power_gain": ("voltage_dependence",),
 }  # fmt: skip
 
 

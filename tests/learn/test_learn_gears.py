@@ -118,7 +118,7 @@ def test_the_whole_vehicle_has_a_gradient():
         return jnp.mean(changed.energy(told(changed, log)))
 
     given = jnp.asarray(0.006), jnp.asarray(5.5), vehicle.driveline.efficiency.values
-    check_grads(energy, given, order=1, modes=("fwd", "rev"), eps=1e-7, rtol=1e-3, atol=1e-3)
+    check_grads(jax.jit(energy), given, order=1, modes=("fwd", "rev"), eps=1e-7, rtol=1e-3, atol=1e-3)
 
 
 def test_a_gear_that_training_lacked_is_refused():

@@ -16,7 +16,7 @@ import hdev_jax
 from hdev_jax import cli, progress
 from hdev_jax.errors import InputError
 
-VERBS = ("check", "diagnose", "calibrate", "predict", "simulate", "effects")
+VERBS = ("check", "diagnose", "calibrate", "predict", "simulate", "demo", "effects")
 SHEET = ["--vehicle", "v.toml"]
 
 
@@ -125,6 +125,14 @@ def test_help_explains(verb, capsys):
     assert "\n  hdev " in text or verb == "effects", "examples"
 
 
+def test_alone_it_says_what_to_do_first(capsys, api):
+    assert cli.main([]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert all(f"  hdev {verb} " in captured.out for verb in ("demo", "check", "diagnose", "predict"))
+    assert api.calls == []
+
+
 def test_version(capsys):
     with pytest.raises(SystemExit) as exit_:
         cli.main(["--version"])
@@ -135,7 +143,6 @@ def test_version(capsys):
 @pytest.mark.parametrize(
     ("argv", "says"),
     [
-        ([], "hdev: the following arguments are required: VERB"),
         (["diagnos"], "invalid choice: 'diagnos'"),
         (["diagnose", "a.csv"], "required: --vehicle, --out"),
         (["check"], "required: LOG"),
