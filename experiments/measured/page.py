@@ -36,16 +36,15 @@ FOLDER = "figures/real_logs"
 COLD_C = 12.0  # heating runs below: splits the missions of ZTBus into about a third and two thirds
 HEAD = """# Measured logs
 
-What the loop finds on two public logs, how far that depends on the trips it was trained on, what stays unexplained, and
-what it concludes when a channel that the log has is kept from it. Made by
+What the diagnosis finds in two public logs, how far that depends on the training trips, and what stays unexplained;
+with a channel taken out of the log, what it concludes without it. Made by
 
     python -m experiments.measured.logs --work DIR --write
 
-from the diagnosis.json of each run. Everything here is measured; nothing is synthetic. Every error is on trips that no
-choice has seen, and predictions are free of measured power (no feedback). Both logs are public, and effects of the
-library were added with them in view: this page says what the loop makes of measured data, not how it does on a log that
-nobody has seen. Synthetic logs that no rule of the search was mended on are in planted_again.md.
-Cost is the wall clock of one run with its compiling, on a shared machine, and the most memory it held."""
+from the diagnosis.json of each run. Everything here is measured. Every error is on held-out test trips, and predictions
+use no measured power (free run). Effects were added to the library with both logs in view, so this page does not show
+how the diagnosis does on a log that nobody has seen: planted_summary.md does, for synthetic ones. Cost is the wall
+clock of one run, compiling included, on a shared machine, and its peak memory."""
 READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with what was found.
 - *found*: the loop added the effect. *one of a class*: it added one of several that this log cannot tell apart.
 - The number behind it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),

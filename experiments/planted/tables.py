@@ -56,35 +56,30 @@ LEGEND = {  # of each table that is there; the first of every page
         "called shaft samples of electric power with the motor's torque and speed",
     ),
     "planted": (
-        "As asked: the share of logs that name all and only what was planted (one entry each: the id, or a class of at "
-        "most three that holds it); with nothing planted, that name nothing; of a cause outside the library, that name "
-        "nothing false; of what a coefficient absorbs, that say so; of what only trips tell, that more trips would. "
-        "Its interval is Wilson's. Met: what was asked is at least what is wanted, and so is, where wanted, the share "
-        "called unexplained. Met by interval: the lower ends of their intervals are, too; not asked where so few logs "
-        "could not show it",
+        "As asked: the share of logs with the right answer, with Wilson's 95 % interval. Right is: all and only what "
+        "was planted (each by its id, or in a class of at most three); with nothing planted, no name; with a cause "
+        "outside the library, no wrong name (a constant load is right for the mean of one that switches); where a "
+        "coefficient absorbs the effect, or only more trips could decide, that this is said. Met: the share is at "
+        "least what is wanted; met by interval: so is the lower end",
         "Something false: logs that name an effect which was not planted. Called unexplained: logs in which structure "
-        "is left, which levels of trips are too, though they are noise there",
+        "is left (random intercepts of trips count, though they are noise there)",
     ),
     "planted_errors": (
-        "Sizes are of what was named itself. Within 5 percent of oracle: test RMSE after the loop against a refit on "
-        "the same training trips that knows the cause. After over noise: that RMSE over the noise's own, median. "
+        "Within 5 percent of oracle: test RMSE of the diagnosis against a fit on the same training trips that knows "
+        "the cause. After over noise: that RMSE over the noise's own, median. Sizes: of effects named by their own id. "
         "Seconds: of one diagnosis, median, beside others on the same machine; a kind's first logs also compile",
     ),
     "planted_names": (
-        "Named first: classes set aside, what each entry is called. No class: each entry is one name. Separable: logs "
-        "of an effect without a twin in which no other could have done as well under this noise, worked out from the "
-        "truth; of large effects (size 1) an upper bound. "
-        "Redrawn: logs drawn anew since the effect acted in one training trip only",
+        "Named first: the first name of each entry is the planted one. No class: each entry is one name. Separable: "
+        "logs in which, by the truth, no other effect explains as much under this noise. Redrawn: logs drawn again "
+        "because the effect acted in one training trip only",
     ),
     "planted_names_by_twin": (
-        "Twins: three effects cannot be told from another one by any log of road segments under this sheet (drag area "
-        "open, no declared load), once rolling resistance and drag area are fitted: auxiliary_power (from power_gain's "
-        "offset, and from inverter_loss with its standby), mass_scale (from power_gain's gain) and power_gain (from "
-        "mass_scale). The right answer is a class of at most three that holds both, and is asked here: in the first "
-        "table a name by itself counts, which is a guess there. A share with one name is wanted of all logs, of which "
-        "only a guess could name more than those without a twin, and of these by themselves. Each part has to reach "
-        "what is wanted of all. Met: as asked is at least what is wanted, and so is, where wanted, the share with no "
-        "class; by interval: so are the lower ends of both intervals",
+        "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "
+        "rolling resistance and drag area are fitted. The right answer is a class of at most three that holds both. "
+        "In the first table one name of the two counts too, though it is a guess. Met: as asked is at least what is "
+        "wanted, and so is, where wanted, the share with no class; by interval: so are the lower ends of both "
+        "intervals",
     ),
     "planted_rivals": (
         "Ours needs an entry that holds the planted effect, ours_first (classes set aside, what each entry is called) "

@@ -1,0 +1,36 @@
+"""The numbers of README.md are those of the pages that commands made."""
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+REAL, PLANTED = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("real_logs.md", "planted_summary.md"))
+
+
+def row(page: str, name: str) -> list[str]:
+    """Cells of the first row of a page's table with this name."""
+    line = next(x for x in page.splitlines() if x.startswith(f"| {name} |"))
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_errors_on_measured_logs_are_those_of_the_page():
+    before, after = re.search(r"\*\*ZTBus\*\*: test RMSE (\S+) → (\S+) kW", REAL).groups()  # pyright: ignore
+    assert f"RMSE {after} kW" in README
+    assert f"{before} kW for the calibrated sheet" in README
+    each = [row(REAL, str(trip)) for trip in (1, 2, 3, 4)]
+    mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
+    assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} numbers" in README
+    assert "paper's network of 282 parameters, trained on trip 1 (its table VIII): 0.1604" in REAL
+    assert "0.1604 kW² for the paper's network of 282" in README
+
+
+def test_shares_of_synthetic_logs_are_those_of_the_page():
+    for size, words in ((0.5, "named exactly in {} % of {}"), (0.25, "at a quarter of the noise: {} % of {}")):
+        _, n, share, *_ = row(PLANTED, f"one effect, size {size}, 12 trips, ar1")
+        assert words.format(round(100 * float(share)), n) in README
+    _, n, share, *_ = row(PLANTED, "nothing planted, all together")
+    assert f"a name in {round((1 - float(share)) * int(n))} of {n}" in README
+    outside = [row(PLANTED, f"a {what} outside the library, size 1, 24 trips, ar1") for what in ("cause", "cycle")]
+    wrong, logs = sum(float(r[7]) * int(r[1]) for r in outside), sum(int(r[1]) for r in outside)
+    assert f"a wrong name in {round(wrong)} of {logs}" in README
