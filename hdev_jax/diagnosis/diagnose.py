@@ -60,7 +60,7 @@ def diagnose(
     **Arguments:** `library`, the candidates by id; `settings`, every number that decides; `seed` of placebos,
     resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
 
-    **Returns:** a `Outcome`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
+    **Returns:** an `Outcome`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
     """
     # 1. The training rows, and the effects that could act on this target
     training, excluded = training_of(problem, split, library, settings)

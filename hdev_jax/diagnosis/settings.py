@@ -47,7 +47,7 @@ class Settings:
         "collinearity: standard error 18 times that of an orthogonal column",
     )  # fmt: skip
     by_rows: float = _number(
-        1e-12, "p-value by rows alone below which shapes are estimated before clusters are asked", "1", "time"
+        1e-12, "p-value by rows alone below which a shape is refined before its clustered test counts", "1", "time"
     )
     agreed: float = _number(
         0.25, "share of a size by ordinary least squares that generalised least squares must not exclude", "1",

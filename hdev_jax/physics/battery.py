@@ -224,7 +224,7 @@ class StepChange(Effect):
         Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
         Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
         Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
-        Choice("at_trip", "1", 0.0, 1.0, grid=()),  # every trip with three on either side
+        Choice("at_trip", "1", 0.0, 1.0, grid=()),  # every trip with three of the same vehicle on either side
     )
     variants: ClassVar = (("power_w",), ("c_rr",), ("loss",))
     mistaken_for: ClassVar = ("rolling_temperature", "mass_scale")

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,7 +56,17 @@ def calibrate(
         raise InputError(f"--noise {noise!r}: accepted are normal, student_t")
     started = time.time()
     start = opened(
-        "calibrate", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known_effects(effects)
+        "calibrate",
+        logs,
+        vehicle,
+        adapter,
+        target,
+        train_trips,
+        test_trips,
+        effects,
+        seed,
+        known_effects(effects),
+        kept=out is not None,
     )
     if not start.problem.table.free:
         raise InputError(f"sheet {vehicle}: nothing to calibrate; give a coefficient in use a value with an sd")
@@ -68,7 +79,7 @@ def calibrate(
             summary, predictive = (json.loads((folder / f).read_text()) for f in ("calibration.json", BESIDE))
             sheet = (folder / "calibrated_vehicle.toml").read_text()
             answer = (folder / "answer.txt").read_text()
-            return CalibrationResult(answer, summary, sheet, predictive, lambda: kept(folder))
+            return CalibrationResult(answer, summary, sheet, predictive, partial(kept, folder))
         result = _calibrated(start, method, noise, seed, started, run)
         run.path("calibrated_vehicle.toml").write_text(result.sheet)
         run.path(BESIDE).write_text(json.dumps(result.predictive, indent=1, allow_nan=False) + "\n")
@@ -108,7 +119,7 @@ def _calibrated(
     lines += [] if outcome.good else [f"NOT A GOOD FIT: {fit.message}"]
     lines += [f"note: {note}" for note in summary["notes"]]
     lines.append(f"test RMSE {summary['before']['test']['rmse']:.4g} {problem.unit}; {fit.message}")
-    return CalibrationResult("\n".join(lines), summary, sheet, predictive, lambda: data, outcome.draws)
+    return CalibrationResult("\n".join(lines), summary, sheet, predictive, data, outcome.draws)
 
 
 def _summary(

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.diagnose import diagnose as run_method
 from hdev_jax.diagnosis.result.stages import add_stages
 from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.physics import Effect
 from hdev_jax.report.build import answer_text, of_diagnosis
@@ -63,10 +65,23 @@ def diagnose(
     **Returns:** a `Diagnosis`; `str()` is the answer as text. **Raises:** `InputError` for faults of the input.
     """
     started = time.time()
+    if not 0.0 < fdr < 1.0:
+        raise InputError(f"fdr {fdr}: a number between 0 and 1 is expected")
     known = known_effects(effects)
     candidates = chosen_effects(known, only, exclude)
     start = opened(
-        "diagnose", logs, vehicle, adapter, target, train_trips, test_trips, effects, seed, known, *candidates
+        "diagnose",
+        logs,
+        vehicle,
+        adapter,
+        target,
+        train_trips,
+        test_trips,
+        effects,
+        seed,
+        known,
+        *candidates,
+        kept=out is not None,
     )
     why = {k: "--exclude" if k in (exclude or ()) else "not in --only" for k in known if k not in candidates}
     excluded = [{"id": k, "why": w} for k, w in why.items() if not start.problem.vehicle.has(k)]
@@ -84,7 +99,7 @@ def diagnose(
             folder = run.work
             summary, predictive = (json.loads((folder / f).read_text()) for f in ("diagnosis.json", BESIDE))
             sheet = (folder / "augmented_vehicle.toml").read_text()
-            return Diagnosis((folder / "answer.txt").read_text(), summary, sheet, predictive, lambda: kept(folder))
+            return Diagnosis((folder / "answer.txt").read_text(), summary, sheet, predictive, partial(kept, folder))
         progress.step(start.read)
         result = _diagnosed(start, candidates, excluded, fdr, seed, started, run)
         run.path("augmented_vehicle.toml").write_text(result.sheet)
@@ -112,7 +127,7 @@ def _diagnosed(
     outcome.summary["notes"] += notes
     progress.step("writing the report")
     data = of_diagnosis(outcome, command_line("diagnose", run), started)
-    return Diagnosis(answer_text(data), outcome.summary, sheet, predictive, lambda: data)
+    return Diagnosis(answer_text(data), outcome.summary, sheet, predictive, data)
 
 
 def _augmented(outcome: Outcome, sheet: Sheet) -> str:

@@ -55,6 +55,10 @@ def log_of(logs: Logs, adapter: str | Path | None = None) -> Log:
 
 def sheet_of(vehicle: Vehicles, library: Mapping[str, type[Effect]]) -> Sheet:
     """The sheet in a file, from Python, or as a result fitted it. Raises `InputError`."""
+    if isinstance(vehicle, str) and "\n" in vehicle:
+        raise InputError("vehicle: the text of a sheet; give its path, a Sheet, or the result that it is of")
+    if not isinstance(vehicle, str | Path | Sheet | Result):
+        raise TypeError(f"vehicle: a sheet's path, a Sheet or a result is expected, found {type(vehicle).__name__}")
     if isinstance(vehicle, Result):
         return Sheet(library=library, path="fitted sheet", **tomllib.loads(vehicle.sheet))
     return vehicle if isinstance(vehicle, Sheet) else read_sheet(vehicle, library=library)
@@ -226,9 +230,17 @@ def _digest_of_vehicle(vehicle: Vehicles, sheet: Sheet) -> str:
 
 
 def _digest_of_effects(effects: Effects) -> str | None:
+    """Of the file, or of the files that hold the classes; raises `InputError` for a class that stands in none."""
     if effects is None or isinstance(effects, str | Path):
         return None if effects is None else digest(Path(effects))
-    return hashlib.sha256("".join(map(inspect.getsource, effects)).encode()).hexdigest()
+    each = []
+    for c in effects:
+        try:
+            each.append(f"{c.__qualname__} {digest(Path(inspect.getfile(c)))}")
+        except (OSError, TypeError) as e:
+            why = "a run in a folder compares its source, which is not available; put it in a file: effects='mine.py'"
+            raise InputError(f"effects: class {c.__name__}: {why}") from e
+    return hashlib.sha256(" ".join(each).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -258,10 +270,12 @@ def opened(
     seed: int,
     known: Mapping[str, type[Effect]],
     *candidates: str,
+    kept: bool = True,
 ) -> Opening:
     """Read the logs and the sheet, bring them together and split the trips. Raises `InputError`.
 
-    **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried.
+    **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried;
+    `kept`, whether the run is kept in a folder, which compares what it was made of.
     """
     sheet = sheet_of(vehicle, known)
     with progress.busy("reading the logs"):
@@ -275,6 +289,7 @@ def opened(
         "log_sha256": problem.log.fingerprint(),
         "vehicle": _named(vehicle),
         "vehicle_sha256": _digest_of_vehicle(vehicle, sheet),
+        "map_sha256": None if sheet.map_path is None else digest(sheet.map_path),
         "adapter": None if adapter is None else str(adapter),
         "target": problem.target,
         "train_trips": split.names(split.train),
@@ -282,7 +297,7 @@ def opened(
         "asked_train": None if train_trips is None else list(train_trips),
         "asked_test": None if test_trips is None else list(test_trips),
         "effects_file": None if effects is None else _named(effects),
-        "effects_sha256": _digest_of_effects(effects),
+        "effects_sha256": _digest_of_effects(effects) if kept else None,
         "seed": seed,
         "x64": bool(jax.config.read("jax_enable_x64")),
     }

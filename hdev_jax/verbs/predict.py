@@ -91,12 +91,16 @@ def predict(
 
     if not 0 < level < 1:
         raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
+    if out is not None and not str(out).endswith((".csv", ".csv.gz", ".parquet")):
+        raise InputError(f"--out {out}: a file that ends in .csv, .csv.gz or .parquet is expected")
     library = known_effects(effects)
     log = log_of(logs, adapter)
     sheet = sheet_of(vehicle, library)
     beside = vehicle.predictive if isinstance(vehicle, Result) else {}
     if isinstance(vehicle, str | Path):
         beside = _beside(Path(vehicle))
+    if target is not None and target not in TARGETS:
+        raise InputError(f"unknown target '{target}'; accepted: {', '.join(TARGETS)}")
     measures = target in log.targets if target else bool(log.targets)
     name = target or (log.default_target if measures else beside.get("target", "energy_wh"))
     measures = measures or derivable(log, name)

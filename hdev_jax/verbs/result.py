@@ -47,12 +47,12 @@ class Result:
     - `summary`: what the JSON file of the command holds (contract, section 4).
     - `sheet`: the vehicle sheet as fitted, TOML.
     - `predictive`: covariance and noise for the intervals of `hdev_jax.predict`, what `predictive.json` holds.
-    - `data`: rows, channels and errors that the report shows.
+    - `data`: rows, channels and errors that the report shows; read from the run's folder when it is first asked for.
     """
 
     def __init__(
         self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
-        data: Callable[[], ReportData],
+        data: ReportData | Callable[[], ReportData],
     ):  # fmt: skip
         self.summary, self.sheet, self.predictive = dict(summary), sheet, dict(predictive)
         self._answer, self._data = answer, data
@@ -64,7 +64,7 @@ class Result:
     @cached_property
     def data(self) -> ReportData:
         """Rows, channels and errors that the report shows."""
-        return self._data()
+        return self._data if isinstance(self._data, ReportData) else self._data()
 
     def __str__(self) -> str:
         return self._answer
@@ -200,7 +200,7 @@ class CalibrationResult(Result):
 
     def __init__(
         self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
-        data: Callable[[], ReportData], draws: "Draws | None" = None,
+        data: ReportData | Callable[[], ReportData], draws: "Draws | None" = None,
     ):  # fmt: skip
         super().__init__(answer, summary, sheet, predictive, data)
         self.draws = draws

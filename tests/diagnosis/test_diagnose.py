@@ -6,16 +6,19 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from planted import breaches, diagnosed, named, opened, training
+from planted import breaches, declared, diagnosed, named, opened, training
 
+from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Factor, Term, describing
 from hdev_jax.diagnosis.competition.compete import compete
-from hdev_jax.diagnosis.competition.state import Verdict
+from hdev_jax.diagnosis.competition.state import Found, Verdict
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
 from hdev_jax.diagnosis.result.stages import add_stages
+from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.errors import InputError
+from hdev_jax.inference import effect_coefficients
 from hdev_jax.physics import LIBRARY, Effect, Shape, Size
 from hdev_jax.problem import Problem, Split
 from hdev_jax.rundir import open_run
@@ -106,6 +109,19 @@ def test_a_state_is_kept_and_comes_back(through, log, tmp_path):
         assert one.score.candidate == other.score.candidate
         np.testing.assert_array_equal(one.score.beta, other.score.beta)
         assert replace(one, score=other.score) == other
+
+
+def test_a_limit_that_is_held_away_from_where_it_was_found_comes_back(log):
+    problem, _ = log
+    rows = training(problem, ["hvac_power"])
+    state, hvac = declared(rows, problem), LIBRARY["hvac_power"]
+    effect = hvac(below_w_per_k=500.0, above_w_per_k=0.0, heat_c=20.0, cool_c=26.0)
+    table = [replace(c, free=False) for c in effect_coefficients(effect, ("below_w_per_k",))]
+    candidate = Candidate(hvac, ("below_w_per_k",), (None,), (("heat_c", 14.0),), "size", ())
+    found = Found(hvac.id, Score(candidate, np.array([500.0]), 9.0, 0.0, 0.0, 9.0, 1.0), 0.0, 1.0, (), 9.0)
+    fit = replace(state.fit, vehicle=state.fit.vehicle.plus(effect), table=state.fit.table.plus(*table))
+    again = from_plain(to_plain(replace(state, fit=fit, found=(found,))), problem.vehicle, rows)
+    assert float(again.fit.vehicle.effect("hvac_power").heat_c) == 20.0
 
 
 # --- what comes out ----------------------------------------------------------------------------------------------

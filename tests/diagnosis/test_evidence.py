@@ -486,3 +486,16 @@ def test_what_would_show_by_now_is_ruled_out():
     assert ruled_out(0.5, 0.5, 1, 40)
     assert not ruled_out(0.5, 0.5, 1, 6)
     assert not ruled_out(0.5, 0.9, 2, 3)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_few_clusters_that_matter_make_as_few_false_finds(k):
+    """Sizes that six of 24 clusters show are tested at 5 degrees of freedom: a level of 5 % is one."""
+    rng, p = np.random.default_rng(k), []
+    for _ in range(4000):
+        sizes = rng.normal(size=(6, k))
+        mean = sizes.mean(axis=0)
+        spread = np.linalg.cholesky(np.atleast_2d(np.cov(sizes.T)) / 6.0) * np.sqrt(24.0 / 23.0)
+        left_out = mean + np.concatenate([spread.T, -spread.T, np.zeros((24 - 2 * k, k))]) / np.sqrt(2.0)
+        p.append(float(wald(mean, left_out, np.asarray(6.0 - k))))
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.012)

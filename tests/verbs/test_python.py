@@ -1,5 +1,7 @@
 """From Python: a frame and a sheet in, an answer with frames, figures and a report out; no folder is needed."""
 
+import pickle
+
 import matplotlib.figure
 import numpy as np
 import pandas as pd
@@ -9,6 +11,7 @@ import hdev_jax
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import demo_log
 from hdev_jax.physics import Effect, Size
+from hdev_jax.verbs.demo import demo
 
 ONLY = ["headwind", "auxiliary_power"]
 
@@ -98,6 +101,52 @@ def test_a_result_predicts_as_its_folder_does(found, log, sheet, tmp_path):
     inside = (here.rows["lower"] < log.frame["energy_wh"]) & (log.frame["energy_wh"] < here.rows["upper"])
     assert 0.85 < inside.mean() < 0.97
     assert "cross-validation over the fit's training trips" in str(here)
+
+
+def test_a_result_is_pickled_with_its_rows(found):
+    again = pickle.loads(pickle.dumps(found))
+    assert str(again) == str(found)
+    pd.testing.assert_frame_equal(again.residual, found.residual)
+
+
+def test_a_class_that_stands_in_no_file_is_tried_but_kept_in_no_folder(log, sheet, tmp_path):
+    made = type("Typed", (Nothing,), {"__module__": "nowhere", "id": "typed"})
+    options = {"only": ["auxiliary_power"], "effects": [made]}
+    assert hdev_jax.diagnose(log.frame, sheet, **options).summary["excluded"]
+    with pytest.raises(InputError, match="put it in a file"):
+        hdev_jax.diagnose(log.frame, sheet, **options, out=tmp_path / "out")
+
+
+def test_another_efficiency_map_is_another_run(log, tmp_path):
+    table = tmp_path / "map.csv"
+    efficiencies = "gear,motor_speed_radps,motor_torque_nm,efficiency\n" + "".join(
+        f"1,{w},{t},{{0}}\n" for w in (0.0, 200.0, 400.0) for t in (-4000.0, 0.0, 4000.0)
+    )
+    table.write_text(efficiencies.format(0.93))
+    sections = {"mass_kg": 29e3, "road": {"c_rr": (0.006, 0.0008), "cda_m2": 5.6}}
+    ratios = {"gear_ratios": [1.0], "final_drive": 20.0, "wheel_radius_m": 0.5}
+    sheet = hdev_jax.Sheet(**sections, driveline={"map": "map.csv", **ratios}, path=tmp_path / "sheet.toml")
+    hdev_jax.calibrate(log.frame, sheet, out=tmp_path / "out")
+    table.write_text(efficiencies.format(0.80))
+    again = hdev_jax.Sheet(**sections, driveline={"map": "map.csv", **ratios}, path=tmp_path / "sheet.toml")
+    with pytest.raises(InputError, match="another configuration"):
+        hdev_jax.calibrate(log.frame, again, out=tmp_path / "out")
+
+
+def test_the_demo_takes_nothing_that_is_another_s(tmp_path):
+    (tmp_path / "result").mkdir()
+    (tmp_path / "result" / "mine.txt").write_text("precious")
+    with pytest.raises(InputError, match="--out"):
+        demo(out=tmp_path)
+    assert (tmp_path / "result" / "mine.txt").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"), [({"target": "energy"}, "unknown target"), ({"out": "p.xlsx"}, ".parquet")]
+)
+def test_predict_says_what_it_does_not_know(options, says, log, sheet):
+    with pytest.raises(InputError, match=says):
+        hdev_jax.predict(log.frame, sheet, **options)
 
 
 def test_a_calibration_has_its_coefficients_in_a_frame(log, sheet):

@@ -35,7 +35,7 @@ class Facts:
 
     @property
     def steps(self) -> tuple[float, ...]:
-        """Ids of trips from which on something may have changed."""
+        """Ids of trips from which on something may have changed: of the last vehicle's trips alone."""
         return thinned(self._open)
 
     @property

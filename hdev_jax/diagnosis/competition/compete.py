@@ -66,8 +66,8 @@ def _rows_with(training: Training, state: State) -> Training:
 
 
 def _step(training: Training, state: State, step: int, rng: np.random.Generator, tell: Tell) -> State:
-    """One round: the first of forward, the searched candidates, exchange, a wider form, a term without a name, that
-    changes something; then backward. `finished` where none does."""
+    """One round: the first of an exchange of two, forward, the searched candidates, an exchange, a wider form and a
+    term without a name that changes something; then backward. `finished` where none does."""
     tell(f"scoring candidates, step {step}")
     scores = sharpened(training, score_all(training, state.fit))
     if step == 1:

@@ -7,11 +7,13 @@ which none by itself is better than either.
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.forward import Round, forward
+from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.needed import Without, can_be_asked, model_without
 from hdev_jax.diagnosis.competition.refit import gained, refit, without
 from hdev_jax.diagnosis.competition.state import Found, State
@@ -43,7 +45,7 @@ def one_exchanged(round_: Round) -> State | None:
             continue
         round_.tell(f"testing {' and '.join(ahead)} in place of {f.id}")
         start = replace(without(training, state, f.id), refused=())
-        fresh = Round(training, start, score_all(training, start.fit), round_.rng, round_.tell)
+        fresh = _round(round_, start)
         own = _own_worth(fresh, state, f)
         while ahead and (new := forward(fresh, only=ahead)) is not None:
             first = new.found[-1]
@@ -64,20 +66,19 @@ def two_exchanged(round_: Round) -> State | None:
         if ahead is None:
             continue
         a, b = (c.id for c in ahead)
-        if (test := f"{a}+{b}+{f.id}+{g.id}") in state.tested:
-            continue
-        round_.tested.append(test)
+        round_.tested.append(_test(a, b, f.id, g.id))
         round_.tell(f"testing {a} and {b} in place of {f.id} and {g.id}")
         start = replace(without(training, state, f.id, g.id), refused=())
-        fresh = Round(training, start, score_all(training, start.fit), round_.rng, round_.tell)
+        fresh = _round(round_, start)
         ab, ba = _beside(fresh, a, b), _beside(fresh, b, a)
-        if ab is None or ba is None:
+        if ab is None or ba is None or _sizes(ab.found[-2]) != _sizes(ba.found[-1]):
             continue
         own = _together(fresh.scores, gained(training, state.fit, fresh.scores), [f.score.candidate, g.score.candidate])
         if _well_ahead(round_, _together(fresh.scores, gained(training, ab.fit, fresh.scores), ahead), own):
             round_.tell(f"exchanged {f.id} and {g.id} for {a} and {b}")
             why = Rejection(Kind.SUPERFLUOUS, {"beside": f"{a} and {b}", "times": 2})
-            found = (*start.found, ba.found[-1], ab.found[-1])
+            as_fitted = replace(ba.found[-1], score=ab.found[-2].score, gain=ab.found[-2].gain)
+            found = (*start.found, as_fitted, ab.found[-1])
             return replace(ab, found=found, refused=state.refused, removed={**state.removed, f.id: why, g.id: why})
     return None
 
@@ -92,13 +93,19 @@ def _best_pair(round_: Round, w: Without, out: set[str]) -> list[Candidate] | No
     def score(pair: Sequence[Candidate]) -> Score:
         return w.evidence.score(replace(pair[0], columns=tuple(k for c in pair for k in c.columns)))
 
-    own = score(w.each)
+    own, places = score(w.each), [k for c in w.each for k in c.columns]
+    # a third effect that is only not added yet is no reason for an exchange
+    more = w.evidence.gains(w.evidence.totals(), [(*places, *c.columns) for c in w.rivals(open_)])
+    worth_ = [_together(scores, float(x), (*w.each, c)) for x, c in zip(more, open_, strict=True)]
+    to_beat = max([_together(scores, own.gain, w.each), *(x for x in worth_ if np.isfinite(x))])
     gains = w.evidence.gains(w.evidence.totals(), [(*a.columns, *b.columns) for a, b in pairs])
     worths = np.array([_together(scores, float(x), pair) for x, pair in zip(gains, pairs, strict=True)])
     for k in np.argsort(-worths):
-        if not _well_ahead(round_, float(worths[k]), _together(scores, own.gain, w.each)):
+        if not _well_ahead(round_, float(worths[k]), to_beat):
             return None
         a, b = pairs[int(k)]
+        if _test(a.id, b.id, *(c.id for c in w.each)) in round_.state.tested:
+            continue
         new = score((a, b))
         each = zip((a, b), np.split(new.beta, [len(a.columns)]), strict=True)
         fine = all(plausible(replace(scores.best[c.id], beta=x), settings) for c, x in each)
@@ -106,6 +113,20 @@ def _best_pair(round_: Round, w: Without, out: set[str]) -> list[Candidate] | No
         if fine and all(w.evidence.beside(x.columns, y.columns) <= scores.level(y.id) for x, y in ((a, b), (b, a))):
             return [a, b]
     return None
+
+
+def _test(*ids: str) -> str:
+    return "+".join(ids)
+
+
+def _sizes(f: Found) -> tuple[Any, ...]:
+    return f.score.candidate.sizes, f.score.candidate.groups
+
+
+def _round(round_: Round, state: State) -> Round:
+    """A round from another state, with the same draws."""
+    scores = sharpened(round_.training, score_all(round_.training, state.fit))
+    return Round(round_.training, state, scores, round_.rng, round_.tell)
 
 
 def _beside(start: Round, first: str, second: str) -> State | None:
@@ -118,8 +139,7 @@ def _beside(start: Round, first: str, second: str) -> State | None:
         return None
     found = Found(first, came.score, 1.0, 0.0, (), came.gain)
     there = replace(start.state, fit=came.fit, found=(*start.state.found, found))
-    fresh = Round(start.training, there, score_all(start.training, there.fit), start.rng, start.tell)
-    return forward(fresh, only=[second])
+    return forward(_round(start, there), only=[second])
 
 
 def _together(scores: Scores, gain: float, candidates: Sequence[Candidate]) -> float:

@@ -95,7 +95,7 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
 
     The newest has just passed every gate beside the others and is not tested, unless `newest`: the others have changed.
     Beside a term without a name an effect has to be as significant as when it entered, unless it reads the same channel
-    (the two may be parts of one cause) or is a constant load; and so has a constant load beside a cycle.
+    (the two may be parts of one cause) or is a constant load. The same holds for a constant load beside a cycle.
     """
     settings = training.settings
     while asked := [f for f in (state.found if newest or state.terms else state.found[:-1]) if _has_columns(f)]:
@@ -123,7 +123,7 @@ def _constant(f: Found) -> bool:
 
 
 def _beside_cycle(state: State, f: Found) -> bool:
-    """Whether it is a constant load beside a cycle: the cycle's mean is known as well as its duty only."""
+    """Whether it is a constant load beside a cycle: the cycle's mean is uncertain, as its duty is."""
     return _constant(f) and any(g.score.candidate.effect.searched == "spectrum" for g in state.found)
 
 

@@ -51,7 +51,7 @@ class State:
 
     `terms` are those without a name; `removed` says why added effects were removed again; `refused` passed the gates of
     their scores but not the later ones, and are tried again only before the end; `tested` are exchanges of two that
-    failed; `trail` holds the values of fits by the effects that they had.
+    were tried; `trail` holds the values of fits by the effects that they had.
     """
 
     fit: Calibration

@@ -68,7 +68,7 @@ def _significant(a: Asked) -> Rejection | None:
 
 
 def _agreed(a: Asked) -> Rejection | None:
-    """Slow noise looks like a slow cause where only clusters count; weights that suit the noise leave some of one."""
+    """Where only clusters count, slow noise looks like a slow cause; generalised least squares find a cause too."""
     s, share = a.score, a.scores.settings.agreed
     if not s.plain:
         return None

@@ -1,7 +1,7 @@
 """A step of the competition as plain values and back, so that a run that was killed goes on where it stood."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ def to_plain(state: State) -> dict[str, Any]:
     return {
         "table": [asdict(c) for c in state.fit.table.rows],
         "fit": {k: getattr(state.fit, k) for k in _FIT},
+        "held": _held(state.fit.table, state.fit.vehicle).values(state.fit.vehicle),
         "found": [_found(f) for f in state.found],
         "terms": [
             {"factors": [asdict(f) for f in t.factors], "scale": t.scale, "values": t.values} for t in state.terms
@@ -53,6 +54,7 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, training: Training) 
     vehicle = declared.plus(*[realised(f.score.candidate, f.score.beta, gears=training.gears) for f in found])
     vehicle = vehicle.plus(*[describing(training.target)(np.asarray(1.0)) for _ in terms])
     fit = dict(plain["fit"])
+    vehicle = _held(table, vehicle).insert(vehicle, jnp.asarray(plain["held"]))
     vehicle = table.insert(vehicle, jnp.asarray(fit["values"]))
     return State(
         Calibration(vehicle=vehicle, table=table, **fit),
@@ -66,6 +68,17 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, training: Training) 
         dict(plain["trail"]),
         bool(plain["finished"]),
     )
+
+
+def _held(table: ParameterTable, vehicle: Vehicle) -> ParameterTable:
+    """The effects' held coefficients that the vehicle has, as a table: a limit may be held where it was not found."""
+
+    def there(path: str) -> bool:
+        _, id_, name = path.split(".")
+        return vehicle.has(id_) and getattr(vehicle.effect(id_), name) is not None
+
+    held = (c for c in table.rows if not c.free and c.path.startswith("effects.") and there(c.path))
+    return ParameterTable(tuple(replace(c, free=True) for c in held))
 
 
 def _rejection(r: Rejection) -> dict[str, Any]:

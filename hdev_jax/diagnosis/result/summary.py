@@ -92,7 +92,8 @@ def parameters_of(f: Found, fit: Calibration, leeway: Mapping[str, Open], cluste
     for name, value in c.shapes:
         p = next((p for p in c.effect.parameters if p.name == name and name not in fitted), None)
         if p:
-            known = {"value": value, "sd": 0.0}
+            now = getattr(fit.vehicle.effect(f.id), name)  # where it is held: a limit may have moved since it was found
+            known = {"value": value if now is None else float(np.asarray(now)), "sd": 0.0}
             known = _opened(known, p, leeway[name], None, clusters) if name in leeway else known
             parameters[name] = {**known, "unit": p.unit}
     return parameters

@@ -152,9 +152,9 @@ class Evidence(NormalEquations):
         at = self.base + np.array([*other, *(k for k in own if k not in other)], dtype=int)
         if len(at) == len(other):
             return 1.0
-        _, x = self._fit(self.totals(), at)
-        skip = self.base + len(other)
-        return float(wald(x[0, skip:], self._jackknife(at, 0)[:, skip:]))
+        likelihood, x = self._fit(self.totals(), at)
+        v, skip = int(np.argmax(likelihood)), self.base + len(other)
+        return float(wald(x[v, skip:], self._jackknife(at, v)[:, skip:]))
 
     def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
         """The same evidence with the candidate's columns given a sign in each cluster."""
@@ -168,7 +168,7 @@ class Evidence(NormalEquations):
         return replace(self, grams=grams, levels=levels)
 
     def within(self, on: Float[np.ndarray, " cluster"]) -> "Evidence":
-        """The same evidence of candidates that act in the clusters `on` alone."""
+        """The same evidence of candidates that act in the clusters `on` alone; without random intercepts."""
         grams, k = self.grams.copy(), np.arange(self.base, self.grams.shape[-1] - 1)
         grams[:, k, :] *= on[:, None, None]
         grams[:, :, k] = np.swapaxes(grams[:, k, :], 1, 2)
@@ -180,7 +180,8 @@ class Evidence(NormalEquations):
         Whether a cluster that is left out has it is not known: it is as likely as among the others.
         """
         x = self.within(on)._jackknife(np.array([self.base]), 0)
-        index, share = np.arange(self.base + 1), (np.sum(on) - on) / (len(on) - 1)
+        index = np.arange(self.base + 1)
+        share = np.clip((np.sum(on) - on) / (len(on) - 1), 1e-9, 1.0 - 1e-9)
         with_it, without = (self._loss(x * np.r_[np.ones(self.base), k], index, 0) for k in (1.0, 0.0))
         either = np.logaddexp(np.log(share) - with_it, np.log1p(-share) - without)
         return float(np.sum(self._base_loss(0) + either))

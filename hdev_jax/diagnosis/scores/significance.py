@@ -27,7 +27,8 @@ def wald(
     d = np.sqrt(np.maximum(np.einsum("...ii->...i", covariance), 1e-300))
     inverse = np.linalg.pinv(covariance / (d[..., :, None] * d[..., None, :]), rcond=1e-10)
     w = np.einsum("...i,...ij,...j->...", beta / d, inverse, beta / d)
-    return np.asarray(stats.f.sf(w * (g - k) / (k * (g - 1)), k, g - k if freedom is None else freedom))
+    f = g - k if freedom is None else freedom
+    return np.asarray(stats.f.sf(w * f / (k * (f + k - 1)), k, f))
 
 
 def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
