@@ -91,7 +91,7 @@ def predict(
 
     if not 0 < level < 1:
         raise InputError(f"--level {level}: a probability between 0 and 1 is expected")
-    if out is not None and not str(out).endswith((".csv", ".csv.gz", ".parquet")):
+    if out is not None and Path(out).suffix not in ("", ".csv", ".gz", ".parquet"):
         raise InputError(f"--out {out}: a file that ends in .csv, .csv.gz or .parquet is expected")
     library = known_effects(effects)
     log = log_of(logs, adapter)
