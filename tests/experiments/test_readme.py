@@ -20,17 +20,18 @@ def test_errors_on_measured_logs_are_those_of_the_page():
     assert f"{before} kW for the calibrated sheet" in README
     each = [row(REAL, str(trip)) for trip in (1, 2, 3, 4)]
     mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
-    assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} numbers" in README
+    assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} parameters" in README
     assert "paper's network of 282 parameters, trained on trip 1 (its table VIII): 0.1604" in REAL
     assert "0.1604 kW² for the paper's network of 282" in README
 
 
 def test_shares_of_synthetic_logs_are_those_of_the_page():
-    for size, words in ((0.5, "named exactly in {} % of {}"), (0.25, "at a quarter of the noise: {} % of {}")):
+    for size, words in ((0.5, "half"), (0.25, "a quarter")):
         _, n, share, *_ = row(PLANTED, f"one effect, size {size}, 12 trips, ar1")
-        assert words.format(round(100 * float(share)), n) in README
+        said = f"named exactly in {round(100 * float(share))} % of {n} logs"
+        assert f"| one effect, {words} as large as the noise | {said} |" in README
     _, n, share, *_ = row(PLANTED, "nothing planted, all together")
-    assert f"a name in {round((1 - float(share)) * int(n))} of {n}" in README
+    assert f"an effect is named in {round((1 - float(share)) * int(n))} of {n} logs" in README
     outside = [row(PLANTED, f"a {what} outside the library, size 1, 24 trips, ar1") for what in ("cause", "cycle")]
     wrong, logs = sum(float(r[7]) * int(r[1]) for r in outside), sum(int(r[1]) for r in outside)
-    assert f"a wrong name in {round(wrong)} of {logs}" in README
+    assert f"a wrong effect is named in {round(wrong)} of {logs} logs" in README
