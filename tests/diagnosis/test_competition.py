@@ -14,7 +14,7 @@ from hdev_jax.diagnosis.competition.compete import compete
 from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.needed import backward, classes
-from hdev_jax.diagnosis.competition.refit import joined, refit, widened, without
+from hdev_jax.diagnosis.competition.refit import _crossed, joined, refit, widened, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.scores.evidence import Score
@@ -269,3 +269,28 @@ def test_a_column_of_the_library_is_what_its_effect_adds(two):
     np.testing.assert_allclose(added, size * made[1][:, c.columns[0]], rtol=1e-9, atol=1e-9)
     assert isinstance(state.found[0], Found)
     assert isinstance(LIBRARY["standstill_load"].parameters[0], Size)
+
+
+# --- steps and limits ------------------------------------------------------------------------------------------------
+
+
+def test_a_step_lies_between_trips_of_one_vehicle(two):
+    facts = two[1].facts
+    assert replace(facts, trips=np.arange(12), vehicles=np.zeros(12, int)).steps == tuple(map(float, range(3, 10)))
+    assert replace(facts, trips=np.arange(12), vehicles=np.repeat([0, 1], 6)).steps == (9.0,)
+    assert replace(facts, trips=np.arange(12), vehicles=np.arange(12) % 2).steps == ()
+    assert replace(facts, trips=np.arange(5), vehicles=np.zeros(5, int)).steps == ()
+
+
+def test_limits_that_end_out_of_order_are_told_by_path(two):
+    problem, rows = two
+    state, hvac = declared(rows, problem), LIBRARY["hvac_power"]
+    for heat, cool, crossed in ((14.0, 20.0, set()), (20.0, 14.0, {"heat_c", "cool_c"})):
+        effect = hvac(below_w_per_k=500.0, above_w_per_k=300.0, heat_c=heat, cool_c=cool)
+        table = state.fit.table.plus(*effect_coefficients(effect, ("below_w_per_k", "above_w_per_k")))
+        vehicle = state.fit.vehicle.plus(effect)
+        n = len(table.free)
+        fit = replace(
+            state.fit, vehicle=vehicle, table=table, values=table.values(vehicle), sd=np.ones(n), covariance=np.eye(n)
+        )
+        assert _crossed(fit) == {f"effects.hvac_power.{n}" for n in crossed}
