@@ -6,8 +6,10 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import pandas as pd
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
@@ -20,10 +22,21 @@ from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.inference import CHUNK_ROWS, cluster_rows, padded
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
-from hdev_jax.physics import LIBRARY, Effect, most_group
+from hdev_jax.physics import LIBRARY, Effect, Shape, Size, most_group
 from hdev_jax.problem import Problem, Split, prepare, split_trips
 
-__all__ = ["ROAD_SIDE", "breaches", "declared", "diagnosed", "found_in_turn", "named", "opened", "run", "training"]
+__all__ = [
+    "ROAD_SIDE",
+    "FadingStart",
+    "breaches",
+    "declared",
+    "diagnosed",
+    "found_in_turn",
+    "named",
+    "opened",
+    "run",
+    "training",
+]
 
 CHECKER = Path(os.environ.get("HDEV_DATA") or Path(__file__).parents[2] / "shared" / "data").parent
 CHECKER = CHECKER / "check_diagnosis.py"
@@ -104,6 +117,24 @@ def found_in_turn(training: Training, problem: Problem, ids: Iterable[str], **on
         found = Found(id_, came.score, 1e-9, 1.0, (), came.gain)
         state = replace(state, fit=came.fit, found=(*state.found, found))
     return state
+
+
+class FadingStart(Effect):
+    """A user's own, without bounds: a time constant below 0 would make a column that no number holds."""
+
+    id: ClassVar = "fading_start"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "P·exp(−t/τ)"
+    parameters: ClassVar = (
+        Size("power_w", "W", 0.0, 1e4),
+        Shape("tau_s", "s", 100.0, 100.0, grid=(20.0, 100.0, 400.0)),
+    )
+    power_w: Any
+    tau_s: Any
+
+    def power(self, row, car, point):
+        """Power [W]."""
+        return self.power_w * jnp.exp(-row.time_s / self.tau_s)
 
 
 def breaches(diagnosis: Outcome) -> list[str]:

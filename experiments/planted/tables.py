@@ -60,7 +60,7 @@ LEGEND = {  # of each table that is there; the first of every page
         "was planted (each by its id, or in a class of at most three); with nothing planted, no name; with a cause "
         "outside the library, no wrong name (a constant load is right for the mean of one that switches); where a "
         "coefficient absorbs the effect, or only more trips could decide, that this is said. Met: the share is at "
-        "least what is wanted; met by interval: so is the lower end",
+        "least the wanted one; met by interval: so is the lower end",
         "Something false: logs that name an effect which was not planted. Called unexplained: logs in which structure "
         "is left (random intercepts of trips count, though they are noise there)",
     ),
@@ -77,8 +77,8 @@ LEGEND = {  # of each table that is there; the first of every page
     "planted_names_by_twin": (
         "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "
         "rolling resistance and drag area are fitted. The right answer is a class of at most three that holds both. "
-        "In the first table one name of the two counts too, though it is a guess. Met: as asked is at least what is "
-        "wanted, and so is, where wanted, the share with no class; by interval: so are the lower ends of both "
+        "In the first table one name of the two counts too, though it is a guess. Met: the share is at least the "
+        "wanted one, and so is that with no class, where one is wanted; by interval: so are the lower ends of both "
         "intervals",
     ),
     "planted_rivals": (

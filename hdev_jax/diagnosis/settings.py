@@ -38,7 +38,12 @@ class Settings:
         "log-likelihood",
         "odds of 20 to 1 (Kass and Raftery, JASA 90, 1995: strong)",
     )
-    leaders: int = _number(3, "candidates about as good that are refitted before one is taken", "candidates", "time")
+    leaders: int = _number(
+        3,
+        "candidates that are refitted, or have their shapes refined, in one step",
+        "candidates",
+        "time",
+    )
     tries: int = _number(4, "rounds of leaders in one step", "rounds", "time")
 
     # gates

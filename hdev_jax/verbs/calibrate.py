@@ -1,9 +1,7 @@
 """The verb `calibrate`: a sheet's coefficients with their posterior."""
 
-import json
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,11 +15,10 @@ from hdev_jax.inference.posterior.methods import METHODS, Method, Outcome, calib
 from hdev_jax.inference.sheet import augmented_sheet
 from hdev_jax.problem import Problem, Split, metrics
 from hdev_jax.report.build import report_data
-from hdev_jax.report.page import write_calibration_report
 from hdev_jax.rundir import Run, open_run
 from hdev_jax.verbs.opening import Effects, Logs, Opening, Vehicles, command_line, known_effects, opened
-from hdev_jax.verbs.predict import BESIDE, predictive_of, sheet_digest
-from hdev_jax.verbs.result import CalibrationResult, keep, kept
+from hdev_jax.verbs.predict import predictive_of, sheet_digest
+from hdev_jax.verbs.result import CalibrationResult
 
 __all__ = ["calibrate"]
 
@@ -75,21 +72,9 @@ def calibrate(
     config = {**start.config, "method": method, "noise": noise}
     with open_run(out, config, seed=seed) as run:
         if run.done:
-            folder = run.work
-            summary, predictive = (json.loads((folder / f).read_text()) for f in ("calibration.json", BESIDE))
-            sheet = (folder / "calibrated_vehicle.toml").read_text()
-            answer = (folder / "answer.txt").read_text()
-            return CalibrationResult(answer, summary, sheet, predictive, partial(kept, folder))
+            return CalibrationResult.of_folder(run.work)
         result = _calibrated(start, method, noise, seed, started, run)
-        run.path("calibrated_vehicle.toml").write_text(result.sheet)
-        run.path(BESIDE).write_text(json.dumps(result.predictive, indent=1, allow_nan=False) + "\n")
-        run.path("calibration.json").write_text(json.dumps(result.summary, indent=1, allow_nan=False) + "\n")
-        if result.draws is not None:
-            result.draws.write(run.path("posterior.nc"))
-        write_calibration_report(result.data, run.work)
-        keep(run, result.data)
-        result.add_line(f"{Path(out) / 'report.html'}")
-        run.path("answer.txt").write_text(str(result))
+        result.write(run, out)
     return result
 
 

@@ -1,9 +1,7 @@
 """The verb `diagnose`: the method on a user's logs, in memory or into a folder."""
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,6 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.physics import Effect
 from hdev_jax.report.build import answer_text, of_diagnosis
-from hdev_jax.report.page import write_report
 from hdev_jax.rundir import Run, open_run
 from hdev_jax.verbs.opening import (
     Effects,
@@ -28,8 +25,8 @@ from hdev_jax.verbs.opening import (
     known_effects,
     opened,
 )  # fmt: skip
-from hdev_jax.verbs.predict import BESIDE, predictive_of, sheet_digest
-from hdev_jax.verbs.result import Diagnosis, keep, kept
+from hdev_jax.verbs.predict import predictive_of, sheet_digest
+from hdev_jax.verbs.result import Diagnosis
 
 __all__ = ["diagnose"]
 
@@ -96,19 +93,10 @@ def diagnose(
     }
     with open_run(out, config, seed=seed) as run:
         if run.done:
-            folder = run.work
-            summary, predictive = (json.loads((folder / f).read_text()) for f in ("diagnosis.json", BESIDE))
-            sheet = (folder / "augmented_vehicle.toml").read_text()
-            return Diagnosis((folder / "answer.txt").read_text(), summary, sheet, predictive, partial(kept, folder))
+            return Diagnosis.of_folder(run.work)
         progress.step(start.read)
         result = _diagnosed(start, candidates, excluded, fdr, seed, started, run)
-        run.path("augmented_vehicle.toml").write_text(result.sheet)
-        run.path(BESIDE).write_text(json.dumps(result.predictive, indent=1, allow_nan=False) + "\n")
-        run.path("diagnosis.json").write_text(json.dumps(result.summary, indent=1, allow_nan=False) + "\n")
-        write_report(result.data, run.work)
-        keep(run, result.data)
-        result.add_line(f"{Path(out) / 'report.html'}")
-        run.path("answer.txt").write_text(str(result))
+        result.write(run, out)
     return result
 
 

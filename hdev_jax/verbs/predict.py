@@ -16,11 +16,10 @@ from hdev_jax.problem import Problem, Split, derivable, prepare
 from hdev_jax.rundir import atomic_file
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles, digest, known_effects, log_of, sheet_of, tried
-from hdev_jax.verbs.result import Prediction, Result
+from hdev_jax.verbs.result import PREDICTIVE, Prediction, Result
 
 __all__ = ["predict", "predictive_of", "sheet_digest", "strongly_correlated"]
 
-BESIDE = "predictive.json"  # what a fitted sheet has beside it
 Noise = Literal["normal", "student_t"]
 STRONG = 0.95  # correlation of two coefficients, above which neither is read by itself
 LIKE = 1.5  # times as long: rows of another log with about the same noise
@@ -150,9 +149,9 @@ def _warnings(problem: Problem, spread: Spread | None, beside: dict[str, Any], k
     """Notes where the intervals are for another sheet, another target or other rows."""
     out = []
     if beside and not known and not beside.get("stale"):
-        out.append(f"note: {BESIDE} beside the sheet is for the target {beside['target']} and is not used")
+        out.append(f"note: {PREDICTIVE} beside the sheet is for the target {beside['target']} and is not used")
     if beside.get("stale"):
-        out.append(f"note: {BESIDE} is not used: the sheet was changed after it was written")
+        out.append(f"note: {PREDICTIVE} is not used: the sheet was changed after it was written")
     row_s = float(np.median(np.asarray(problem.segments.duration_s)))
     if spread is not None and max(row_s, spread.row_s) > LIKE * min(row_s, spread.row_s):
         out.append(
@@ -167,7 +166,7 @@ def _beside(sheet: Path) -> dict[str, Any]:
 
     Raises `InputError` where the file is there and cannot be used.
     """
-    path = sheet.parent / BESIDE
+    path = sheet.parent / PREDICTIVE
     try:
         found = json.loads(path.read_text())
     except FileNotFoundError:

@@ -1,11 +1,13 @@
 """What the verbs return: the answer as text, numbers, frames and figures; in memory, or read from a folder."""
 
+import json
 import shutil
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -21,27 +23,22 @@ if TYPE_CHECKING:
 
     from hdev_jax.inference.posterior.draws import Draws
 
-__all__ = ["CalibrationResult", "Diagnosis", "Prediction", "Result", "keep", "kept"]
+__all__ = ["PREDICTIVE", "CalibrationResult", "Diagnosis", "Prediction", "Result"]
 
+R = TypeVar("R", bound="Result")
+ANSWER, PREDICTIVE = "answer.txt", "predictive.json"
 DATA = "data.npz"  # rows and channels that a report is made of
 
 
-def keep(run: Run, data: ReportData) -> None:
-    """Write what a report is made of into a run's folder, for `kept`; channels in single precision."""
-    channels = {k: np.asarray(v, dtype=np.float32) for k, v in data.channels.items()}
-    with open(run.path(DATA), "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **packed({**vars(data), "channels": channels}))
-
-
-def kept(folder: Path) -> ReportData:
-    """What `keep` wrote. Raises `InputError` where it is not there, or is damaged."""
+def _kept(folder: Path) -> ReportData:
+    """The report's data of a finished folder. Raises `InputError` where it is not there, or is damaged."""
     try:
         return ReportData(**load(folder / DATA))
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise InputError(f"{folder / DATA}: cannot be read ({e}); run the command again into a new folder") from e
 
 
-class Result:
+class Result(ABC):
     """An answer with what is behind it. `str()` is the answer as the command line prints it.
 
     - `summary`: what the JSON file of the command holds (contract, section 4).
@@ -50,12 +47,34 @@ class Result:
     - `data`: rows, channels and errors that the report shows; read from the run's folder when it is first asked for.
     """
 
+    json_file: ClassVar[str]
+    sheet_file: ClassVar[str]
+
     def __init__(
         self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
         data: ReportData | Callable[[], ReportData],
     ):  # fmt: skip
         self.summary, self.sheet, self.predictive = dict(summary), sheet, dict(predictive)
         self._answer, self._data = answer, data
+
+    @classmethod
+    def of_folder(cls: type[R], folder: Path) -> R:
+        """What `write` left in a finished folder; `data` is read when it is first asked for."""
+        summary, predictive = (json.loads((folder / name).read_text()) for name in (cls.json_file, PREDICTIVE))
+        answer, sheet = ((folder / name).read_text() for name in (ANSWER, cls.sheet_file))
+        return cls(answer, summary, sheet, predictive, partial(_kept, folder))
+
+    def write(self, run: Run, out: str | Path) -> None:
+        """Everything into a run's folder, which the user calls `out`; channels in single precision."""
+        run.path(self.sheet_file).write_text(self.sheet)
+        for name, content in ((PREDICTIVE, self.predictive), (self.json_file, self.summary)):
+            run.path(name).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        self._write_report(run.work)
+        channels = {k: np.asarray(v, dtype=np.float32) for k, v in self.data.channels.items()}
+        with open(run.path(DATA), "wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **packed({**vars(self.data), "channels": channels}))
+        self._answer = f"{self._answer}\n{Path(out) / 'report.html'}"
+        run.path(ANSWER).write_text(self._answer)
 
     @property
     def _unit(self) -> str:
@@ -68,10 +87,6 @@ class Result:
 
     def __str__(self) -> str:
         return self._answer
-
-    def add_line(self, line: str) -> None:
-        """A line more at the end of the answer: where it was written."""
-        self._answer = f"{self._answer}\n{line}"
 
     def _repr_html_(self) -> str:
         from html import escape
@@ -110,8 +125,8 @@ class Result:
             shutil.move(Path(folder) / "report.html", path)
         return path
 
-    def _write_report(self, folder: Path) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _write_report(self, folder: Path) -> None: ...
 
     def plot_coefficients(self) -> "Figure | None":
         """The coefficients against their tabular values; None where none was estimated."""
@@ -134,6 +149,9 @@ class Result:
 
 class Diagnosis(Result):
     """What a model lacked: effects with their sizes, the error before and after on held-out test trips."""
+
+    json_file = "diagnosis.json"
+    sheet_file = "augmented_vehicle.toml"
 
     def __repr__(self) -> str:
         unit, found = self._unit, ", ".join(e["id"] for e in self.summary["effects"]) or "no effect"
@@ -196,7 +214,11 @@ class Diagnosis(Result):
 
 
 class CalibrationResult(Result):
-    """A sheet's coefficients with their uncertainty. `draws`: those of the posterior, where it was sampled."""
+    """A sheet's coefficients with their uncertainty. `draws`: those of the posterior where it was sampled now;
+    a finished folder has them in `posterior.nc`, for ArviZ."""
+
+    json_file = "calibration.json"
+    sheet_file = "calibrated_vehicle.toml"
 
     def __init__(
         self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
@@ -204,6 +226,12 @@ class CalibrationResult(Result):
     ):  # fmt: skip
         super().__init__(answer, summary, sheet, predictive, data)
         self.draws = draws
+
+    def write(self, run: Run, out: str | Path) -> None:
+        """Everything into a run's folder, the draws included."""
+        super().write(run, out)
+        if self.draws is not None:
+            self.draws.write(run.path("posterior.nc"))
 
     def __repr__(self) -> str:
         count, test = len(self.summary["baseline"]["parameters"]), self.before["rmse"]

@@ -1,12 +1,10 @@
 """The whole method as one call: what it keeps and takes up again, what it refuses, odd logs, a user's effect."""
 
 from dataclasses import replace
-from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from planted import breaches, declared, diagnosed, named, opened, training
+from planted import FadingStart, breaches, declared, diagnosed, named, opened, training
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Factor, Term, describing
@@ -19,7 +17,7 @@ from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.errors import InputError
 from hdev_jax.inference import effect_coefficients
-from hdev_jax.physics import LIBRARY, Effect, Shape, Size
+from hdev_jax.physics import LIBRARY
 from hdev_jax.problem import Problem, Split
 from hdev_jax.rundir import open_run
 
@@ -158,7 +156,7 @@ def test_an_effect_of_the_sheet_is_declared(log):
 
 
 def test_nobody_looks_at_test_trips_before_the_end(log, whole):
-    """Other numbers measured there change what is told of the error, not what is found nor any coefficient."""
+    """Other numbers measured there change what is reported of the error, not what is found nor any coefficient."""
     problem, split = log
     test = problem.rows(split.test)
     noise = np.random.default_rng(0).normal(0.0, 50.0, len(test))
@@ -214,24 +212,6 @@ def test_a_log_that_is_met_exactly_lacks_nothing(log):
 
 
 # --- a user's own effect -----------------------------------------------------------------------------------------
-
-
-class FadingStart(Effect):
-    """A user's own, without bounds: a time constant below 0 would make a column that no number holds."""
-
-    id: ClassVar = "fading_start"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·exp(−t/τ)"
-    parameters: ClassVar = (
-        Size("power_w", "W", 0.0, 1e4),
-        Shape("tau_s", "s", 100.0, 100.0, grid=(20.0, 100.0, 400.0)),
-    )
-    power_w: Any
-    tau_s: Any
-
-    def power(self, row, car, point):
-        """Power [W]."""
-        return self.power_w * jnp.exp(-row.time_s / self.tau_s)
 
 
 def test_a_users_effect_competes_like_any_other(tmp_path):

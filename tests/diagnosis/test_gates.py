@@ -141,7 +141,7 @@ def test_every_setting_is_described():
 @pytest.mark.parametrize("kind", ["trip", "block"])
 def test_only_trips_tell_what_lives_between_them(kind, log):
     """A load that a log of few trips neither shows nor rules out; stretches of a trip, which share its level, are no
-    trips, and what changes inside them is told by rows."""
+    trips, and rows decide on what changes inside them."""
     _, rows, state = log
     rows = replace(rows, clusters=replace(rows.clusters, kind=kind))
 

@@ -1,20 +1,17 @@
 """Sizes whose thresholds few trips tell: what is said of them has room for every threshold that the log allows."""
 
-from typing import Any, ClassVar
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted import declared, found_in_turn, named, opened, run, training
+from planted import FadingStart, declared, found_in_turn, named, opened, run, training
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, columns, finer
 from hdev_jax.diagnosis.result.intervals import Open, _wide, left_open, other_size, shapes_of
 from hdev_jax.diagnosis.result.summary import _opened, _sized
 from hdev_jax.inference import jacobian
-from hdev_jax.physics import LIBRARY, Effect, Shape, Size
+from hdev_jax.physics import LIBRARY
 
 
 def test_what_is_open_adds_to_a_size_at_held_shapes_and_stands_by_itself_for_shapes():
@@ -49,26 +46,8 @@ def test_an_interval_of_mixed_shapes_holds_what_draws_of_them_do(away, inside, f
     assert np.mean(drawn > high) == pytest.approx(0.05, abs=0.012)
 
 
-class Unbounded(Effect):
-    """A user's own, without bounds: a time constant below 0 would make a column that no number holds."""
-
-    id: ClassVar = "fading_start"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·exp(−t/τ)"
-    parameters: ClassVar = (
-        Size("power_w", "W", 0.0, 1e4),
-        Shape("tau_s", "s", 100.0, 100.0, grid=(20.0, 100.0, 400.0)),
-    )
-    power_w: Any
-    tau_s: Any
-
-    def power(self, row, car, point):
-        """Power [W]."""
-        return self.power_w * jnp.exp(-row.time_s / self.tau_s)
-
-
 def test_a_time_constant_without_bounds_stays_positive():
-    c = Candidate(Unbounded, ("power_w",), (None,), (("tau_s", 20.0),), "size", (0,))
+    c = Candidate(FadingStart, ("power_w",), (None,), (("tau_s", 20.0),), "size", (0,))
     for grid in (finer(c, 10.0, reach=1.0)["tau_s"], _wide(c, "tau_s", 25.0, 10.0)):
         assert min(grid) > 0.0
         assert min(grid) < 20.0

@@ -205,7 +205,7 @@ def test_a_fold_has_no_say_in_the_rounds_that_predict_it(monkeypatch):
 
 
 def test_noise_teaches_nothing():
-    """Of twelve residuals of noise, none is borne out by clusters left out at a thousandth."""
+    """Of twelve residuals of noise, none is confirmed by clusters left out at a thousandth."""
     rng, p = np.random.default_rng(1), []
     for seed in range(12):
         rows = residual(rng, 8, 100, rho=0.9)
@@ -335,7 +335,7 @@ def test_what_a_channel_predicts_is_told_with_its_shape_and_its_share(log):
     assert left.noise_floor_rmse == pytest.approx(np.sqrt(np.mean(white(log)[test] ** 2)), rel=0.35)
     assert left.correction is not None
     assert left.correction["channel"] == "humidity_pct"
-    # test rows decide what is told of it, not its size
+    # test rows decide what is reported of it, not its size
     gone = left_of(log, white(log) + 3.0 * bump(log) * train)
     assert gone.rms == left.rms > 1.5
     assert gone.share < 0.02

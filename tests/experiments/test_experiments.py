@@ -165,7 +165,7 @@ def parameters(paths):
 
 @pytest.mark.parametrize("path", parameters(every_config()))
 def test_every_config_has_tasks_or_says_which_data_it_needs(path):
-    """At a tiny size: all of its keys are known, and what it is to compute is told before anything runs."""
+    """At a tiny size: all of its keys are known, and what it is to compute is listed before anything runs."""
     try:
         plans = plan(path, tiny=True)
     except MissingDataError as e:

@@ -10,8 +10,6 @@ from hdev_jax.diagnosis.training import Training
 
 __all__ = ["refined", "sharpened"]
 
-MOST = 3  # candidates whose shapes are looked at again in one step
-
 
 def sharpened(training: Training, scores: Scores) -> Scores:
     """The scores with the tests at finer shapes of what rows show clearly and clusters do not.
@@ -24,7 +22,7 @@ def sharpened(training: Training, scores: Scores) -> Scores:
         if scores.q[id_] > settings.fdr and s.p_model < settings.by_rows and not s.plain and s.candidate.shapes
         and id_ not in scores.absorbed_by
     ]  # fmt: skip
-    for s in sorted(doubted, key=lambda s: -s.gain)[:MOST]:
+    for s in sorted(doubted, key=lambda s: -s.gain)[: settings.leaders]:
         better, ways = refined(training, s, scores)
         if better is not s and better.p * ways < s.p:
             # places stay those of the coarse grid; a refit looks for finer shapes again
