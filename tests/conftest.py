@@ -21,8 +21,16 @@ for _name, _value in {
     jax.config.update(_name, _value)
     os.environ[_name.upper()] = str(_value)  # the same for the processes that a test starts
 
+
+def _with_shapes() -> list[str]:
+    """The modules whose annotations have shapes: only these are checked, for a check costs more than most calls."""
+    root = Path(__file__).parents[1]
+    files = [f for f in (root / "hdev_jax").rglob("*.py") if "jaxtyping" in f.read_text()]
+    return [".".join(f.relative_to(root).with_suffix("").parts) for f in files]
+
+
 # Before any module of the package is imported.
-jaxtyping.install_import_hook("hdev_jax", "beartype.beartype")
+jaxtyping.install_import_hook(_with_shapes(), "beartype.beartype")
 from hdev_jax.compiling import compile_quickly  # noqa: E402
 
 compile_quickly()  # each program runs once or twice; studies and benchmarks run as XLA compiles by default

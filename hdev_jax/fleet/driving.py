@@ -31,6 +31,7 @@ _NODES = 10  # simulation steps in a road segment, about 10 m each
 _LIMITS_KMH = {"city": (30, 50, 50, 60), "regional": (50, 70, 80, 80), "motorway": (70, 80, 90, 90)}
 _POWER_W = 380e3  # traction power of the drive, bounds the driver's acceleration
 _BRAKE_W = 280e3  # what the driver lets the machine take back, uphill or down; the truth has no friction brake
+_STANDING_MPS = 0.1  # below, a vehicle stands
 _G = 9.81  # only for what the driver can climb and hold
 
 
@@ -212,8 +213,8 @@ def drive_trips(
         parts.append(part)
         lags.append(lag)
     columns = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
-    columns["standstill_flag"] = (columns["distance_m"] == 0).astype(float)
     mean_speed = columns["distance_m"] / columns["duration_s"]
+    columns["standstill_flag"] = (mean_speed < _STANDING_MPS).astype(float)
     shift = mean_speed * np.where(columns["grade_rad"] > 0.015, 0.85, 1.0)  # holds the lower gear uphill
     columns["gear"] = 1.0 + np.searchsorted([5.0, 9.0, 14.0], shift)
     return Drive(columns, lambda lag_s: np.concatenate([f(lag_s) for f in lags]), mode, sample_s)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -68,6 +69,7 @@ def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
     return effect(**values)
 
 
+@jax.jit
 def derived(segments: Segments) -> Segments:
     """The same rows with what any effect of the library derives by trip worked out once."""
     segments = with_bounds(segments)

@@ -28,17 +28,19 @@ def check(
     log = log_of(logs, adapter)
     s = log.segments
     lines = [f"{len(log)} rows, {len(log.trip_names)} trips, {len(log.vehicle_names)} vehicles"]
-    lines += ["", "columns"] + [f"  {c.source:34s} {c.unit or '-':10s} -> {c.name}" for c in log.columns]
+    wide = max((len(c.source) for c in log.columns), default=0)
+    lines += ["", "columns"] + [f"  {c.source:{wide}s}  {c.unit or '-':6s} -> {c.name}" for c in log.columns]
     has_energy = any(TARGETS[t].of_battery for t in log.targets)
     energy = log.target("energy_wh") if has_energy else None
-    lines += ["", f"{'trip':40s} {'rows':>7s} {'min':>7s} {'km':>8s} {'kWh':>9s} {'kWh/km':>8s}"]
+    wide = max(4, *(len(name) for name in log.trip_names))
+    lines += ["", f"{'trip':{wide}s} {'rows':>7s} {'min':>7s} {'km':>8s} {'kWh':>9s} {'kWh/km':>8s}"]
     for i, name in enumerate(log.trip_names):
         m = s.trip == i
         km, minutes = float(np.sum(s.distance_m[m])) / 1e3, float(np.sum(s.duration_s[m])) / 60
         kwh = float(np.sum(energy[m])) / 1e3 if energy is not None else float("nan")
         per = f"{kwh / km:8.3f}" if km > 0.05 and energy is not None else f"{'-':>8s}"
         total = f"{kwh:9.3f}" if energy is not None else f"{'-':>9s}"
-        lines.append(f"{name:40s} {int(m.sum()):7d} {minutes:7.1f} {km:8.2f} {total} {per}")
+        lines.append(f"{name:{wide}s} {int(m.sum()):7d} {minutes:7.1f} {km:8.2f} {total} {per}")
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
     if vehicle is not None:

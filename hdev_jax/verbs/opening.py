@@ -61,7 +61,9 @@ def sheet_of(vehicle: Vehicles, library: Mapping[str, type[Effect]]) -> Sheet:
         raise TypeError(f"vehicle: a sheet's path, a Sheet or a result is expected, found {type(vehicle).__name__}")
     if isinstance(vehicle, Result):
         return Sheet(library=library, path="fitted sheet", **tomllib.loads(vehicle.sheet))
-    return vehicle if isinstance(vehicle, Sheet) else read_sheet(vehicle, library=library)
+    if isinstance(vehicle, Sheet):
+        return vehicle.knowing(library)
+    return read_sheet(vehicle, library=library)
 
 
 def known_effects(file: Effects) -> dict[str, type[Effect]]:

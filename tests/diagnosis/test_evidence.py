@@ -199,6 +199,15 @@ def test_ways_are_counted_by_what_the_declared_coefficients_leave_of_them():
         assert counted == pytest.approx(expected, abs=0.1)
 
 
+def test_two_looks_are_two_tests():
+    """A column that hardly changes inside a trip is tried by ordinary least squares too."""
+    evidence, ways = Rows().evidence(), [candidate(0), candidate(2)]
+    quick, slow = np.zeros(CANDIDATES, bool), np.ones(CANDIDATES, bool)
+    _, once = best_of(evidence, evidence, ways, quick, SETTINGS)
+    _, twice = best_of(evidence, evidence, ways, slow, SETTINGS)
+    assert twice["auxiliary_power"] == 2.0 * once["auxiliary_power"]
+
+
 def test_what_lies_in_the_jacobian_is_no_way_of_its_own():
     rows = Rows(level=0.0)
     rows.columns[:, 2] = rows.jacobian @ np.array([2.0, -1.0])
@@ -499,3 +508,18 @@ def test_few_clusters_that_matter_make_as_few_false_finds(k):
         left_out = mean + np.concatenate([spread.T, -spread.T, np.zeros((24 - 2 * k, k))]) / np.sqrt(2.0)
         p.append(float(wald(mean, left_out, np.asarray(6.0 - k))))
     assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.012)
+
+
+@pytest.mark.parametrize("rests_on", [4.0, 9.0])
+def test_a_size_that_rests_on_few_clusters_needs_more(rests_on):
+    p, level = 0.01, 1e-3
+    n = clusters_needed(p, 1, 9, level, rests_on)
+    assert n is not None
+    share = rests_on / 9
+    statistic = stats.f.isf(p, 1, rests_on - 1)
+    assert (
+        stats.f.sf(statistic * n / 9, 1, share * n - 1)
+        <= level
+        < stats.f.sf(statistic * (n - 1) / 9, 1, share * (n - 1) - 1)
+    )
+    assert (n == clusters_needed(p, 1, 9, level)) == (rests_on == 9.0)

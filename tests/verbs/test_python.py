@@ -1,6 +1,7 @@
 """From Python: a frame and a sheet in, an answer with frames, figures and a report out; no folder is needed."""
 
 import pickle
+from typing import Any, ClassVar
 
 import matplotlib.figure
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import hdev_jax
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import demo_log
-from hdev_jax.physics import Effect, Size
+from hdev_jax.physics import Aero, Driveline, Effect, Size
 from hdev_jax.verbs.demo import demo
 
 ONLY = ["headwind", "auxiliary_power"]
@@ -54,6 +55,30 @@ def test_a_frame_and_a_sheet_are_enough(found):
     assert row["low"] < row["value"] < row["high"]
     assert found.unexplained["significant"] is False
     assert {"id": "nothing_at_all", "why": "not in --only"} in found.summary["excluded"]
+
+
+class Box(Effect):
+    """Drag of a box that is on the roof."""
+
+    id: ClassVar = "box"
+    stage: ClassVar = "road"
+    equation: ClassVar = "s·½ρ·C_dA·v²·box"
+    needs: ClassVar = ("roof_box",)
+    parameters: ClassVar = (Size("share", "1", 0.0, 0.1, 0.0, 1.0),)
+    share: Any
+
+    def force(self, row, car):
+        return self.share * car.drag(row) * row.speed_mps**2 * row.channels["roof_box"]
+
+
+def test_an_effect_of_ones_own_is_found_beside_a_sheet_that_was_read_before(log, sheet):
+    frame = log.frame.assign(roof_box=(log.frame["trip_id"].astype("category").cat.codes % 2).astype(float))
+    segments = hdev_jax.Log.from_frame(frame).segments
+    car = hdev_jax.Vehicle([Aero(5.6)], mass_kg=1.0, driveline=Driveline(0.91))
+    frame["energy_wh"] += np.asarray(car.plus(Box(0.4)).energy(segments) - car.energy(segments))
+    found = hdev_jax.diagnose(frame, sheet, only=["box", *ONLY], effects=[Box])
+    assert {e["id"] for e in found.summary["effects"]} >= {"box"}
+    assert "[effects.box]" in found.sheet
 
 
 def test_the_residual_is_a_frame_as_long_as_the_log(found, log):

@@ -32,7 +32,6 @@ __all__ = ["add_cycle", "barred"]
 ID = PeriodicLoad.id
 PERIODS, PHASES, DUTIES = 21, 9, (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 ROUNDS = 3  # of choosing period, duty and phases in turn
-WITHIN = 1.5  # of the shortest and the longest period, so that a fit may move
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ def add_cycle(training: Training, state: State, rng: np.random.Generator) -> tup
         why = f"no cycle is significant in the spectrum (FDR-adjusted p = {q:.2g})"
         return no(Kind.NOT_SIGNIFICANT, why, q=q)
     period = next(p for p in PeriodicLoad.parameters if p.name == "period_s")
-    if not WITHIN * period.lower < hit.period_s < period.upper / WITHIN:
+    if not period.lower < hit.period_s < period.upper:
         return no(Kind.IMPLAUSIBLE, f"a cycle of {hit.period_s:.3g} s, outside the range of switched loads", q=q)
     wave, square = _fitted(rows, hit.period_s)
     # the noise is quieter, and phases are sharper, without the cycle

@@ -48,7 +48,8 @@ def _needed(round_: Round, s: Score) -> int | None:
     level = scores.level(id_)
     p = max(s.p_model, s.p_cluster)
     if s.p <= settings.hint or s.p_model <= level:
-        return clusters_needed(p, k, count, level)
+        rests_on = scores.plain.rests_on(s.candidate) if s.plain else None
+        return clusters_needed(p, k, count, level, rests_on)
     if scores.baseline.clusters.kind != "trip" or not scores.between(s.candidate):
         return None
     if ruled_out(settings.half, p, k, count):

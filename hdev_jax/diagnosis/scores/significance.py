@@ -31,16 +31,18 @@ def wald(
     return np.asarray(stats.f.sf(w * f / (k * (f + k - 1)), k, f))
 
 
-def clusters_needed(p: float, k: int, clusters: int, level: float) -> int | None:
+def clusters_needed(p: float, k: int, clusters: int, level: float, rests_on: float | None = None) -> int | None:
     """How many clusters would bring a Wald test of `k` numbers from `p` down to `level`, its size staying as it is.
 
-    **Returns:** None where twenty times as many are not enough.
+    `rests_on`: how many of them the numbers rest on, where that is the test's freedom (`Evidence.rests_on`); it grows
+    as their number does. **Returns:** None where twenty times as many are not enough.
     """
     if clusters < least_clusters(k):
         return None
-    statistic = float(stats.f.isf(p, k, clusters - k))
+    share = 1.0 if rests_on is None else float(np.clip(rests_on, k + 1, clusters)) / clusters
+    statistic = float(stats.f.isf(p, k, share * clusters - k))
     more = np.arange(clusters, 20 * clusters + 1)
-    enough = stats.f.sf(statistic * more / clusters, k, more - k) <= level
+    enough = stats.f.sf(statistic * more / clusters, k, share * more - k) <= level
     return int(more[np.argmax(enough)]) if enough.any() else None
 
 

@@ -1,5 +1,6 @@
 """The vehicle sheet: read from TOML, where the chain is entered, and traction force from motor torque."""
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,12 @@ class Sheet:
         return (
             f"Sheet({self.name!r}; estimated: {', '.join(free) or 'nothing'}; known: {', '.join(known) or 'nothing'})"
         )
+
+    def knowing(self, effects: Mapping[str, type[Effect]]) -> "Sheet":
+        """The same sheet, with these effects in its library besides."""
+        other = copy.copy(self)
+        other.library = {**self.library, **effects}
+        return other
 
     def driveline(self, efficiency: Any, *, regenerating: Any = None, covers_machine: bool = False) -> Driveline:
         """The driveline with the sheet's ratios and these efficiencies; else the kernel's default."""
