@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 CUT_OFF := $(VENV)/.installing
 PIP := $(PY) -m pip --disable-pip-version-check --no-input install -qq -c constraints.txt
 
-.PHONY: demo paper test lint types FORCE
+.PHONY: demo paper test lint types docs FORCE
 .DELETE_ON_ERROR:
 
 demo: $(READY)
@@ -30,6 +30,14 @@ lint: $(READY)
 
 types: $(READY)
 	@$(PY) -m pyright
+
+# The site, into out/site: runs the notebooks, draws the effects, checks every link between its pages.
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: export PYDEVD_DISABLE_FILE_VALIDATION := 1
+docs: $(READY)
+	@$(PIP) --no-build-isolation -e '.[docs]'
+	@$(PY) -m mkdocs build --quiet
+	@echo "the site is in out/site: open out/site/index.html"
 
 $(READY): pyproject.toml constraints.txt $(if $(wildcard $(PY)),,FORCE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \

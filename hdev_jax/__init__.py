@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.check import check
     from hdev_jax.verbs.diagnose import diagnose
     from hdev_jax.verbs.effects import effects
+    from hdev_jax.verbs.init import init
     from hdev_jax.verbs.predict import predict
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
     from hdev_jax.verbs.simulate import simulate
@@ -31,6 +32,7 @@ __all__ = [
     "check",
     "diagnose",
     "effects",
+    "init",
     "predict",
     "read_log",
     "read_sheet",
@@ -51,6 +53,7 @@ _HOME = {
     "check": "hdev_jax.verbs.check",
     "diagnose": "hdev_jax.verbs.diagnose",
     "effects": "hdev_jax.verbs.effects",
+    "init": "hdev_jax.verbs.init",
     "predict": "hdev_jax.verbs.predict",
     "simulate": "hdev_jax.verbs.simulate",
 }

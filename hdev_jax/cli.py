@@ -16,6 +16,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
+import shtab
+
 from hdev_jax import __version__
 from hdev_jax.compiling import compile_quickly, compiles_long, keep_compiled
 from hdev_jax.errors import InputError
@@ -32,9 +34,9 @@ _EXAMPLES = """\
 to begin:
   hdev demo                                     a synthetic truck's log, diagnosed: open hdev_demo/result/report.html
   hdev check trips.csv                          what was read from the log, no fit
-  hdev check other.csv --skeleton > a.toml      a log with other column names: fill in a.toml ...
-  hdev check other.csv --adapter a.toml         ... and look again
-  hdev diagnose trips.csv --vehicle truck.toml --out result
+  hdev init trips.csv                           begins trips.sheet.toml with what the log shows; for other
+                                                column names trips.adapter.toml, to be filled in
+  hdev diagnose trips.csv --vehicle trips.sheet.toml --out result
                                                 then open result/report.html
   hdev predict new.csv --vehicle result/augmented_vehicle.toml --out new_predicted.csv
 
@@ -44,7 +46,7 @@ to begin:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; argparse's own exits (`--help`, usage) raise SystemExit."""
     arguments = vars(parser().parse_args(argv))
-    verb = arguments.pop("verb")
+    verb, _ = arguments.pop("verb"), arguments.pop("completion", None)
     if verb is None:
         print(f"{_ABOUT}\n\n{_EXAMPLES}")
         return 0
@@ -68,6 +70,7 @@ def parser() -> argparse.ArgumentParser:
     """The command line: one subparser a verb, whose options are the arguments of the function of that name."""
     top = _Parser(prog="hdev", description=_ABOUT, epilog=_EXAMPLES)
     top.add_argument("--version", action="version", version=f"hdev {__version__}")
+    shtab.add_argument_to(top, "--completion", help="print a completion script for this shell, to be sourced")
     verbs = top.add_subparsers(dest="verb", metavar="VERB")
 
     check = verbs.add_parser(
@@ -83,6 +86,16 @@ def parser() -> argparse.ArgumentParser:
     check.add_argument(
         "--skeleton", action="store_true", help="print an adapter for these files, to be filled in, and stop"
     )
+
+    init = verbs.add_parser(
+        "init",
+        help="begin a vehicle sheet, and an adapter where one is needed, with what the log shows",
+        description="Write NAME.sheet.toml with what the log shows of the vehicle and typical values for the rest, "
+        "with comments. Where the log's columns have other names, write NAME.adapter.toml instead, to be filled in.",
+        epilog="examples:\n  hdev init trips.csv\n  hdev init other.csv --adapter other.adapter.toml",
+    )
+    _log_files(init)
+    init.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="the folder (default: this one)")
 
     diagnose = verbs.add_parser(
         "diagnose",
@@ -188,20 +201,24 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> None:
+def _log_files(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "logs", nargs="+", type=Path, metavar="LOG", help="log files (.csv, .csv.gz, .parquet, .mat), read as one log"
-    )
+    ).complete = shtab.FILE  # type: ignore[attr-defined]
+    verb.add_argument(
+        "--adapter", type=Path, metavar="A.toml", help="how to read files whose columns have other names or units"
+    ).complete = shtab.FILE  # type: ignore[attr-defined]
+
+
+def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> None:
+    _log_files(verb)
     verb.add_argument(
         "--vehicle",
         type=Path,
         required=vehicle_required,
         metavar="V.toml",
         help="the vehicle sheet: what is known of the vehicle",
-    )
-    verb.add_argument(
-        "--adapter", type=Path, metavar="A.toml", help="how to read files whose columns have other names or units"
-    )
+    ).complete = shtab.FILE  # type: ignore[attr-defined]
 
 
 def _target(verb: argparse.ArgumentParser) -> None:

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from planted import declared, opened, training
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
-from hdev_jax.diagnosis.competition.cycle import _fitted, _left_out_gain, _Rows
-from hdev_jax.diagnosis.competition.mode import LASTING, _against, _alone, _p, _split, _stability
+from hdev_jax.diagnosis.competition import cycle
+from hdev_jax.diagnosis.competition.cycle import _fitted, _left_out_gain, _Rows, add_cycle
+from hdev_jax.diagnosis.competition.mode import LASTING, _against, _alone, _p, _split, _stability, add_mode
+from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.noise.noise import Noise
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.settings import SETTINGS
@@ -208,3 +211,20 @@ def test_one_odd_trip_is_no_mode_of_resampled_trips():
     """Drawn twice it is still one trip: a mode has two of them at least."""
     grams = _grams(np.random.default_rng(3), np.r_[2.0, np.zeros(11)])
     assert _stability(grams[None], [True], *NOTHING, 0.05, np.random.default_rng(0), SETTINGS) < 0.1
+
+
+@pytest.mark.parametrize("left_out", [200.0, 1.0])
+@pytest.mark.parametrize(("effect", "rows", "add"), [("mode_change", 80, add_mode), ("periodic_load", 160, add_cycle)])
+def test_what_trips_left_out_do_not_confirm_is_not_added(effect, rows, add, left_out, tmp_path, monkeypatch):
+    monkeypatch.setattr(Evidence, "left_out_gain_of_mode", lambda *_: left_out)
+    monkeypatch.setattr(cycle, "_left_out_gain", lambda *_: left_out)
+    options = {"effects": {effect: {}}, "ratio": 1.0}
+    _, problem, _ = opened(tmp_path, seed=7102, trips=12, rows_per_trip=rows, **options)
+    log = training(problem, [effect])
+    state, verdict = add(log, declared(log, problem), np.random.default_rng(0))
+    if left_out > SETTINGS.ahead:
+        assert state is not None, verdict
+        assert state.ids == (effect,)
+    else:
+        assert verdict is not None
+        assert verdict.rejection.kind is Kind.NOT_CONFIRMED

@@ -14,7 +14,7 @@ from hdev_jax.diagnosis.competition.compete import compete
 from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.needed import backward, classes
-from hdev_jax.diagnosis.competition.refit import _crossed, joined, refit, widened, without
+from hdev_jax.diagnosis.competition.refit import _crossed, fitted, joined, refit, widened, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.scores.evidence import Score
@@ -294,3 +294,16 @@ def test_limits_that_end_out_of_order_are_told_by_path(two):
             state.fit, vehicle=vehicle, table=table, values=table.values(vehicle), sd=np.ones(n), covariance=np.eye(n)
         )
         assert _crossed(fit) == {f"effects.hvac_power.{n}" for n in crossed}
+
+
+def test_limits_stay_in_order_in_every_refit(tmp_path):
+    """Heating below and cooling above limits that cross are a constant load together, which is what this log has."""
+    _, problem, _ = opened(tmp_path, seed=4, effects={"auxiliary_power": {"power_w": 9000.0}}, noise_level=0.01)
+    rows = training(problem, ["hvac_power"])
+    start = declared(rows, problem).fit
+    effect = LIBRARY["hvac_power"](below_w_per_k=300.0, above_w_per_k=300.0, heat_c=15.0, cool_c=16.0)
+    table = start.table.plus(*effect_coefficients(effect, ("below_w_per_k", "above_w_per_k")))
+    vehicle = start.vehicle.plus(effect)
+    assert _crossed(rows.calibrate(vehicle, table)), "nothing tempts it: nothing would show"
+    hvac = fitted(rows, start, vehicle, table).vehicle.effect("hvac_power")
+    assert float(hvac.heat_c) < float(hvac.cool_c)

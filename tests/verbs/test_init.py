@@ -1,0 +1,72 @@
+"""`hdev init`: what the log shows is filled in, the rest can be fitted as it stands, nothing is overwritten."""
+
+import tomllib
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import hdev_jax
+from hdev_jax.cli import main
+from hdev_jax.errors import InputError
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.verbs.init import init
+
+
+def log_of(folder, **options):
+    return synthetic_log(seed=3, **{"trips": 4, "rows_per_trip": 200} | options).write(folder, truth=False)["log"]
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"mode": "samples"}, {"entry": "shaft", "mode": "samples"}, {"entry": "wheel", "mode": "samples"}]
+)
+def test_the_sheet_that_it_begins_can_be_fitted(options, tmp_path):
+    path = log_of(tmp_path, **options)
+    said = init([path], out=tmp_path / "new")
+    sheet = read_sheet(tmp_path / "new" / "synthetic_truck.sheet.toml")
+    assert "an adapter is not needed" in said
+    fit = hdev_jax.calibrate([path], sheet)
+    assert np.isfinite(pd.to_numeric(fit.coefficients["value"])).all()
+    assert ("[machine]" in (tmp_path / "new" / "synthetic_truck.sheet.toml").read_text()) == ("entry" in options)
+
+
+def test_what_the_log_shows_is_in_the_sheet(tmp_path):
+    frame = pd.read_csv(log_of(tmp_path, mode="samples", entry="shaft"))
+    ratio = 9.16 * 4.5 / 0.5  # of the lowest gear [rad/m]
+    stands = frame["speed_mps"] < 0.1
+    frame.loc[stands, "battery_power_kw"] = 3.2
+    frame.to_csv(tmp_path / "bus.csv", index=False)
+    init(tmp_path / "bus.csv", out=tmp_path)
+    sheet = tomllib.loads((tmp_path / "bus.sheet.toml").read_text())
+    assert sheet["driveline"]["gear_ratios"][0] / sheet["driveline"]["wheel_radius_m"] == pytest.approx(ratio, rel=0.05)
+    assert sheet["battery"]["auxiliary_w"]["value"] == 3200.0
+    assert "mass_kg" not in sheet, "the log has it"
+
+
+def test_other_column_names_begin_an_adapter(tmp_path, capsys):
+    frame = pd.read_csv(log_of(tmp_path)).rename(columns={"speed_start_mps": "v0", "speed_end_mps": "v1"})
+    frame.to_csv(tmp_path / "own.csv", index=False)
+    assert main(["init", str(tmp_path / "own.csv"), "--out", str(tmp_path)]) == 0
+    assert "own.adapter.toml: fill in which column is what" in capsys.readouterr().out
+    assert "v0" in (tmp_path / "own.adapter.toml").read_text()
+    assert not (tmp_path / "own.sheet.toml").exists()
+
+
+def test_nothing_is_overwritten(tmp_path):
+    path = log_of(tmp_path)
+    init(path, out=tmp_path)
+    before = (tmp_path / "synthetic_truck.sheet.toml").read_text()
+    with pytest.raises(InputError, match="is there already"):
+        init(path, out=tmp_path)
+    assert (tmp_path / "synthetic_truck.sheet.toml").read_text() == before
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_the_shell_completes_verbs_and_options(shell, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--completion", shell])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert "diagnose" in text
+    assert "--train-trips" in text
