@@ -177,9 +177,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="examples:\n  hdev simulate configs/studies/fleet.toml --out out/fleet\n"
         "  hdev check out/fleet/log.parquet/A.parquet --vehicle out/fleet/sheets/A.toml",
     )
-    simulate.add_argument(
-        "config", type=Path, metavar="CONFIG", help="what to simulate: a TOML file with at least a seed"
-    )
+    _file(simulate, "config", "CONFIG", "what to simulate: a TOML file with at least a seed")
     simulate.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
 
     demo = verbs.add_parser(
@@ -201,24 +199,19 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _file(verb: argparse.ArgumentParser, name: str, metavar: str, text: str, **options: Any) -> None:
+    """An argument that a shell completes with files."""
+    verb.add_argument(name, type=Path, metavar=metavar, help=text, **options).complete = shtab.FILE  # type: ignore[attr-defined]
+
+
 def _log_files(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "logs", nargs="+", type=Path, metavar="LOG", help="log files (.csv, .csv.gz, .parquet, .mat), read as one log"
-    ).complete = shtab.FILE  # type: ignore[attr-defined]
-    verb.add_argument(
-        "--adapter", type=Path, metavar="A.toml", help="how to read files whose columns have other names or units"
-    ).complete = shtab.FILE  # type: ignore[attr-defined]
+    _file(verb, "logs", "LOG", "log files (.csv, .csv.gz, .parquet, .mat), read as one log", nargs="+")
+    _file(verb, "--adapter", "A.toml", "how to read files whose columns have other names or units")
 
 
 def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> None:
     _log_files(verb)
-    verb.add_argument(
-        "--vehicle",
-        type=Path,
-        required=vehicle_required,
-        metavar="V.toml",
-        help="the vehicle sheet: what is known of the vehicle",
-    ).complete = shtab.FILE  # type: ignore[attr-defined]
+    _file(verb, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=vehicle_required)
 
 
 def _target(verb: argparse.ArgumentParser) -> None:
@@ -245,9 +238,7 @@ def _split(verb: argparse.ArgumentParser) -> None:
 
 
 def _effects(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--effects", type=Path, metavar="FILE.py", help="effects of your own, for the search and for the sheet"
-    )
+    _file(verb, "--effects", "FILE.py", "effects of your own, for the search and for the sheet")
 
 
 def _out(verb: argparse.ArgumentParser) -> None:

@@ -216,8 +216,9 @@ def _of_piece(
     return statistics(x * jnp.asarray(scale)[None, :], r, fit.measured, weight, ids, cells)
 
 
+@jax.jit
 def _no_perfect_log(
-    summed: Statistics, scale: Float[np.ndarray, " k"], unit: Float[np.ndarray, " k"]
+    summed: Statistics, scale: Float[Any, " k"], unit: Float[Any, " k"]
 ) -> Statistics:  # fmt: skip
     """Rows with the noise that computed ones have: without any, the table's own width would go to 0 with the noise's,
     also of what the rows do not determine.

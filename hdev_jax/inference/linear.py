@@ -34,6 +34,7 @@ class Statistics(eqx.Module):
     driving: Float[Array, "*group"]
     largest: Float[Array, "*group"]
 
+    @eqx.filter_jit
     def __add__(self, other: "Statistics") -> "Statistics":
         """Both sets of rows together; they were linearised at the same point."""
         both = jax.tree.map(jnp.add, self, other)
@@ -45,6 +46,7 @@ class Statistics(eqx.Module):
             lambda a: a * jnp.reshape(factor, jnp.shape(factor) + (1,) * (a.ndim - jnp.ndim(factor))), self
         )
 
+    @eqx.filter_jit
     def about(self, step: Float[Any, "*group k"]) -> "Statistics":
         """The same rows with r counted from a point `step` further on: exact where the model is linear."""
         along = jnp.einsum("...ij,...j->...i", self.gram, step)
@@ -52,6 +54,7 @@ class Statistics(eqx.Module):
         new = (self.moment - along, jnp.maximum(square, 0.0))
         return eqx.tree_at(lambda s: (s.moment, s.square), self, new)
 
+    @eqx.filter_jit
     def total(self) -> "Statistics":
         """All groups of the leading axis together."""
         summed = jax.tree.map(lambda a: jnp.sum(a, axis=0), self)
@@ -133,6 +136,7 @@ class Posterior(eqx.Module):
         return along @ self.mean, jnp.sqrt(self.rate / self.shape * (jnp.sum(weight**2) + wide))
 
 
+@jax.jit
 def _inverse(a: Float[Array, "*group k k"]) -> Float[Array, "*group k k"]:
     """Of a symmetric positive matrix, through its eigenvalues after scaling its diagonal to 1: never NaN."""
     d = jnp.sqrt(jnp.maximum(jnp.diagonal(a, axis1=-2, axis2=-1), 1e-300))
@@ -173,6 +177,7 @@ def statistics(
     return eqx.tree_at(lambda s: s.largest, summed, largest)
 
 
+@jax.jit
 def posterior(prior: Prior, data: Statistics) -> Posterior:
     """The posterior of one group; for several, `jax.vmap`. The cost does not depend on the rows that are in `data`.
 

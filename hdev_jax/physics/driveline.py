@@ -1,5 +1,6 @@
 """Gears and their losses: the ratio between motor and road, and an efficiency or a map of it."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -43,6 +44,7 @@ class EfficiencyMap(eqx.Module):
             if not isinstance(axis, Tracer) and not np.all(np.diff(np.asarray(axis)) > 0):
                 raise ValueError(f"efficiency map: {name} must increase from one to the next, found {np.asarray(axis)}")
 
+    @jax.jit
     def __call__(self, gear: Any, speed_radps: Any, torque_nm: Any) -> Any:
         """Efficiency at one operating point. Beyond the edges it is that of the edge, and its slope across it is 0."""
         g = jnp.argmin(jnp.abs(self.gears - gear))
@@ -87,6 +89,7 @@ def _turns(a: Any) -> tuple[Any, Any]:
     return a * (1 - a) * (1 - a), -a * a * (1 - a)
 
 
+@partial(jax.jit, static_argnums=2)  # traced once for a grid, not in every program
 def _slopes(x: Any, values: Array, axis: int) -> Array:
     """Slopes at the nodes along an axis that keep the cubic monotone where the nodes are."""
     z = jnp.moveaxis(values, axis, -1)
