@@ -87,9 +87,9 @@ def _key(settings: Mapping[str, Number]) -> str:
 
 def _counts(rows: Sequence[Mapping[str, Any]]) -> Counts:
     """Over the settings of the study's first table, without its rows over several of them."""
-    own = [r["ours"] for r in rows if "something_false" in (r["ours"] or {}) and "all together" not in r["name"]]
-    right = sum(round(x["as_asked"] * x["n"]) for x in own)
-    return right, sum(round(x["something_false"] * x["n"]) for x in own), sum(x["n"] for x in own)
+    own = [r["ours"] for r in rows if "false_name" in (r["ours"] or {}) and "all together" not in r["name"]]
+    right = sum(round(x["right"] * x["n"]) for x in own)
+    return right, sum(round(x["false_name"] * x["n"]) for x in own), sum(x["n"] for x in own)
 
 
 def _read(out: Path) -> list[dict[str, Any]]:

@@ -86,7 +86,7 @@ def told(metrics: Mapping[str, Any]) -> list[str]:
     if metrics.get("skipped"):
         said.append(f"{len(metrics['skipped'])} could not be made as asked for.")
     if metrics.get("missed"):
-        said.append(f"Short of what is wanted: {'; '.join(metrics['missed'])}.")
+        said.append(f"Below its target: {'; '.join(metrics['missed'])}.")
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
     said += [f"{note.rstrip('.')}." for note in metrics.get("notes", [])]

@@ -159,18 +159,28 @@ def _by(arguments: str) -> str:
 
 
 def _lines(folder: Path, docs: Path, name: str, before: str) -> list[str]:
-    """What is told of the run in `folder`, its tables, and its figures, which are put under `docs/figures/NAME/`."""
+    """What is told of the run in `folder`: a sentence, its figures, which are put under `docs/figures/NAME/`, its first
+    table; notes and other tables folded."""
     metrics = json.loads((folder / "metrics.json").read_text())
-    lines = [f"- {line}" for line in told(metrics)]
-    for table in sorted((folder / "tables").glob("*.md")):
-        lines += ["", table.read_text(encoding="utf-8").rstrip()]
-    home = docs / "figures" / name
+    first, *notes = told(metrics) or [""]
+    lines, home = [first], docs / "figures" / name
     for figure in sorted((folder / "figures").glob("*.png")):
         home.mkdir(parents=True, exist_ok=True)
         to = home / (figure.name if before == f"{figure.stem}_" else f"{before}{figure.name}")
         to.write_bytes(figure.read_bytes())
         lines += ["", f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})"]
+    tables = [t.read_text(encoding="utf-8").rstrip() for t in sorted((folder / "tables").glob("*.md"))]
+    lines += ["", *tables[:1]] if tables else []
+    if notes:
+        lines += ["", *folded("What the columns mean", "\n".join(f"- {line}" for line in notes))]
+    if tables[1:]:
+        lines += ["", *folded("More tables", "\n\n".join(tables[1:]))]
     return lines
+
+
+def folded(title: str, text: str) -> list[str]:
+    """A part of a page that opens on a click, on the site and where Markdown is shown as it is."""
+    return ['<details markdown="1">', f"<summary>{title}</summary>", "", text, "", "</details>"]
 
 
 def _kind(config: Path) -> str:

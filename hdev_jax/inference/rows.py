@@ -20,6 +20,7 @@ from hdev_jax.segments import Segments, trip_slices
 __all__ = ["CHUNK_ROWS", "Chunk", "Fit", "Shapes", "chunks_of", "chunks_of_fit", "cut", "padded", "padded_rows"]
 
 Real = Float[Array, " row"] | Float[np.ndarray, " row"]
+FEW_ROWS = 4_096
 CHUNK_ROWS = 65_536  # rows at a time: 200 columns of them are 0.1 GB
 
 
@@ -33,9 +34,13 @@ class Fit(eqx.Module):
 
 
 def padded_rows(n: int) -> int:
-    """The next of eight shapes per octave, so that logs of like length share one compilation."""
-    quantum = max(64, 2 ** max(int(np.ceil(np.log2(max(n, 1)))) - 3, 0))
-    return int(np.ceil(n / quantum) * quantum)
+    """1,024, 2,048 or 4,096 rows, or the next of four shapes per octave beyond: logs of like length share programs.
+
+    Compiling takes far longer than the rows of a short log, so short logs have few shapes.
+    """
+    octave = max(10, int(np.ceil(np.log2(max(n, 1)))))
+    quantum = 2**octave if 2**octave <= FEW_ROWS else 2 ** (octave - 3)
+    return int(np.ceil(max(n, 1) / quantum) * quantum)
 
 
 def padded(segments: Segments, measured: np.ndarray, size: int | None = None) -> Fit:

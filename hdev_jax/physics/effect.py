@@ -220,6 +220,7 @@ class Effect(eqx.Module):
         """The predicted column as the instrument would show it, by trip."""
         return column
 
-    def overrides(self, hook: str) -> bool:
+    @classmethod
+    def overrides(cls, hook: str) -> bool:
         """Whether this class has a hook of its own, so that the kernel calls only what does something."""
-        return getattr(type(self), hook) is not getattr(Effect, hook)
+        return getattr(cls, hook) is not getattr(Effect, hook)

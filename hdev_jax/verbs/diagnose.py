@@ -23,6 +23,7 @@ from hdev_jax.verbs.opening import (
     chosen_effects,
     command_line,
     known_effects,
+    names_of,
     opened,
 )  # fmt: skip
 from hdev_jax.verbs.predict import predictive_of, sheet_digest
@@ -64,6 +65,7 @@ def diagnose(
     started = time.time()
     if not 0.0 < fdr < 1.0:
         raise InputError(f"fdr {fdr}: a number between 0 and 1 is expected")
+    only, exclude = names_of(only), names_of(exclude)
     known = known_effects(effects)
     candidates = chosen_effects(known, only, exclude)
     start = opened(

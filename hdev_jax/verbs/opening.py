@@ -32,11 +32,12 @@ from hdev_jax.verbs.result import Result
 
 __all__ = [
     "Effects", "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest", "known_effects", "log_of",
-    "opened", "sheet_of", "tried",
+    "names_of", "opened", "sheet_of", "tried",
 ]  # fmt: skip
 
 Logs = Any  # a path or several, a `Log`, or a table in memory (pandas, polars, pyarrow, a mapping of arrays)
-Vehicles = str | Path | Sheet | Result  # a sheet's path, a sheet, or a result with a fitted one
+# a sheet's path, a sheet, its sections as a mapping, or a result with a fitted one
+Vehicles = str | Path | Sheet | Mapping[str, Any] | Result
 Effects = str | Path | Sequence[type[Effect]] | None  # a Python file of a user's own effects, or their classes
 HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
 ROUNDING = 1e4  # units in the last place of the largest prediction, for two that count as equal
@@ -48,7 +49,9 @@ def log_of(logs: Logs, adapter: str | Path | None = None) -> Log:
         return logs
     if isinstance(logs, str | Path):
         return read_log(logs, adapter)
-    if isinstance(logs, Sequence) and all(isinstance(p, str | Path) for p in logs):
+    if isinstance(logs, Sequence):
+        if odd := [type(p).__name__ for p in logs if not isinstance(p, str | Path)]:
+            raise InputError(f"logs: a list of paths is expected, found {odd[0]}; concatenate tables first")
         return read_log(list(logs), adapter)
     return log_from_frame(logs, adapter=adapter)
 
@@ -57,8 +60,10 @@ def sheet_of(vehicle: Vehicles, library: Mapping[str, type[Effect]]) -> Sheet:
     """The sheet in a file, from Python, or as a result fitted it. Raises `InputError`."""
     if isinstance(vehicle, str) and "\n" in vehicle:
         raise InputError("vehicle: the text of a sheet; give its path, a Sheet, or the result that it is of")
+    if isinstance(vehicle, Mapping):
+        return Sheet(library=library, **vehicle)
     if not isinstance(vehicle, str | Path | Sheet | Result):
-        raise TypeError(f"vehicle: a sheet's path, a Sheet or a result is expected, found {type(vehicle).__name__}")
+        raise InputError(f"vehicle: a sheet's path, a Sheet or a result is expected, found {type(vehicle).__name__}")
     if isinstance(vehicle, Result):
         return Sheet(library=library, path="fitted sheet", **tomllib.loads(vehicle.sheet))
     if isinstance(vehicle, Sheet):
@@ -216,6 +221,13 @@ def chosen_effects(
     return chosen
 
 
+def names_of(given: str | Sequence[Any] | None) -> tuple[str, ...] | None:
+    """Names as a command line has them, with commas between, or one by one; numbers of trips as text."""
+    if given is None:
+        return None
+    return tuple(x.strip() for x in given.split(",")) if isinstance(given, str) else tuple(str(x) for x in given)
+
+
 def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
@@ -279,6 +291,9 @@ def opened(
     **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried;
     `kept`, whether the run is kept in a folder, which compares what it was made of.
     """
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InputError(f"seed: a whole number from 0 is expected, found {seed!r}")
+    train_trips, test_trips = names_of(train_trips), names_of(test_trips)
     sheet = sheet_of(vehicle, known)
     with progress.busy("reading the logs"):
         log = log_of(logs, adapter)

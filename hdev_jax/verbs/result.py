@@ -116,7 +116,7 @@ class Result(ABC):
         **Returns:** the page's path.
         """
         path = Path(path)
-        if path.suffix != ".html":
+        if path.suffix not in (".html", ".htm"):
             self._write_report(path)
             return path / "report.html"
         with tempfile.TemporaryDirectory() as folder:

@@ -165,7 +165,7 @@ def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
     assert rows["one effect, size 0.25, 12 trips, ar1"]["after_over_noise"] == 1.03
 
 
-def test_classes_are_not_what_was_asked_without_them(tmp_path):
+def test_classes_are_not_what_wright_without_them(tmp_path):
     ten = every("single", effects=["headwind"])
     apart = {"headwind": []}
     logs = [(t, result(["headwind", "crosswind"] if k < 3 else ["headwind"], alike=apart)) for k, t in enumerate(ten)]
@@ -199,15 +199,15 @@ def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
 
     right = parts("class", "mass_scale", "power_gain")
     assert [right[k]["n"] for k in right] == [20, 10, 10]
-    assert [right[k]["as_asked"] for k in right] == [1.0, 1.0, 1.0]
+    assert [right[k]["right"] for k in right] == [1.0, 1.0, 1.0]
     assert [right[k]["named_exactly_no_class"] for k in right] == [0.5, 1.0, None]
     assert [right[k]["wanted"] for k in right] == [None, 0.88, 0.88]
     assert [right[k]["no_class_wanted"] for k in right] == [0.85, 0.85, None]
     assert [right[k]["met"] for k in right] == [False, True, True], "of all logs one name is asked, twins or not"
     for guess in ("power_gain", "mass_scale"):
         rows = parts(guess, guess)
-        assert (rows["a twin"]["as_asked"], rows["a twin"]["met"]) == (0.0, False)
-        assert (rows["all"]["as_asked"], rows["all"]["named_exactly_no_class"]) == (0.5, 0.5)
+        assert (rows["a twin"]["right"], rows["a twin"]["met"]) == (0.0, False)
+        assert (rows["all"]["right"], rows["all"]["named_exactly_no_class"]) == (0.5, 0.5)
         assert rows["no twin"]["met"] is True
 
 
@@ -228,7 +228,7 @@ def test_what_is_planted_as_it_is_has_no_place_on_the_axis_of_sizes(tmp_path):
     ]
     same = [(t, result(["iron_loss", "driveline_drag"])) for t in every("same_drag")]
     rows = told(tmp_path, sized + same)
-    assert rows["the same drag in all gears, a class with iron loss, 12 trips, ar1"]["as_asked"] == 1.0
+    assert rows["the same drag in all gears, a class with iron loss, 12 trips, ar1"]["right"] == 1.0
 
 
 def test_a_twin_is_never_separable_whatever_the_oracle_says(tmp_path):

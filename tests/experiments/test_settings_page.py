@@ -63,9 +63,9 @@ def test_the_page_in_docs_is_as_the_settings_are():
 
 def test_results_of_the_study_fill_half_and_double(tmp_path, capsys):
     def run(settings, right):
-        ours = {"n": 4, "as_asked": right / 4, "something_false": 0.25}
+        ours = {"n": 4, "right": right / 4, "false_name": 0.25}
         pooled = {"name": "nothing planted, all together", "paper": None, "ours": ours}
-        twin = {"name": "one effect: no twin", "paper": None, "ours": {"n": 4, "as_asked": 1.0}}
+        twin = {"name": "one effect: no twin", "paper": None, "ours": {"n": 4, "right": 1.0}}
         return {"sweep": {"settings": settings}, "rows": [{"name": "x", "paper": None, "ours": ours}, pooled, twin]}
 
     (tmp_path / "sweep.json").write_text(json.dumps([run({}, 4), run({"leaders": 2}, 3)]))

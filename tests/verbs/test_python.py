@@ -189,3 +189,37 @@ def test_what_is_no_log_or_effect_is_said(sheet, log):
         hdev_jax.diagnose(log.frame, sheet, effects=[Effect])
     with pytest.raises(InputError, match="column"):
         hdev_jax.diagnose(log.frame.drop(columns="speed_start_mps"), sheet)
+
+
+def test_arguments_are_taken_as_people_write_them(found, log):
+    """A sheet's sections as a mapping, one name as text, trips by number."""
+    frame = log.frame.assign(trip_id=log.frame["trip_id"].astype("category").cat.codes + 1)
+    sheet = {
+        "mass_kg": 24e3,
+        "road": {"c_rr": (0.006, 0.0008), "cda_m2": (5.6, 0.5)},
+        "driveline": {"efficiency": 0.91},
+    }
+    result = hdev_jax.diagnose(frame, sheet, only="headwind, auxiliary_power", test_trips=[3, 6])
+    assert result.summary["split"]["test_trips"] == ["3", "6"]
+    assert [e["id"] for e in result.summary["effects"]] == ["headwind"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"vehicle": 3.0}, "vehicle: a sheet's path"),
+        ({"seed": "x"}, "seed: a whole number from 0"),
+        ({"only": "headwnd"}, "did you mean 'headwind'"),
+        ({"test_trips": [99]}, "99"),
+        ({"fdr": 2.0}, "between 0 and 1"),
+    ],
+)
+def test_a_wrong_argument_is_one_line(wrong, said, log, sheet):
+    with pytest.raises(InputError, match=said) as caught:
+        hdev_jax.diagnose(log.frame, **({"vehicle": sheet, "only": ONLY} | wrong))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_of_frames_is_refused_in_one_line(log, sheet):
+    with pytest.raises(InputError, match="a list of paths is expected, found DataFrame"):
+        hdev_jax.diagnose([log.frame, log.frame], sheet)

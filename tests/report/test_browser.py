@@ -1,0 +1,64 @@
+"""The report in a real browser: nothing overflows on a desk or a phone, in light and dark, and no error is logged."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+
+import hdev_jax
+from hdev_jax.fleet import demo_log
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = [
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--allow-file-access-from-files", "--enable-logging=stderr",
+    "--virtual-time-budget=4000",
+]  # fmt: skip
+# A page that holds the report in a frame of a given width and writes down what it measures there.
+FRAME = """<!doctype html><iframe id="f" src="report.html" style="width:{width}px;height:900px;border:0"></iframe>
+<pre id="found"></pre><script>
+document.getElementById("f").onload = () => {{
+  const d = document.getElementById("f").contentDocument, wide = d.documentElement;
+  const boxes = [...d.querySelectorAll("body *")].filter(e => !e.closest(".scroll") || e.matches(".scroll"));
+  document.getElementById("found").textContent = JSON.stringify({{
+    width: wide.clientWidth, scroll: wide.scrollWidth,
+    out: boxes.filter(e => e.getBoundingClientRect().right > wide.clientWidth + 1).map(e => e.outerHTML.slice(0, 80)),
+    unnamed: [...d.images].filter(i => !i.alt || !i.complete || !i.naturalWidth).map(i => i.outerHTML.slice(0, 80)),
+    figures: d.images.length, heading: d.querySelector(".answer").textContent.trim(),
+    background: getComputedStyle(d.body).backgroundColor, ink: getComputedStyle(d.body).color,
+  }});
+}};</script>"""
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    log = demo_log(3, trips=8)
+    sheet = hdev_jax.read_sheet(log.write(folder / "log", truth=False)["sheet"])
+    hdev_jax.diagnose(log.frame, sheet, only=["headwind", "auxiliary_power"]).report(folder / "report.html")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+@pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, False), (390, True)])
+def test_nothing_overflows_and_no_error_is_logged(width, dark, report, tmp_path):
+    page = report / f"frame_{width}.html"
+    page.write_text(FRAME.format(width=width))
+    flags = [*FLAGS, f"--user-data-dir={tmp_path}", f"--window-size={width + 60},1000"]
+    flags += ["--blink-settings=preferredColorScheme=0"] if dark else ["--blink-settings=preferredColorScheme=1"]
+    done = subprocess.run([CHROMIUM, *flags, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120)
+    said = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert said, done.stderr[-2000:]
+    found = json.loads(html.unescape(said.group(1)))
+    assert found["scroll"] <= found["width"], found["out"]
+    assert found["out"] == []
+    assert found["unnamed"] == [], "a figure without a description, or one that does not load"
+    assert found["figures"] >= 3
+    assert found["heading"].startswith("The declared model misses")
+    assert "CONSOLE" not in done.stderr, done.stderr[-2000:]
+    light = sum(map(int, re.findall(r"\d+", found["background"])[:3])) > 600
+    assert light is not dark, "the page follows the reader's colour scheme"
