@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hdev_jax.fleet.config import FleetConfig, load_config, parse_config
 from hdev_jax.fleet.rows import ROW_FIELDS
+from hdev_jax.fleet.sheets import write_sheet
 from hdev_jax.fleet.simulator import Batch, VehiclePart, batches, shares
 from hdev_jax.fleet.variants import Variant
 from hdev_jax.physics import Vehicle
@@ -39,6 +41,14 @@ class FleetVehicle:
     def id(self) -> str:
         return self.variant.id
 
+    @property
+    def frame(self) -> pd.DataFrame:
+        """The log as a table, with the contract's columns: what `hdev_jax.diagnose` takes."""
+        s = self.segments
+        ends = {k: getattr(s, k) for k in ROW_FIELDS if k not in ("trip", "vehicle")}
+        trip = np.asarray(self.trip_names)[np.asarray(s.trip)]
+        return pd.DataFrame({"trip_id": trip, "vehicle_id": self.id, **ends, **s.channels, "energy_wh": self.energy_wh})
+
     def __len__(self) -> int:
         return len(self.energy_wh)
 
@@ -49,6 +59,13 @@ class Fleet:
 
     config: FleetConfig
     vehicles: tuple[FleetVehicle, ...]
+
+    def write_sheets(self, folder: str | Path) -> dict[str, Path]:
+        """The vehicles' sheets, with their efficiency maps, as files. **Returns:** the sheets' paths by vehicle."""
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        for v in self.vehicles:
+            write_sheet(v.variant, self.config, Path(folder))
+        return {v.id: Path(folder) / f"{v.id}.toml" for v in self.vehicles}
 
     def __getitem__(self, id: str) -> FleetVehicle:
         for v in self.vehicles:

@@ -3,22 +3,36 @@
 import json
 import shlex
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, overload
 
 import jax
 
 from hdev_jax import progress
+from hdev_jax.errors import InputError
+from hdev_jax.fleet import Fleet
+from hdev_jax.fleet import simulate as in_memory
 from hdev_jax.rundir import open_run
 
 __all__ = ["simulate"]
 
 
-def simulate(config: str | Path, *, out: str | Path) -> str:
-    """A synthetic fleet with known truth, from its configuration (a TOML file), into the folder `out`.
+@overload
+def simulate(config: str | Path | Mapping[str, Any], *, out: None = None) -> Fleet: ...
+@overload
+def simulate(config: str | Path, *, out: str | Path) -> str: ...
+def simulate(config: str | Path | Mapping[str, Any], *, out: str | Path | None = None) -> str | Fleet:
+    """A synthetic fleet with known truth, from its configuration (a TOML file).
 
-    `log.parquet`, `truth.parquet` and `sheets` hold a file for each vehicle; `fleet.json`, a report and figures say
-    what is in them. **Returns:** a summary as text. Raises `InputError`. In memory: `hdev_jax.fleet.simulate`.
+    Into the folder `out`: `log.parquet`, `truth.parquet` and `sheets` hold a file for each vehicle; `fleet.json`, a
+    report and figures say what is in them. **Returns:** a summary as text; without `out` the fleet in memory, for which
+    the configuration may be a mapping too: `simulate({"seed": 1, "routes": 60})["A"].frame`. Raises `InputError`.
     """
+    if out is None:
+        return in_memory(config)
+    if isinstance(config, Mapping):
+        raise InputError("config: the path of a TOML file is expected where a folder is written")
     from hdev_jax.fleet.config import load_config
     from hdev_jax.fleet.files import write_fleet
     from hdev_jax.report.fleet_page import fleet_summary, fleet_text, write_fleet_report

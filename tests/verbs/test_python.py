@@ -223,3 +223,15 @@ def test_a_wrong_argument_is_one_line(wrong, said, log, sheet):
 def test_a_list_of_frames_is_refused_in_one_line(log, sheet):
     with pytest.raises(InputError, match="a list of paths is expected, found DataFrame"):
         hdev_jax.diagnose([log.frame, log.frame], sheet)
+
+
+def test_a_fleet_in_memory_is_diagnosed_by_its_frame(tmp_path):
+    fleet = hdev_jax.simulate({"seed": 1, "routes": 8, "variants": ["A"], "segments_per_route": 40})
+    frame, sheet = fleet["A"].frame, fleet.write_sheets(tmp_path)["A"]
+    log = hdev_jax.Log.from_frame(frame)
+    assert len(log.trip_names) == 8
+    np.testing.assert_allclose(log.segments.distance_m, fleet["A"].segments.distance_m)
+    result = hdev_jax.diagnose(frame, sheet, only=["headwind"])
+    assert result.summary["before"]["train"]["n"] > 0
+    with pytest.raises(InputError, match="path of a TOML file"):
+        hdev_jax.simulate({"seed": 1}, out=tmp_path / "out")  # pyright: ignore
