@@ -40,6 +40,7 @@ to begin:
                                                 then open result/report.html
   hdev predict new.csv --vehicle result/augmented_vehicle.toml --out new_predicted.csv
 
+verbs: check, init, diagnose, calibrate, predict, simulate, demo, effects
 `hdev VERB --help` explains a verb. HDEV_DEBUG=1 shows the traceback of an error."""
 
 
@@ -123,9 +124,9 @@ def parser() -> argparse.ArgumentParser:
 
     calibrate = verbs.add_parser(
         "calibrate",
-        help="the sheet's coefficients with their uncertainty, from the tabular values and the log",
-        description="Estimate the coefficients to which the sheet gives an sd, from their tabular values and the "
-        "training trips, with standard errors. No effect is searched.",
+        help="the sheet's coefficients with their uncertainty, from the declared values and the log",
+        description="Estimate the coefficients to which the sheet gives an sd, from their declared values (as priors) and "
+        "the training trips, with standard errors. No effect is searched.",
         epilog="examples:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated\n"
         "  hdev calibrate trips.csv --vehicle truck.toml --method nuts --noise student_t --out drawn",
     )

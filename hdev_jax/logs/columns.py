@@ -272,7 +272,7 @@ class _Work:
                 hint = near(header, [c for c in COLUMNS if c not in self.headers], 0.85)
                 if header in COLUMNS.values():
                     hint = "; its name says no unit, so it is not read as a column of the contract"
-                self.note(header, f"not a column of the contract, kept under its own name{hint}")
+                self.note(header, f"unknown column, kept under its own name{hint}")
 
     def clock(self) -> None:
         """Where no rule made `time_s`: the column of that name, else absolute times by their usual names."""

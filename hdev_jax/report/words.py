@@ -259,7 +259,9 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
                 "in this log; "
             )
         else:
-            text = f"\x02Nothing is missing\x03: none of the {count(tried, 'effect')} tried explains what is left; "
+            text = (
+                f"\x02No missing effect found\x03: none of the {count(tried, 'effect')} tried explains what is left; "
+            )
         text += (
             f"{_where(data)} the error is {pair(test.get('rmse'), test.get('rmse'))[1]}{NBSP}{data.unit} RMSE per row"
         )

@@ -27,7 +27,10 @@ def test_errors_on_measured_logs_are_those_of_the_page():
 
 
 def test_shares_of_synthetic_logs_are_those_of_the_page():
-    for size, words in ((0.5, "half as large as the noise, is named exactly in"), (0.25, "a quarter as large in")):
+    for size, words in (
+        (0.5, "half as large as the noise (RMS of what it adds to a row), is named exactly in"),
+        (0.25, "a quarter as large in"),
+    ):
         _, n, share, *_ = row(PLANTED, f"one effect, size {size}, 12 trips, ar1")
         assert f"{words} {round(100 * float(share))} % of {n}" in TEXT
     _, n, share, *_ = row(PLANTED, "nothing planted, all together")

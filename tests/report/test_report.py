@@ -225,7 +225,7 @@ def test_a_strong_suspect_is_named_as_one(verdict):
     decided = "cannot decide on cut-off of regeneration at low speed (about 14 trips like these would be enough)"
     assert (decided in said) == (verdict != "effects_found")
     assert "slope bias" not in said
-    assert "Nothing is missing" not in said
+    assert "No missing effect found" not in said
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
@@ -242,7 +242,7 @@ def test_page_leads_with_the_answer(verdict, tmp_path):
         assert f"to {words.percent(after['pe_percent'])}".replace("\u00a0", " ") in said
         assert "<strong>headwind</strong>" in text
         assert "½ρ" in text
-    assert ("Nothing is missing: none of the 20 effects tried" in said) == (verdict == "nothing_missing")
+    assert ("No missing effect found: none of the 20 effects tried" in said) == (verdict == "nothing_missing")
     assert ("that no effect of the library explains: it depends on time since start" in said) == (
         "unexplained" in verdict
     )
@@ -255,7 +255,7 @@ def test_page_leads_with_the_answer(verdict, tmp_path):
     [
         ({"kind": "block", "count": 1}, True, "Not decidable on this log: with 1 stretch of driving for training"),
         ({"kind": "block", "count": 2}, True, "Not decidable on this log: with 2 stretches of driving for training"),
-        ({"kind": "block", "count": 3}, True, "Nothing is missing: none of the 20 effects"),
+        ({"kind": "block", "count": 3}, True, "No missing effect found: none of the 20 effects"),
         ({"kind": "block", "count": 3}, False, "Nothing was tried: every requested effect is declared in the sheet"),
     ],
 )
