@@ -46,12 +46,13 @@ verbs: check, init, diagnose, calibrate, predict, simulate, demo, effects
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; argparse's own exits (`--help`, usage) raise SystemExit."""
-    arguments = vars(parser().parse_args(argv))
-    verb, _ = arguments.pop("verb"), arguments.pop("completion", None)
-    if verb is None:
-        print(f"{_ABOUT}\n\n{_EXAMPLES}")
-        return 0
+    verb: str | None = None
     try:
+        arguments = vars(parser().parse_args(argv))
+        verb, _ = arguments.pop("verb"), arguments.pop("completion", None)
+        if verb is None:
+            print(f"{_ABOUT}\n\n{_EXAMPLES}")
+            return 0
         _print(_run(verb, arguments))
     except KeyboardInterrupt:
         resumes = verb in ("diagnose", "calibrate")
@@ -125,8 +126,8 @@ def parser() -> argparse.ArgumentParser:
     calibrate = verbs.add_parser(
         "calibrate",
         help="the sheet's coefficients with their uncertainty, from the declared values and the log",
-        description="Estimate the coefficients to which the sheet gives an sd, from their declared values (as priors) and "
-        "the training trips, with standard errors. No effect is searched.",
+        description="Estimate the coefficients to which the sheet gives an sd, from their declared values, as priors, "
+        "and the training trips, with standard errors. No effect is searched.",
         epilog="examples:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated\n"
         "  hdev calibrate trips.csv --vehicle truck.toml --method nuts --noise student_t --out drawn",
     )

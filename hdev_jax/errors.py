@@ -1,6 +1,6 @@
 """The one exception for whatever the user can put right: `hdev` prints it as one line and exits with status 2."""
 
-__all__ = ["InputError"]
+__all__ = ["InputError", "MissingColumnError"]
 
 
 class InputError(Exception):
@@ -10,3 +10,7 @@ class InputError(Exception):
         line = " ".join(str(message).split())
         # what a damaged file holds must not reach the terminal as control characters
         super().__init__("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line))
+
+
+class MissingColumnError(InputError):
+    """A column that every log needs is not there, or has another name."""

@@ -9,6 +9,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import jaxtyping
+import numpy as np
 import pytest
 
 import hdev_jax
@@ -299,3 +301,11 @@ def test_ci_fails_where_a_test_of_measured_data_is_skipped(pytester, monkeypatch
     outcomes = pytester.runpytest_subprocess("-p", "no:cacheprovider").parseoutcomes()
     assert outcomes.get("failed", 0) + outcomes.get("errors", 0) == failed
     assert outcomes["skipped"] == 4 - failed
+
+
+def test_shapes_in_annotations_are_checked():
+    """The hook of tests/conftest.py works, so that a wrong shape fails wherever a test meets it."""
+    from hdev_jax.diagnosis.scores.significance import effective_number
+
+    with pytest.raises(jaxtyping.TypeCheckError):
+        effective_number(np.ones(3))

@@ -7,7 +7,7 @@ from latex2mathml.converter import convert
 
 __all__ = ["on_page_markdown"]
 
-CODE = re.compile(r"(^```.*?^```|`[^`\n]*`)", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"((?:^[ \t]*```.*?^[ \t]*```)|(?:^[ \t]*~~~.*?^[ \t]*~~~)|`[^`\n]*`)", re.MULTILINE | re.DOTALL)
 EQUATION = re.compile(r"\$\$(.+?)\$\$|\$([^$\s](?:[^$\n]*[^$\s])?)\$", re.DOTALL)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.errors import InputError
+from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
@@ -97,9 +97,11 @@ def _require(pieces: list[Piece]) -> bool:
             lacking = [c for c in ("speed_start_mps", "speed_end_mps") if c not in p.data]
             wanted = lacking[0] if len(lacking) == 1 else "speed_mps"
             also = "" if len(lacking) == 1 else " (or speed_start_mps and speed_end_mps)"
-            raise InputError(f"{p.file}: no column {wanted}{also}{_nearest([*lacking, wanted], free, p)}")
+            raise MissingColumnError(f"{p.file}: no column {wanted}{also}{_nearest([*lacking, wanted], free, p)}")
         if "time_s" not in p.data and "duration_s" not in p.data:
-            raise InputError(f"{p.file}: no column time_s or duration_s{_nearest(['time_s', 'duration_s'], free, p)}")
+            raise MissingColumnError(
+                f"{p.file}: no column time_s or duration_s{_nearest(['time_s', 'duration_s'], free, p)}"
+            )
     for c in ("time_s", "duration_s"):
         other = "duration_s" if c == "time_s" else "time_s"
         lacking = [p for p in pieces if c not in p.data]

@@ -161,7 +161,7 @@ class PeriodicLoad(Effect):
     source: ClassVar = "thermostat with hysteresis"
     parameters: ClassVar = (
         Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
-        Shape("period_s", "s", 900.0, 300.0, 30.0, 4800.0, grid=(600.0, 1200.0, 1500.0)),
+        Shape("period_s", "s", 900.0, 300.0, 20.0, 7200.0, grid=(600.0, 1200.0, 1500.0)),
         Shape("duty", "1", 0.5, 0.2, 0.05, 0.95, grid=(0.3, 0.5, 0.7)),
         Choice("phase", "1", float("nan"), 0.25, -1.0, 1.0),
     )

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.physics import Effect
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.rundir import Run, open_run
+from hdev_jax.verbs.arguments import names_of
 from hdev_jax.verbs.opening import (
     Effects,
     Logs,
@@ -23,7 +25,6 @@ from hdev_jax.verbs.opening import (
     chosen_effects,
     command_line,
     known_effects,
-    names_of,
     opened,
 )  # fmt: skip
 from hdev_jax.verbs.predict import predictive_of, sheet_digest
@@ -57,14 +58,15 @@ def diagnose(
     ```
 
     **Arguments:** as the options of `hdev diagnose`. `logs`: a path or several, a `Log`, or a table in memory;
-    `vehicle`: a sheet's path or a `Sheet`; `effects`: a Python file or classes of your own effects; `out`: a folder for
-    `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`, from which a run that was stopped goes on.
+    `vehicle`: a sheet's path, a `Sheet` or a mapping of its sections; `effects`: a Python file or classes of your own
+    effects; `out`: a folder for `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`, from which an
+    interrupted run resumes.
 
     **Returns:** a `Diagnosis`; `str()` is the answer as text. **Raises:** `InputError` for faults of the input.
     """
     started = time.time()
-    if not 0.0 < fdr < 1.0:
-        raise InputError(f"fdr {fdr}: a number between 0 and 1 is expected")
+    if not isinstance(fdr, Real) or not 0.0 < fdr < 1.0:
+        raise InputError(f"fdr {fdr!r}: a number between 0 and 1 is expected")
     only, exclude = names_of(only), names_of(exclude)
     known = known_effects(effects)
     candidates = chosen_effects(known, only, exclude)

@@ -1,58 +1,62 @@
-"""The verb `init`: a vehicle's sheet and an adapter, begun with what the log itself shows."""
+"""The verb `init`: a vehicle's sheet, begun with what the log itself shows; or an adapter, where it cannot be read."""
 
+import json
+import shlex
+import tomllib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hdev_jax.errors import InputError
-from hdev_jax.logs import Log, write_adapter_skeleton
+from hdev_jax.errors import InputError, MissingColumnError
+from hdev_jax.inference.sheet import Sheet, choose_entry
+from hdev_jax.logs import Log, read_log, write_adapter_skeleton
 from hdev_jax.logs.names import stem
-from hdev_jax.verbs.opening import Logs, log_of
+from hdev_jax.physics.driveline import WHEEL_RADIUS_M
+from hdev_jax.physics.loads import STANDSTILL_MPS
+from hdev_jax.problem import prepare
 
 __all__ = ["init"]
 
 CAR_KG = 4500.0  # lighter than the lightest truck, heavier than a van
-STANDS_MPS, DRIVES_MPS = 0.1, 1.5
-ENOUGH = 10  # rows in a gear
+DRIVES_MPS = 1.5  # faster, the ratio of motor speed to speed is no noise
+ENOUGH = 10  # rows of a gear, or at standstill, for a median
+ONE_RATIO = 1.05  # 90th over 10th percentile of a ratio that is one number
 
 
-def init(logs: Logs, adapter: str | Path | None = None, out: str | Path = Path()) -> str:
-    """Write a sheet of the vehicle, and an adapter where the log's columns have other names, into the folder `out`.
+def init(logs: str | Path | Sequence[str | Path], adapter: str | Path | None = None, out: str | Path = Path()) -> str:
+    """Write NAME.sheet.toml into the folder `out`; or, where columns have other names, NAME.adapter.toml to fill in.
 
-    What the log tells is filled in or left out, with a comment; the rest has values that such vehicles have, each with
-    a standard deviation, to be replaced by better ones. **Returns:** what was written, and what comes next. Raises
-    `InputError`, also where one of the files is there already.
+    Of the sheet, what the log tells is filled in or left out, with a comment; the rest has values that such vehicles
+    have, each with a standard deviation. **Returns:** what was written, and what comes next. Raises `InputError`, also
+    where the file is there already.
     """
-    paths = [Path(logs)] if isinstance(logs, str | Path) else [Path(p) for p in logs]
-    name = stem(paths[0].name)
-    at = Path(out)
-    files = {"sheet": at / f"{name}.sheet.toml", "adapter": at / f"{name}.adapter.toml"}
-    said: list[str] = []
+    paths = [logs] if isinstance(logs, str | Path) else list(logs) if isinstance(logs, list | tuple) else []
+    if not paths or not all(isinstance(p, str | Path) for p in paths):
+        raise InputError("logs: the paths of one or several files are expected")
+    first = Path(paths[0])
+    name = stem(first.resolve().name)
+    given = shlex.join(map(str, paths))
     try:
-        log = log_of(paths, adapter)
-    except InputError as e:
+        log = read_log(list(paths), adapter)
+    except MissingColumnError as e:
         if adapter is not None:
             raise
-        first = (
-            next((p for p in sorted(paths[0].iterdir()) if p.is_file()), paths[0]) if paths[0].is_dir() else paths[0]
-        )
-        _write(files["adapter"], write_adapter_skeleton(first))
-        return "\n".join([
-            f"the log cannot be read as it is: {e}",
-            f"{files['adapter']}: fill in which column is what, then",
-            f"  hdev init {paths[0]} --adapter {files['adapter']}",
-        ])  # fmt: skip
-    _write(files["sheet"], sheet_text(log, name))
-    said.append(f"{files['sheet']}: look at its values, replace what you know better")
-    known = "" if adapter is None else f" --adapter {adapter}"
-    if adapter is None:
-        said.append("an adapter is not needed: the columns have names and units that are known")
-    logged = " ".join(map(str, paths)) if len(paths) < 4 else f"{paths[0]} …"
-    said += ["then:", f"  hdev diagnose {logged} --vehicle {files['sheet']}{known} --out {name}_result"]
-    return "\n".join(said)
+        if first.is_dir():
+            first = next(p for p in sorted(first.iterdir()) if p.is_file())
+        file = _write(Path(out) / f"{name}.adapter.toml", write_adapter_skeleton(first))
+        again = f"  hdev init {given} --adapter {shlex.quote(str(file))}"
+        return f"the log cannot be read as it is: {e}\n{file}: fill in which column is what, then\n{again}"
+    text = sheet_text(log, name)
+    prepare(log, Sheet(**tomllib.loads(text)), need_measured=bool(log.targets))
+    file = _write(Path(out) / f"{name}.sheet.toml", text)
+    options = "" if adapter is None else f" --adapter {shlex.quote(str(adapter))}"
+    where = f"--vehicle {shlex.quote(str(file))}{options} --out {shlex.quote(f'{name}_result')}"
+    return f"{file}: look at its values, replace what you know better, then\n  hdev diagnose {given} {where}"
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, text: str) -> Path:
     if path.exists():
         raise InputError(f"{path} is there already; rename or delete it, or give another folder by --out")
     try:
@@ -60,47 +64,39 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as e:
         raise InputError(f"{path}: cannot be written ({e.strerror or e}); give another folder by --out") from e
+    return path
 
 
 def sheet_text(log: Log, name: str) -> str:
     """The sheet as TOML, with comments that say what of it the log shows."""
-    s = log.segments
+    s, gears = log.segments, _gears(log)
+    ratios = tomllib.loads("\n".join(["[driveline]", *gears]))
+    target: Any = log.default_target if log.targets else None
+    entry = choose_entry(s, target, Sheet(**ratios)) if target else "road"
     mass = np.asarray(s.channels["mass_kg"]) if s.has("mass_kg") else None
     heavy = mass is None or float(np.median(mass)) > CAR_KG
-    shaft = s.has("motor_torque_nm")
-    wheel = s.has("traction_force_n") and "traction_force_n" not in log.targets[:1]
     lines = [
         "# A value with an sd is estimated from the log, with that value and sd as its prior; a bare number is kept.",
-        f'name = "{name}"',
-        *(_mass(mass) if mass is not None or not (shaft or wheel) else []),
-        "",
+        f"name = {json.dumps(name, ensure_ascii=False)}",
     ]
-    if shaft or wheel:
-        what = "motor torque" if shaft else "traction force"
+    if mass is not None:
+        lines += [f"# mass_kg is not needed: the log has its own, {mass.min():,.0f} to {mass.max():,.0f} kg"]
+    elif entry == "road":
+        lines += ["mass_kg = { value = 18000.0, sd = 4000.0 }  # total mass; the log has none: weigh it if you can"]
+    if entry == "road":
+        lines += ["", *_road(log, heavy), "[driveline]"]
+        lines += ["efficiency = { value = 0.88, sd = 0.03 }  # wheel to battery: gearbox, motor and inverter"]
+    else:
+        what = {"shaft": "motor torque", "wheel": "traction force"}[entry]
         lines += [
+            "",
             f"[machine]  # the log measures {what}: the road's part of the model is not needed",
             "motoring_efficiency = { value = 0.90, sd = 0.05 }",
             "regenerating_efficiency = { value = 0.88, sd = 0.05 }",
             "",
+            "[driveline]",
         ]
-    else:
-        lines += _road(log, heavy)
-    lines += [
-        "[driveline]",
-        *([] if shaft or wheel else ["efficiency = { value = 0.88, sd = 0.03 }"]),
-        *_gears(log),
-        "",
-    ]
-    lines += ["[battery]", *_standstill(log), *_voltage(log)]
-    return "\n".join(lines) + "\n"
-
-
-def _mass(mass: np.ndarray | None) -> list[str]:
-    if mass is None:
-        return [
-            "mass_kg = 18000.0  # total mass; the log has none: weigh the vehicle, or add the load to its curb weight"
-        ]
-    return [f"# mass_kg is not needed: the log has its own, {mass.min():,.0f} to {mass.max():,.0f} kg"]
+    return "\n".join([*lines, *gears, "", "[battery]", *_standstill(log), *_voltage(log)]) + "\n"
 
 
 def _road(log: Log, heavy: bool) -> list[str]:
@@ -119,36 +115,39 @@ def _road(log: Log, heavy: bool) -> list[str]:
 
 
 def _gears(log: Log) -> list[str]:
-    """Ratios, where motor speed shows them: rad of the motor for each metre."""
+    """Ratios, where motor speed shows them in every gear: rad of the motor for each metre."""
     s, v = log.segments, np.asarray(log.segments.speed_mps)
     if not s.has("motor_speed_radps"):
         return ["# gear_ratios = [9.16, 5.27], final_drive = 4.5, wheel_radius_m = 0.5  # for losses by gear"]
     drives = v > DRIVES_MPS
     ratio = np.asarray(s.channels["motor_speed_radps"])[drives] / v[drives]
-    if not len(ratio) or not np.median(ratio) > 0:
-        return []
-    gear = np.asarray(s.channels["gear"])[drives] if s.has("gear") else np.ones(len(ratio))
-    forward = [g for g in np.unique(gear[np.isfinite(gear)]).astype(int) if g > 0 and np.sum(gear == g) > ENOUGH]
-    if not forward or forward != list(range(1, len(forward) + 1)):
-        return [f"# the log shows {np.median(ratio):.4g} rad of the motor for each metre"]
-    each = [float(np.median(ratio[gear == g])) for g in forward]
+    gear = np.asarray(s.channels["gear"]) if s.has("gear") else np.ones(len(v))
+    forward = sorted({int(g) for g in gear[np.isfinite(gear)] if g >= 1})
+    by_gear = [ratio[gear[drives] == g] for g in forward]
+    one = all(len(x) > ENOUGH and 0 < np.quantile(x, 0.9) < ONE_RATIO * np.quantile(x, 0.1) for x in by_gear)
+    if not by_gear or not one or forward != list(range(1, len(forward) + 1)):
+        return ["# the log's motor speed does not show the ratio of each gear: gear_ratios = […], wheel_radius_m = …"]
+    radius = round(WHEEL_RADIUS_M, 3)
+    each = ", ".join(f"{float(np.median(x)) * radius:.4g}" for x in by_gear)
     return [
-        f"gear_ratios = [{', '.join(f'{x / 2:.4g}' for x in each)}]  # with the wheel radius, as the log shows",
-        "wheel_radius_m = 0.5  # assumed: only gear_ratios / wheel_radius_m matters",
+        f"gear_ratios = [{each}]  # with the wheel radius, as the log shows",
+        f"wheel_radius_m = {radius}  # assumed: only gear_ratios / wheel_radius_m matters",
     ]
 
 
 def _standstill(log: Log) -> list[str]:
-    """The auxiliaries: what the vehicle draws while it stands."""
-    v = np.asarray(log.segments.speed_mps)
-    if "battery_power_kw" not in log.targets or np.sum(v < STANDS_MPS) < 20:
-        return ["auxiliary_w = { value = 2000.0, sd = 1500.0 }  # consumers that are always on"]
-    watts = 1e3 * log.target("battery_power_kw")[v < STANDS_MPS]
+    """The auxiliaries: what the vehicle draws while it stands and does not charge."""
+    usual = ["auxiliary_w = { value = 2000.0, sd = 1500.0 }  # consumers that are always on"]
+    if "battery_power_kw" not in log.targets:
+        return usual
+    watts = 1e3 * log.target("battery_power_kw")[np.asarray(log.segments.speed_mps) < STANDSTILL_MPS]
+    watts = watts[watts > 0]
+    if len(watts) <= ENOUGH:
+        return usual
     low, middle, high = (float(x) for x in np.quantile(watts, (0.1, 0.5, 0.9)))
-    value = max(round(middle, -1), 0.0)
     return [
         f"# at standstill the log shows {middle / 1e3:.1f} kW median, {low / 1e3:.1f} to {high / 1e3:.1f} in 80 %",
-        f"auxiliary_w = {{ value = {value}, sd = {max(round(0.5 * (high - low), -1), 200.0)} }}",
+        f"auxiliary_w = {{ value = {round(middle, -1)}, sd = {max(round(0.5 * (high - low), -1), 200.0)} }}",
     ]
 
 

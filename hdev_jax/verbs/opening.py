@@ -21,18 +21,19 @@ from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import computed
 from hdev_jax.errors import InputError
 from hdev_jax.inference import padded
-from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
+from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet, sheet_of_sections
 from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.library import DECLARED
 from hdev_jax.problem import Problem, Split, prepare, split_trips
 from hdev_jax.rundir import Run
+from hdev_jax.verbs.arguments import names_of, seed_of
 from hdev_jax.verbs.result import Result
 
 __all__ = [
     "Effects", "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest", "known_effects", "log_of",
-    "names_of", "opened", "sheet_of", "tried",
+    "opened", "sheet_of", "tried",
 ]  # fmt: skip
 
 Logs = Any  # a path or several, a `Log`, or a table in memory (pandas, polars, pyarrow, a mapping of arrays)
@@ -49,7 +50,7 @@ def log_of(logs: Logs, adapter: str | Path | None = None) -> Log:
         return logs
     if isinstance(logs, str | Path):
         return read_log(logs, adapter)
-    if isinstance(logs, Sequence):
+    if isinstance(logs, Sequence) and not isinstance(logs, bytes):
         if odd := [type(p).__name__ for p in logs if not isinstance(p, str | Path)]:
             raise InputError(f"logs: a list of paths is expected, found {odd[0]}; concatenate tables first")
         return read_log(list(logs), adapter)
@@ -61,9 +62,10 @@ def sheet_of(vehicle: Vehicles, library: Mapping[str, type[Effect]]) -> Sheet:
     if isinstance(vehicle, str) and "\n" in vehicle:
         raise InputError("vehicle: the text of a sheet; give its path, a Sheet, or the result that it is of")
     if isinstance(vehicle, Mapping):
-        return Sheet(library=library, **vehicle)
+        return sheet_of_sections(vehicle, library=library)
     if not isinstance(vehicle, str | Path | Sheet | Result):
-        raise InputError(f"vehicle: a sheet's path, a Sheet or a result is expected, found {type(vehicle).__name__}")
+        kind = type(vehicle).__name__
+        raise InputError(f"vehicle: a sheet's path, a Sheet, its sections or a result is expected, found {kind}")
     if isinstance(vehicle, Result):
         return Sheet(library=library, path="fitted sheet", **tomllib.loads(vehicle.sheet))
     if isinstance(vehicle, Sheet):
@@ -221,13 +223,6 @@ def chosen_effects(
     return chosen
 
 
-def names_of(given: str | Sequence[Any] | None) -> tuple[str, ...] | None:
-    """Names as a command line has them, with commas between, or one by one; numbers of trips as text."""
-    if given is None:
-        return None
-    return tuple(x.strip() for x in given.split(",")) if isinstance(given, str) else tuple(str(x) for x in given)
-
-
 def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
@@ -291,9 +286,7 @@ def opened(
     **Arguments:** `known`, the library with those of the file `effects`; `candidates`, ids of those that are tried;
     `kept`, whether the run is kept in a folder, which compares what it was made of.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InputError(f"seed: a whole number from 0 is expected, found {seed!r}")
-    train_trips, test_trips = names_of(train_trips), names_of(test_trips)
+    seed, train_trips, test_trips = seed_of(seed), names_of(train_trips), names_of(test_trips)
     sheet = sheet_of(vehicle, known)
     with progress.busy("reading the logs"):
         log = log_of(logs, adapter)

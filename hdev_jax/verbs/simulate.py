@@ -29,10 +29,13 @@ def simulate(config: str | Path | Mapping[str, Any], *, out: str | Path | None =
     report and figures say what is in them. **Returns:** a summary as text; without `out` the fleet in memory, for which
     the configuration may be a mapping too: `simulate({"seed": 1, "routes": 60})["A"].frame`. Raises `InputError`.
     """
-    if out is None:
+    if out is None and isinstance(config, Mapping) and "seed" not in config:
+        raise InputError("config: seed is missing; a whole number is expected (the same seed, the same fleet)")
+    if out is None and isinstance(config, str | Path | Mapping):
         return in_memory(config)
-    if isinstance(config, Mapping):
-        raise InputError("config: the path of a TOML file is expected where a folder is written")
+    if out is None or not isinstance(config, str | Path):
+        other = " or, in memory, a mapping" if out is None else ""
+        raise InputError(f"config: the path of a TOML file{other} is expected, found {type(config).__name__}")
     from hdev_jax.fleet.config import load_config
     from hdev_jax.fleet.files import write_fleet
     from hdev_jax.report.fleet_page import fleet_summary, fleet_text, write_fleet_report

@@ -165,7 +165,7 @@ def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
     assert rows["one effect, size 0.25, 12 trips, ar1"]["after_over_noise"] == 1.03
 
 
-def test_classes_are_not_what_wright_without_them(tmp_path):
+def test_classes_are_not_right_without_their_members(tmp_path):
     ten = every("single", effects=["headwind"])
     apart = {"headwind": []}
     logs = [(t, result(["headwind", "crosswind"] if k < 3 else ["headwind"], alike=apart)) for k, t in enumerate(ten)]

@@ -36,5 +36,6 @@ def test_shares_of_synthetic_logs_are_those_of_the_page():
     _, n, share, *_ = row(PLANTED, "nothing planted, all together")
     assert f"an effect is named in {round((1 - float(share)) * int(n))} of {n} logs" in TEXT
     outside = [row(PLANTED, f"a {what} outside the library, size 1, 24 trips, ar1") for what in ("cause", "cycle")]
-    wrong, logs = sum(float(r[7]) * int(r[1]) for r in outside), sum(int(r[1]) for r in outside)
+    at = row(PLANTED, "name").index("false name")
+    wrong, logs = sum(float(r[at]) * int(r[1]) for r in outside), sum(int(r[1]) for r in outside)
     assert f"a wrong one is named in {round(wrong)} of {logs}." in TEXT

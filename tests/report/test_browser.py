@@ -60,5 +60,6 @@ def test_nothing_overflows_and_no_error_is_logged(width, dark, report, tmp_path)
     assert found["figures"] >= 3
     assert found["heading"].startswith("The declared model misses")
     assert "CONSOLE" not in done.stderr, done.stderr[-2000:]
-    light = sum(map(int, re.findall(r"\d+", found["background"])[:3])) > 600
-    assert light is not dark, "the page follows the reader's colour scheme"
+    page_is, ink = (sum(map(int, re.findall(r"\d+", found[k])[:3])) for k in ("background", "ink"))
+    assert (page_is > 600) is not dark, "the page follows the reader's colour scheme"
+    assert abs(page_is - ink) > 450, "ink that is read on its page"

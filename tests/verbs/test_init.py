@@ -1,5 +1,6 @@
 """`hdev init`: what the log shows is filled in, the rest can be fitted as it stands, nothing is overwritten."""
 
+import shlex
 import tomllib
 
 import numpy as np
@@ -10,7 +11,6 @@ import hdev_jax
 from hdev_jax.cli import main
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
-from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.verbs.init import init
 
 
@@ -18,17 +18,54 @@ def log_of(folder, **options):
     return synthetic_log(seed=3, **{"trips": 4, "rows_per_trip": 200} | options).write(folder, truth=False)["log"]
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"mode": "samples"}, {"entry": "shaft", "mode": "samples"}, {"entry": "wheel", "mode": "samples"}]
-)
-def test_the_sheet_that_it_begins_can_be_fitted(options, tmp_path):
-    path = log_of(tmp_path, **options)
+def rare_gear(frame):
+    """The highest gear in too few rows for a ratio."""
+    top = frame.index[frame["gear"] == frame["gear"].max()]
+    frame.loc[top[5:], "gear"] = frame["gear"].max() - 1
+    return frame
+
+
+CHANGES = {
+    "as it is": lambda f: f,
+    "no motor speed": lambda f: f.drop(columns="motor_speed_radps"),
+    "no battery power": lambda f: f.drop(columns="battery_power_kw"),
+    "no gear": lambda f: f.drop(columns="gear"),
+    "a rare gear": rare_gear,
+    "no mass, no slope": lambda f: f.drop(columns=["mass_kg", "grade_rad", "altitude_m"]),
+}
+ROAD = [({}, "as it is"), ({"mode": "samples"}, "as it is"), ({"mode": "samples"}, "no mass, no slope")]
+WHEEL = [({"entry": "wheel", "mode": "samples"}, "as it is")]
+SHAFT = [({"entry": "shaft", "mode": "samples"}, change) for change in CHANGES]
+
+
+@pytest.mark.parametrize(("options", "change"), [*ROAD, *WHEEL, *SHAFT])
+def test_the_sheet_that_it_begins_can_be_fitted(options, change, tmp_path):
+    path = tmp_path / 'my "first" log.csv'
+    CHANGES[change](pd.read_csv(log_of(tmp_path, **options))).to_csv(path, index=False)
     said = init([path], out=tmp_path / "new")
-    sheet = read_sheet(tmp_path / "new" / "synthetic_truck.sheet.toml")
-    assert "an adapter is not needed" in said
-    fit = hdev_jax.calibrate([path], sheet)
+    (file,) = (tmp_path / "new").iterdir()
+    assert shlex.split(said.splitlines()[-1])[:3] == ["hdev", "diagnose", str(path)]
+    fit = hdev_jax.calibrate([path], file)
     assert np.isfinite(pd.to_numeric(fit.coefficients["value"])).all()
-    assert ("[machine]" in (tmp_path / "new" / "synthetic_truck.sheet.toml").read_text()) == ("entry" in options)
+    shows = options.get("entry") == "shaft" and change not in ("no motor speed", "no gear", "a rare gear")
+    assert ("gear_ratios" in tomllib.loads(file.read_text())["driveline"]) == shows
+
+
+@pytest.mark.parametrize(
+    ("logs", "said"), [([], "one or several files"), (3.0, "one or several"), ({"a": [1.0]}, "one or several")]
+)
+def test_what_is_no_file_is_one_line(logs, said, tmp_path):
+    with pytest.raises(InputError, match=said):
+        init(logs, out=tmp_path)
+
+
+def test_a_fault_that_an_adapter_cannot_mend_is_said_and_nothing_is_written(tmp_path):
+    frame = pd.read_csv(log_of(tmp_path))
+    frame.loc[7, "time_s"] = -50.0
+    frame.to_csv(tmp_path / "backwards.csv", index=False)
+    with pytest.raises(InputError, match="time runs backwards"):
+        init(tmp_path / "backwards.csv", out=tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_what_the_log_shows_is_in_the_sheet(tmp_path):

@@ -185,6 +185,8 @@ def test_a_calibration_has_its_coefficients_in_a_frame(log, sheet):
 def test_what_is_no_log_or_effect_is_said(sheet, log):
     with pytest.raises(TypeError):
         hdev_jax.diagnose(3.0, sheet)
+    with pytest.raises(InputError, match="seed is missing"):
+        hdev_jax.simulate({"routes": 4})
     with pytest.raises(InputError, match=r"effects: .*Effect.> is no subclass"):
         hdev_jax.diagnose(log.frame, sheet, effects=[Effect])
     with pytest.raises(InputError, match="column"):
@@ -208,7 +210,12 @@ def test_arguments_are_taken_as_people_write_them(found, log):
     ("wrong", "said"),
     [
         ({"vehicle": 3.0}, "vehicle: a sheet's path"),
+        ({"vehicle": {"library": 1}}, "unknown"),
+        ({"vehicle": {1: 2}}, "unknown"),
         ({"seed": "x"}, "seed: a whole number from 0"),
+        ({"seed": 2**40}, "seed: a whole number from 0"),
+        ({"only": "headwind,"}, "names with commas"),
+        ({"fdr": None}, "between 0 and 1"),
         ({"only": "headwnd"}, "did you mean 'headwind'"),
         ({"test_trips": [99]}, "99"),
         ({"fdr": 2.0}, "between 0 and 1"),

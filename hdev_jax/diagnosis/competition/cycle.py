@@ -94,9 +94,9 @@ def add_cycle(training: Training, state: State, rng: np.random.Generator) -> tup
         why = f"no cycle is significant in the spectrum (FDR-adjusted p = {q:.2g})"
         return no(Kind.NOT_SIGNIFICANT, why, q=q)
     period = next(p for p in PeriodicLoad.parameters if p.name == "period_s")
-    if not period.lower < hit.period_s < period.upper:
-        return no(Kind.IMPLAUSIBLE, f"a cycle of {hit.period_s:.3g} s, outside the range of switched loads", q=q)
     wave, square = _fitted(rows, hit.period_s)
+    if not period.lower < wave.period_s < period.upper:
+        return no(Kind.IMPLAUSIBLE, f"a cycle of {wave.period_s:.3g} s, outside the range of switched loads", q=q)
     # the noise is quieter, and phases are sharper, without the cycle
     load = rows.worth * rows.load(wave) * _common(rows, square[:, None])[1]
     left = residual - load  # the mean of the cycle may have been taken for a constant load

@@ -197,7 +197,7 @@ def summarise(
             *_warnings(steps, state, settings),
             *_known(problem, state, steps[-1], test, rmse[-1]),
             *_by_trip(problem, state),
-            *_of_last_vehicle(problem, train),
+            *(_of_last_vehicle(problem, train) if any(c["id"] == "step_change" for c in candidates) else ()),
             *_odd_rows(problem, predicted[0]),
         ],
     }
@@ -291,11 +291,11 @@ def _by_trip(problem: Problem, state: State) -> list[str]:
 
 def _of_last_vehicle(problem: Problem, train: np.ndarray) -> list[str]:
     """A note where trips of several vehicles train: a change that stays is sought in those of the last alone."""
-    ids = np.unique(np.asarray(problem.segments.vehicle)[train])
-    if len(ids) < 2:
+    ids = np.asarray(problem.segments.vehicle)[train]
+    if len(np.unique(ids)) < 2:
         return []
     last = problem.log.vehicle_names[int(ids[-1])]
-    return [f"step_change is tried within the trips of {last} only, the last vehicle; diagnose the others separately"]
+    return [f"step_change is tried within the last trips of {last} only; diagnose the other vehicles separately"]
 
 
 def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:

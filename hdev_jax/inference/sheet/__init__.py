@@ -5,6 +5,7 @@ from hdev_jax.inference.sheet.sheet import (
     Sheet,
     choose_entry,
     read_sheet,
+    sheet_of_sections,
     traction_force_from_torque,
 )
 from hdev_jax.inference.sheet.text import augmented_sheet
@@ -16,5 +17,6 @@ __all__ = [
     "build",
     "choose_entry",
     "read_sheet",
+    "sheet_of_sections",
     "traction_force_from_torque",
 ]

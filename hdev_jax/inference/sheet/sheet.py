@@ -20,7 +20,7 @@ from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS, TargetName
 from hdev_jax.textfiles import read_toml
 
-__all__ = ["Sheet", "choose_entry", "read_sheet", "traction_force_from_torque"]
+__all__ = ["Sheet", "choose_entry", "read_sheet", "sheet_of_sections", "traction_force_from_torque"]
 
 
 class Sheet:
@@ -122,8 +122,16 @@ def read_sheet(path: str | Path, *, library: Mapping[str, type[Effect]] = LIBRAR
     or in the efficiency map it names.
     """
     table, _ = read_toml(Path(path), "sheet")
-    if {"library", "path"} & {*table}:  # arguments here, unknown keys there
-        parse(f"sheet {path}", table, library)
+    return sheet_of_sections(table, library=library, path=path)
+
+
+def sheet_of_sections(
+    sections: Mapping[Any, Any], *, library: Mapping[str, type[Effect]] = LIBRARY, path: str | Path | None = None
+) -> Sheet:
+    """A sheet from a mapping of its sections. Raises `InputError` for a key that is none."""
+    table = {str(k): v for k, v in sections.items()}
+    if {"library", "path"} & {*table}:  # arguments of `Sheet`, unknown keys of a sheet
+        parse("sheet" if path is None else f"sheet {path}", table, library)
     return Sheet(library=library, path=path, **table)
 
 
