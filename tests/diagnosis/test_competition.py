@@ -13,6 +13,7 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
 from hdev_jax.diagnosis.competition.compete import compete
 from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
+from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import _crossed, fitted, joined, refit, widened, without
 from hdev_jax.diagnosis.competition.state import Found, State
@@ -307,3 +308,19 @@ def test_limits_stay_in_order_in_every_refit(tmp_path):
     assert _crossed(rows.calibrate(vehicle, table)), "nothing tempts it: nothing would show"
     hvac = fitted(rows, start, vehicle, table).vehicle.effect("hvac_power")
     assert float(hvac.heat_c) < float(hvac.cool_c)
+
+
+def test_a_shape_between_two_points_of_its_grid_is_looked_at_before_trips_decide(tmp_path):
+    """The limit lies between the grid's: rows are sure of it there too, but what trips show of it differs."""
+    _, problem, _ = opened(tmp_path, seed=1, trips=12, effects={"regen_limit": {}}, ratio=0.5, rows_per_trip=100)
+    rows = training(problem, ["regen_limit"])
+    strict = replace(rows, settings=replace(rows.settings, fdr=1e-4))
+    fit = declared(rows, problem).fit
+    before = score_all(strict, fit)
+    p, q, shapes = before.best["regen_limit"].p, before.q["regen_limit"], before.best["regen_limit"].candidate.shapes
+    after = sharpened(strict, before)
+    assert p > 1e-5
+    assert after.best["regen_limit"].p < 1e-10
+    assert after.q["regen_limit"] < strict.settings.fdr < q
+    assert after.best["regen_limit"].candidate.shapes == shapes, "the refit chooses finer ones again"
+    assert sharpened(rows, score_all(rows, fit)).best["regen_limit"].p == p, "not where trips are sure already"
