@@ -23,11 +23,17 @@ FRAME = """<!doctype html><iframe id="f" src="report.html" style="width:{width}p
 document.getElementById("f").onload = () => {{
   const d = document.getElementById("f").contentDocument, wide = d.documentElement;
   const boxes = [...d.querySelectorAll("body *")].filter(e => !e.closest(".scroll") || e.matches(".scroll"));
+  const first = d.querySelector("figure img"), zoom = d.getElementById("zoom");
+  const figures = [...d.querySelectorAll("figure img")];
+  first.click();
+  const opened = zoom.open && zoom.firstElementChild.alt === first.alt;
+  zoom.click();
   document.getElementById("found").textContent = JSON.stringify({{
     width: wide.clientWidth, scroll: wide.scrollWidth,
     out: boxes.filter(e => e.getBoundingClientRect().right > wide.clientWidth + 1).map(e => e.outerHTML.slice(0, 80)),
-    unnamed: [...d.images].filter(i => !i.alt || !i.complete || !i.naturalWidth).map(i => i.outerHTML.slice(0, 80)),
-    figures: d.images.length, heading: d.querySelector(".answer").textContent.trim(),
+    zooms: opened && !zoom.open,
+    unnamed: figures.filter(i => !i.alt || !i.complete || !i.naturalWidth).map(i => i.outerHTML.slice(0, 80)),
+    figures: figures.length, heading: d.querySelector(".answer").textContent.trim(),
     background: getComputedStyle(d.body).backgroundColor, ink: getComputedStyle(d.body).color,
   }});
 }};</script>"""
@@ -58,6 +64,7 @@ def test_nothing_overflows_and_no_error_is_logged(width, dark, report, tmp_path)
     assert found["out"] == []
     assert found["unnamed"] == [], "a figure without a description, or one that does not load"
     assert found["figures"] >= 3
+    assert found["zooms"], "a click enlarges a figure, another closes it"
     assert found["heading"].startswith("The declared model misses")
     assert "CONSOLE" not in done.stderr, done.stderr[-2000:]
     page_is, ink = (sum(map(int, re.findall(r"\d+", found[k])[:3])) for k in ("background", "ink"))
