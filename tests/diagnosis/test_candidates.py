@@ -247,3 +247,13 @@ def test_of_two_sizes_of_one_effect_neither_may_be_nothing(sizes, is_plausible):
     c = Candidate(LIBRARY["power_gain"], ("gain", "offset_w"), (None, None), (), "size", (0, 1))
     s = Score(c, np.array(sizes), 50.0, 1e-9, 1e-9, 9.0, 0.5)
     assert plausible(s, SETTINGS) is is_plausible
+
+
+def test_of_two_limits_of_one_effect_the_lower_is_the_lower(problem):
+    """Heating above the temperature where cooling begins is no way to have either: with both it is a constant load."""
+    grids = {"heat_c": (10.0, 18.0), "cool_c": (14.0, 22.0)}
+    every, _, _ = columns(
+        problem.vehicle, [LIBRARY["hvac_power"]], problem.segments, len(problem.measured), problem.target, grids
+    )
+    pairs = [(x["heat_c"], x["cool_c"]) for c in every if {"heat_c", "cool_c"} <= {*(x := dict(c.shapes))}]
+    assert sorted(set(pairs)) == [(10.0, 14.0), (10.0, 22.0), (18.0, 22.0)]
