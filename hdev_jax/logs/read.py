@@ -37,10 +37,10 @@ def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Ada
     if not given:
         raise InputError("no log given; name one or more files")
     rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
-    files, companions = find_files([Path(p) for p in given], rules)
+    files, left = find_files([Path(p) for p in given], rules)
     ledger = Ledger()
-    for name in companions:
-        ledger = ledger.add("noted", "companion, joined to its log and no log itself", file=name)
+    for name, why in left.items():
+        ledger = ledger.add("noted", why, file=name)
     raws = [raw for path in files for raw in read_raw(path, rules)]
     return _assembled(raws, rules, ledger, tuple(p.name for p in files))
 

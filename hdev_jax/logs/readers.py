@@ -46,10 +46,10 @@ def _format(path: Path, adapter: Adapter) -> str:
     return adapter.format or by_ending or "csv"
 
 
-def find_files(paths: list[Path], adapter: Adapter) -> tuple[list[Path], list[str]]:
-    """Log files in the order given (a folder stands for the logs in it), and names of the companions left out."""
+def find_files(paths: list[Path], adapter: Adapter) -> tuple[list[Path], dict[str, str]]:
+    """Log files in the order given (a folder stands for the logs in it), and by name why others were left out."""
     files: list[Path] = []
-    companions: list[str] = []
+    left: dict[str, str] = {}
     for path in paths:
         if path.is_dir():
             endings = tuple(e for e, f in ENDINGS.items() if adapter.format in (None, f))
@@ -61,16 +61,28 @@ def find_files(paths: list[Path], adapter: Adapter) -> tuple[list[Path], list[st
         else:
             beside = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
             raise InputError(f"{path}: no such file{near(path.name, beside)}")
-        companions += [p.name for p in inside if adapter.is_companion(p.name)]
-        files += [p for p in inside if not adapter.is_companion(p.name)]
+        joined = "companion, joined to its log and no log itself"
+        left |= {p.name: joined for p in inside if adapter.is_companion(p.name)}
+        inside = [p for p in inside if not adapter.is_companion(p.name)]
+        named = [p for p in inside if _names_a_trip(p, adapter)] if path.is_dir() else inside
+        if named:  # where no name does, reading the first says so
+            other = "in the folder, but its name is not that of a trip (trip_id): left out"
+            left |= {p.name: other for p in inside if p not in named}
+        files += named or inside
     if not files:
-        raise InputError(f"no log among {len(paths)} path(s): {len(companions)} companion file(s) only")
+        raise InputError(f"no log among {len(paths)} path(s): {len(left)} companion file(s) only")
     seen: set[Path] = set()
     for path in files:
         if (real := path.resolve()) in seen:
             raise InputError(f"{path}: given twice")
         seen.add(real)
-    return files, companions
+    return files, left
+
+
+def _names_a_trip(path: Path, adapter: Adapter) -> bool:
+    """Whether the file's name has what the adapter takes its trip from; variables name the trips of `time_value`."""
+    by_name = adapter.trip_id is not None and adapter.layout == "table"
+    return not by_name or adapter.match(adapter.trip_id or "", path.name) is not None
 
 
 def read_raw(path: Path, adapter: Adapter) -> list[Raw]:

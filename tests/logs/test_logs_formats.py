@@ -262,3 +262,22 @@ def test_columns_for_the_report(tmp_path):
     buffer = io.StringIO()
     print(*found, file=buffer)
     assert "trip_id" not in buffer.getvalue()
+
+
+def test_of_a_folder_files_whose_name_is_no_trips_are_left_out_and_said(tmp_path):
+    """A named file is never left out: its name is at fault."""
+    adapter = Adapter.from_dict({"trip_id": r"(B\d+)"})
+    frame = FRAME.drop(columns="trip_id")
+    for name in ("B1.csv", "B2.csv"):
+        write(tmp_path, frame, name)
+    other = write(tmp_path, pd.DataFrame({"note": ["not a log"]}), "metaData.csv")
+    log = read_log(tmp_path, adapter)
+    assert log.trip_names == ("B1", "B2")
+    assert any("metaData.csv" in line and "left out" in line for line in log.ledger.lines())
+    with pytest.raises(InputError, match="does not match the file's name"):
+        read_log(other, adapter)
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    write(alone, frame, "drive.csv")
+    with pytest.raises(InputError, match="does not match the file's name"):
+        read_log(alone, adapter)
