@@ -171,6 +171,35 @@ def _is_number(text: str) -> bool:
     return re.fullmatch(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?", text) is not None
 
 
+def _check_fields(path: Path, text: str, separator: str, fields: int, header: int) -> None:
+    """Refuse lines with more fields than the header: what follows the surplus would be read as another column."""
+    odd: list[int] = []
+    for k, line in enumerate(text.split("\n")):
+        if line.count(separator) < fields or k <= header:
+            continue
+        found = len(_split(line, separator)) if '"' in line else line.count(separator) + 1
+        if found > fields + line.rstrip("\r ").endswith(separator):
+            odd.append(k + 1)
+    if odd:
+        more = f" ({len(odd):,} such lines)" if len(odd) > 1 else ""
+        raise InputError(
+            f"{path}: line {odd[0]} has more fields than the {fields} names of the header{more}; a {separator!r} in a "
+            "number or a text? Put quotes around it, or write the file without"
+        )
+
+
+def _check_thousands(path: Path, text: str, separator: str, names: list[str]) -> None:
+    """Refuse `14.288` in a file with decimal commas: fourteen thousand there, fourteen to a reader of points."""
+    start, end = rf"(?m)(?:^|(?<={separator}))", rf"(?=[{separator}\r\n]|$)"
+    for found in re.finditer(start + r"[-+]?\d{1,3}(?:\.\d{3})+" + end, text):
+        line = text.count("\n", 0, found.start())
+        column = text[text.rfind("\n", 0, found.start()) + 1 : found.start()].count(separator)
+        raise InputError(
+            f"{path}: line {line + 1}, column '{names[min(column, len(names) - 1)]}': {found.group()} in a file with "
+            "decimal commas: a thousands separator? Write the file without"
+        )
+
+
 def _read_csv(path: Path, data: bytes) -> tuple[pd.DataFrame, int]:
     try:
         text = data.decode("utf-8-sig")
@@ -197,8 +226,11 @@ def _read_csv(path: Path, data: bytes) -> tuple[pd.DataFrame, int]:
                 continue
             cut = "; the file is truncated" if which == "the last line" and len(found) < len(names) else ""
             raise InputError(f"{path}: {which} has {len(found)} fields, the header {len(names)}{cut}")
+    _check_fields(path, text, separator, len(names), first)
     cells = [c for line in rows for c in _split(line, separator)]
     comma = separator != "," and sum(bool(re.fullmatch(r"[-+]?\d+,\d+", c)) for c in cells) > 0
+    if comma:
+        _check_thousands(path, text, separator, names)
     text_ids: dict[Any, Any] = {i: str for i, n in enumerate(names) if n in _TEXT_IDS}
     try:
         table = pd.read_csv(

@@ -1,8 +1,11 @@
 """What contract §1 refuses: one line that names file, row, column and the remedy."""
 
 import contextlib
+import csv
 import gzip
 import io
+import tempfile
+from pathlib import Path
 
 import hypothesis.strategies as st
 import numpy as np
@@ -327,3 +330,37 @@ def test_targets(tmp_path):
     refused(lambda: log.trip_id("B"), "'B'", "A")
     frame = samples().rename(columns={"battery_power_w": "batery_power_w"})
     refused(lambda: read(tmp_path, frame).default_target, "batery_power_w", "'battery_power_w'")
+
+
+@given(st.sets(st.integers(2, 58), min_size=1, max_size=20), st.sampled_from([",", ";", "\t"]))
+def test_a_line_with_a_field_too_many_is_refused_wherever_it_is(lines, separator):
+    """What follows the surplus would be another column: an unquoted thousands separator."""
+    text = samples(60).to_csv(index=False, sep=separator).splitlines()
+    for k in lines:
+        first, rest = text[k].split(separator, 1)
+        text[k] = separator.join([first, "1", rest])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        path.write_text("\n".join(text) + "\n")
+        with pytest.raises(InputError, match=rf"line {min(lines) + 1} has more fields .*header"):
+            read_log(path)
+
+
+def test_a_separator_at_the_end_of_lines_and_one_in_quotes_are_no_field_too_many(tmp_path):
+    frame = samples(60).assign(place='Z\u00fcrich, "HB"')
+    text = frame.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC).splitlines()
+    (tmp_path / "log.csv").write_text("\n".join([text[0], *(f"{line}," for line in text[1:])]) + "\n", encoding="utf-8")
+    assert len(read_log(tmp_path / "log.csv")) == 60
+
+
+@given(st.integers(0, 59), st.integers(1000, 999999))
+def test_thousands_in_a_file_with_decimal_commas_are_asked_about(row, watts):
+    """14.288 W are fourteen thousand in such a file, and fourteen to a reader of points."""
+    frame = samples(60).round(3)
+    frame["battery_power_w"] = frame["battery_power_w"].astype(int).astype(str)
+    frame.loc[row, "battery_power_w"] = f"{watts:,}".replace(",", ".")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        frame.to_csv(path, index=False, sep=";", decimal=",")
+        with pytest.raises(InputError, match=rf"line {row + 2}, column 'battery_power_w': .*thousands separator"):
+            read_log(path)
