@@ -12,7 +12,7 @@ from hdev_jax.diagnosis.remainder.remainder import Remainder
 from hdev_jax.diagnosis.result.intervals import Open
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Calibration, cluster_rows
-from hdev_jax.physics import Choice, Parameter
+from hdev_jax.physics import Choice, Parameter, StepChange
 from hdev_jax.problem import Problem, Split, metrics
 
 __all__ = ["baseline_block", "parameters_of", "summarise"]
@@ -197,7 +197,7 @@ def summarise(
             *_warnings(steps, state, settings),
             *_known(problem, state, steps[-1], test, rmse[-1]),
             *_by_trip(problem, state),
-            *(_of_last_vehicle(problem, train) if any(c["id"] == "step_change" for c in candidates) else ()),
+            *(_of_last_vehicle(problem, train) if any(c["id"] == StepChange.id for c in candidates) else ()),
             *_odd_rows(problem, predicted[0]),
         ],
     }
@@ -295,7 +295,7 @@ def _of_last_vehicle(problem: Problem, train: np.ndarray) -> list[str]:
     if len(np.unique(ids)) < 2:
         return []
     last = problem.log.vehicle_names[int(ids[-1])]
-    return [f"step_change is tried within the last trips of {last} only; diagnose the other vehicles separately"]
+    return [f"{StepChange.id} is tried within the last trips of {last} only; diagnose the other vehicles separately"]
 
 
 def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
