@@ -19,6 +19,7 @@ from hdev_jax.diagnosis.scores.passes import evidence_of
 from hdev_jax.diagnosis.scores.scores import Scores, worth
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
+from hdev_jax.physics import unavailable
 
 __all__ = ["backward", "can_be_asked", "classes", "model_without", "needed"]
 
@@ -104,7 +105,7 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
         for f in asked:
             p = needed(evidence, state.fit, f).p
             strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
-            allowed = settings.fdr / max(len(training.library), 1) if strictly else settings.keep
+            allowed = settings.fdr / _tried(training, state) if strictly else settings.keep
             if p > allowed and (worst is None or p / allowed > worst[0]):
                 worst = (p / allowed, f)
         if worst is None:
@@ -116,6 +117,12 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
         why = Rejection(Kind.SUPERFLUOUS, {"beside": beside, "times": times})
         state = replace(state, removed={**state.removed, drop: why})
     return state
+
+
+def _tried(training: Training, state: State) -> int:
+    """How many effects of the library this log can show, as `Scores.level` counts them when one is added."""
+    car, row = state.fit.vehicle, training.facts.sample
+    return max(1, sum(not unavailable(c, row, car.entry, car.stands_in) for c in training.library.values()))
 
 
 def _constant(f: Found) -> bool:
