@@ -40,8 +40,7 @@ to begin:
                                                 then open result/report.html
   hdev predict new.csv --vehicle result/augmented_vehicle.toml --out new_predicted.csv
 
-verbs: check, init, diagnose, calibrate, predict, simulate, demo, effects
-`hdev VERB --help` explains a verb. HDEV_DEBUG=1 shows the traceback of an error."""
+`hdev --help` lists the verbs, `hdev VERB --help` explains one. HDEV_DEBUG=1 shows the traceback of an error."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -86,7 +86,7 @@ def _section(c: type[Effect], figure: str, size: str) -> Iterator[str]:
         "parameters": "; ".join(f"`{p.name}` [{p.unit}], {p.lower:g} to {p.upper:g}" for p in c.parameters),
         "needs": ", ".join(" or ".join(f"`{n}`" for n in need.split("|")) for need in c.needs),
         "may be mistaken for": ", ".join(mistaken),
-        "told apart by": c.separated_by,
+        "distinguished by": c.separated_by,
         "source": c.source,
     }
     yield "\n".join(f"- {k}: {v}" for k, v in facts.items() if v) + "\n"
@@ -95,18 +95,15 @@ def _section(c: type[Effect], figure: str, size: str) -> Iterator[str]:
 def _drive(entry: str) -> tuple[Vehicle, Segments]:
     """A truck and fifteen minutes of its driving, with every channel that an effect may read."""
     frame = synthetic_log(seed=4, trips=1, rows_per_trip=900, mode="samples", entry=entry).frame
-    n, t = len(frame), np.arange(len(frame))
+    t = np.arange(len(frame))
     frame["gap_m"] = 40.0 + 25.0 * np.sin(t / 60.0)
     frame["passengers"] = (t // 120) % 40
     frame["road_surface"] = (t // 200) % 2
     frame["hvac_power_w"] = 3000.0 + 1000.0 * np.sin(t / 90.0)
     frame["accel_mps2"] = np.gradient(frame["speed_mps"].to_numpy()) + 9.81 * np.sin(frame["grade_rad"].to_numpy())
-    if "standstill_flag" in frame:
-        frame["standstill_flag"] = (frame["speed_mps"] < 0.1).astype(float)
     segments = jax.tree.map(jnp.asarray, hdev_jax.Log.from_frame(frame).segments)
     terms = [Inertia(1.03), Grade(), Rolling(0.006), Aero(5.6), Auxiliary(2500.0)]
     car = Vehicle(terms, mass_kg=18e3, driveline=Driveline(0.91), entry=entry, nominal_voltage_v=650.0)
-    assert n == len(segments)
     return car, segments
 
 

@@ -144,7 +144,7 @@ def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
 
 
 def _met(row: dict[str, Any]) -> dict[str, Any]:
-    """The row with whether each share is what is wanted."""
+    """The row with whether each share meets its target."""
     asked = [(row[share], row[least]) for share, (_, least) in WANTED.items() if row.get(least) is not None]
     return {**row, "met": all(share >= least for share, least in asked) if asked else None}
 

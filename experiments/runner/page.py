@@ -159,8 +159,8 @@ def _by(arguments: str) -> str:
 
 
 def _lines(folder: Path, docs: Path, name: str, before: str) -> list[str]:
-    """What is told of the run in `folder`: a sentence, its figures, which are put under `docs/figures/NAME/`, its first
-    table; notes and other tables folded."""
+    """What a page says of the run in `folder`: a sentence, its figures, which are put under `docs/figures/NAME/`, its
+    first table; notes and other tables folded."""
     metrics = json.loads((folder / "metrics.json").read_text())
     first, *notes = told(metrics) or [""]
     lines, home = [first], docs / "figures" / name

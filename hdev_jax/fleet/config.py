@@ -114,13 +114,14 @@ def load_config(path: str | Path) -> FleetConfig:
     """Read a configuration. Raises `InputError`, one line with file, key, what was found and what is accepted."""
     path = Path(path)
     table, _ = read_toml(path, "config")
-    if "seed" not in table:
-        raise InputError(f"config {path}: seed is missing; a whole number is expected (the same seed, the same fleet)")
     return parse_config(table, f"config {path}")
 
 
 def parse_config(table: Mapping[str, Any], where: str = "config") -> FleetConfig:
-    """The configuration in a table of plain values; what is left out has its default. Raises `InputError`."""
+    """The configuration in a table of plain values; what is left out has its default, but for the seed. Raises
+    `InputError`."""
+    if "seed" not in table:
+        raise InputError(f"{where}: seed is missing; a whole number is expected (the same seed, the same fleet)")
     config = _parse(FleetConfig, table, where, "")
     _check_variants(config.variants, where)
     return config

@@ -5,6 +5,7 @@ import gzip
 import io
 import re
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -171,21 +172,39 @@ def _is_number(text: str) -> bool:
     return re.fullmatch(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?", text) is not None
 
 
+def _fields(text: str, separator: str) -> Iterator[tuple[int, int, bool]]:
+    """Number of each line that is not blank, how many fields it has, and whether the last is empty."""
+    if '"' in text:  # a quoted field may hold separators and line breaks
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        for row in reader:
+            if row:
+                yield reader.line_num, len(row), not row[-1]
+        return
+    for k, line in enumerate(text.split("\n"), 1):
+        if line := line.rstrip("\r "):
+            yield k, line.count(separator) + 1, line.endswith(separator)
+
+
 def _check_fields(path: Path, text: str, separator: str, fields: int, header: int) -> None:
-    """Refuse lines with more fields than the header: what follows the surplus would be read as another column."""
-    odd: list[int] = []
-    for k, line in enumerate(text.split("\n")):
-        if line.count(separator) < fields or k <= header:
-            continue
-        found = len(_split(line, separator)) if '"' in line else line.count(separator) + 1
-        if found > fields + line.rstrip("\r ").endswith(separator):
-            odd.append(k + 1)
+    """Refuse lines with more fields than the header, since what follows the surplus would be read as another column,
+    and a first or last line with fewer: a file that was cut off."""
+    try:
+        counts = [found for found in _fields(text, separator) if found[0] > header]
+    except csv.Error as e:
+        raise InputError(f"{path}: not a regular table: {e}") from None
+    # a separator at the end of every line is harmless and common
+    odd = [(k, n) for k, n, empty in counts if n > fields + empty]
     if odd:
         more = f" ({len(odd):,} such lines)" if len(odd) > 1 else ""
         raise InputError(
-            f"{path}: line {odd[0]} has more fields than the {fields} names of the header{more}; a {separator!r} in a "
-            "number or a text? Put quotes around it, or write the file without"
+            f"{path}: line {odd[0][0]} has {odd[0][1]} fields, the header {fields}{more}; a {separator!r} in a number "
+            "or a text? Put quotes around it, or write the file without"
         )
+    (first, n, _), last = counts[0], counts[-1][1]
+    if n < fields:
+        raise InputError(f"{path}: line {first} has {n} fields, the header {fields}")
+    if last < fields:
+        raise InputError(f"{path}: the last line has {last} fields, the header {fields}; the file is truncated")
 
 
 def _check_thousands(path: Path, text: str, separator: str, names: list[str]) -> None:
@@ -218,15 +237,7 @@ def _read_csv(path: Path, data: bytes) -> tuple[pd.DataFrame, int]:
     rows = [line for line in head[first + 1 : first + 51] if line.strip()]
     if not rows:
         raise InputError(f"{path}: no rows under the header")
-    last = text[-65536:].rstrip("\r\n").splitlines()[-1]
-    for line, which in ((rows[0], f"line {first + 2}"), (last, "the last line")):
-        if '"' not in line and len(found := _split(line, separator)) != len(names):
-            # a separator at the end of every line is harmless and common
-            if len(found) == len(names) + 1 and not found[-1]:
-                continue
-            cut = "; the file is truncated" if which == "the last line" and len(found) < len(names) else ""
-            raise InputError(f"{path}: {which} has {len(found)} fields, the header {len(names)}{cut}")
-    _check_fields(path, text, separator, len(names), first)
+    _check_fields(path, text, separator, len(names), first + 1)
     cells = [c for line in rows for c in _split(line, separator)]
     comma = separator != "," and sum(bool(re.fullmatch(r"[-+]?\d+,\d+", c)) for c in cells) > 0
     if comma:

@@ -29,8 +29,6 @@ def simulate(config: str | Path | Mapping[str, Any], *, out: str | Path | None =
     report and figures say what is in them. **Returns:** a summary as text; without `out` the fleet in memory, for which
     the configuration may be a mapping too: `simulate({"seed": 1, "routes": 60})["A"].frame`. Raises `InputError`.
     """
-    if out is None and isinstance(config, Mapping) and "seed" not in config:
-        raise InputError("config: seed is missing; a whole number is expected (the same seed, the same fleet)")
     if out is None and isinstance(config, str | Path | Mapping):
         return in_memory(config)
     if out is None or not isinstance(config, str | Path):
