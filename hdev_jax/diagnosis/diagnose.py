@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
-from hdev_jax.diagnosis.competition.compete import compete, named_alone
+from hdev_jax.diagnosis.competition.compete import compete, named_alone, rows_with
 from hdev_jax.diagnosis.competition.refit import as_reported
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.diagnosis.remainder.remainder import Formula, Remainder, remainder
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
+from hdev_jax.diagnosis.result.hidden import Given, given_states
 from hdev_jax.diagnosis.result.intervals import left_open
 from hdev_jax.diagnosis.result.next_drive import advise
 from hdev_jax.diagnosis.result.path import path
@@ -32,7 +33,8 @@ Checkpoint = Callable[[str, Callable[[], Any]], Any]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out: `summary` is diagnosis.json, `before` and `after` the two vehicles, the columns for figures."""
+    """What came out: `summary` is diagnosis.json, `before` and `after` the two vehicles, the columns for figures;
+    `given`, the rows with their decoded states, where a load has one."""
 
     problem: Problem
     split: Split
@@ -43,6 +45,7 @@ class Outcome:
     predicted_before: np.ndarray
     predicted_after: np.ndarray
     found: dict[str, dict[str, tuple[float, float, str]]]
+    given: Given | None = None
 
 
 def diagnose(
@@ -74,16 +77,22 @@ def diagnose(
 
     # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing
     tell("error before and after on the held-out test trips")
+    training = rows_with(training, state)
     named = named_alone(training, state)
     steps = path(training, problem, named)
     predicted = [problem.predict(fit.vehicle) for fit in steps]
 
-    # 4. What remains: the term without a name, a flexible learner, cycles, change points, random intercepts of trips
-    described = _formula(problem, training, state, predicted[-1])
+    # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
+    #    points, random intercepts of trips
+    given = given_states(problem, split, named, steps[-1], seed)
+    explained = predicted[-1] if given is None else given.predicted
+    described = _formula(problem, training, state, explained, given)
     plain = checkpoint(
         "remainder",
         lambda: (
-            remainder(problem, split, predicted[-1], predicted[0], described, settings, seed=seed, tell=tell).__dict__
+            remainder(
+                problem, split, predicted[-1], predicted[0], described, settings, given=explained, seed=seed, tell=tell
+            ).__dict__
         ),
     )
     left = Remainder(**plain)
@@ -92,10 +101,11 @@ def diagnose(
         steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
         test = problem.rows(split.test)
         left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
+        given = given_states(problem, split, named, known, seed)
 
     # 5. Sizes with their intervals, classes, and the drives that separate the members of a class
     leeway = {f.id: left_open(training, named, f.score, steps[-1]) for f in named.found}
-    summary = summarise(problem, split, named, steps, predicted, left, leeway, settings)
+    summary = summarise(problem, split, named, steps, predicted, left, leeway, settings, given)
     summary["excluded"] = excluded
     twins = [(f.id, library[t]) for f in named.found for t in f.alike[: settings.most_in_class] if t in library]
     if twins:
@@ -106,8 +116,9 @@ def diagnose(
     sheet = {f.id: parameters_of(f, steps[-1], {}, summary["clusters"]["count"]) for f in named.found}
     found = {k: {n: (p["value"], p["sd"], p["unit"]) for n, p in v.items()} for k, v in sheet.items()}
     return Outcome(
-        problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found
-    )
+        problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found,
+        given,
+    )  # fmt: skip
 
 
 def training_of(
@@ -128,14 +139,16 @@ def training_of(
     return Training(rows, problem.target, cluster_rows(real), library, gears, settings), excluded
 
 
-def _formula(problem: Problem, training: Training, state: State, predicted: np.ndarray) -> Formula | None:
+def _formula(
+    problem: Problem, training: Training, state: State, predicted: np.ndarray, given: Given | None
+) -> Formula | None:
     """The term without a name, if there is one that explains anything, with the prediction of the model that has it."""
     if not state.terms or state.terms[0].values is not None:  # a cycle's mean: reported with what remains
         return None
     term = state.terms[0]
     at = next(i for i, c in enumerate(state.fit.table.free) if c.path == f"effects.{Described.id}.k")
     words = formula(term, float(state.fit.values[at]), float(state.fit.sd[at]), problem.target)
-    everything = problem.segments.with_channels(**{TERM: term.column(problem.segments)})
+    everything = (given.segments if given else problem.segments).with_channels(**{TERM: term.column(problem.segments)})
     with_it = problem.predict(state.fit.vehicle, everything)
     train = np.isin(np.asarray(problem.segments.trip), np.unique(training.trip))
     before = float(np.mean((problem.measured - predicted)[train] ** 2))

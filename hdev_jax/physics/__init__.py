@@ -54,6 +54,7 @@ from hdev_jax.physics.sensors import (
     TimeSkew,
     TorqueOffset,
 )
+from hdev_jax.physics.states import SecondSwitchingLoad, SwitchingLoad
 from hdev_jax.physics.tyres import (
     Cornering,
     RoadSurface,
@@ -122,6 +123,7 @@ __all__ = [
     "RollingTemperature",
     "RotatingMass",
     "SamplingFilter",
+    "SecondSwitchingLoad",
     "Shape",
     "Size",
     "SpeedScale",
@@ -129,6 +131,7 @@ __all__ = [
     "StandstillLoad",
     "StepChange",
     "Switch",
+    "SwitchingLoad",
     "TimeSkew",
     "TorqueOffset",
     "TractionLimit",

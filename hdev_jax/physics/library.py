@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.physics import battery, brakes, loads, losses, road, sensors, tyres
+from hdev_jax.physics import battery, brakes, loads, losses, road, sensors, states, tyres
 from hdev_jax.physics.across import with_bounds
 from hdev_jax.physics.effect import STAGES, Effect, Grouped
 from hdev_jax.physics.parameter import GROUPS
@@ -28,7 +28,7 @@ DECLARED: tuple[type[Effect], ...] = (road.Inertia, road.Grade, road.Rolling, ro
 def _all() -> dict[str, type[Effect]]:
     found = [
         c
-        for module in (sensors, road, brakes, tyres, losses, loads, battery)
+        for module in (sensors, road, brakes, tyres, losses, loads, states, battery)
         for c in (getattr(module, name) for name in module.__all__)
         if isinstance(c, type) and issubclass(c, Effect) and c.parameters
     ]

@@ -8,9 +8,11 @@ import numpy as np
 from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.inference import padded
 from hdev_jax.physics.across import distance_since_start
+from hdev_jax.physics.states import state_channel
 from hdev_jax.problem import Problem, Split
 from hdev_jax.report.data import ReportData
-from hdev_jax.report.words import answer, next_drives, plus_minus
+from hdev_jax.report.switching import on_column
+from hdev_jax.report.words import answer, known_errors, next_drives, plus_minus, switching
 from hdev_jax.targets import TARGETS
 
 __all__ = ["answer_text", "of_diagnosis", "report_data"]
@@ -52,15 +54,20 @@ def of_diagnosis(result: Outcome, command: str, started: float) -> ReportData:
         test = problem.rows(split.test)
         trip = np.asarray(problem.segments.trip)
         whole = np.isin(trip, trip[test])  # of a trip that is tested in part, what came before belongs to it
-        rows = padded(problem.segments.take(whole), problem.measured[whole])
+        known = problem.segments if result.given is None else result.given.segments
+        rows = padded(known.take(whole), problem.measured[whole])
         for when, car in (("before", result.before), ("after", result.after)):
             parts = car.breakdown(rows.segments)
             breakdown[when] = {
                 k: float(np.sum(np.asarray(v)[: rows.rows][test[whole]])) / 1e3 for k, v in parts.items()
             }
-    return report_data(
+    data = report_data(
         problem, split, result.summary, result.predicted_before, result.predicted_after, command, started, breakdown
     )
+    if given := result.given:
+        states = {on_column(i): np.asarray(given.segments.channels[state_channel(i)]) for i in given.ids}
+        data.rows.update({"given": given.predicted, **states})
+    return data
 
 
 def answer_text(data: ReportData) -> str:
@@ -71,8 +78,12 @@ def answer_text(data: ReportData) -> str:
         m = s[when]["test"]
         pe = "-" if m["pe_percent"] is None else f"{m['pe_percent']:+.2f} %"
         lines.append(f"{when:10s}{m['rmse']:12.4g}{pe:>20s}")
+    lines += known_errors(s, data.unit)
     for e in s["effects"]:
         sizes = ", ".join(f"{k} {plus_minus(p['value'], p['sd'], p['unit'])}" for k, p in e["parameters"].items())
+        if "state" in e:
+            lines.append(f"  {e['id']} ({e['stage']}): {switching(e)}")
+            continue
         others = ", ".join(e["indistinguishable_from"])
         twins = f"; cannot be distinguished from {others}" if others else ""
         lines.append(f"  {e['id']} ({e['stage']}): {sizes}{twins}")

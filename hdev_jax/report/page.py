@@ -23,6 +23,7 @@ from hdev_jax.report.figures import (
 from hdev_jax.report.posterior import prior_likelihood_posterior
 from hdev_jax.report.residuals import panels, residual_by_channel, residual_in_time
 from hdev_jax.report.statistics import blocks, row_seconds
+from hdev_jax.report.switching import loads, switching_loads
 
 __all__ = ["write_calibration_report", "write_page", "write_report"]
 
@@ -49,6 +50,7 @@ def write_report(data: ReportData, directory: Path) -> None:
             "coefficients": coefficients(data),
             "residual_channels": residual_by_channel(data, shown),
             "residual_time": residual_in_time(data),
+            "switching_loads": switching_loads(data),
             "energy_by_effect": energy_by_effect(data),
             "trips": trip_errors(data),
         }
@@ -64,6 +66,7 @@ def write_report(data: ReportData, directory: Path) -> None:
         "candidates": _candidates(summary),
         "excluded": [{**e, "name": names.effect(e["id"])} for e in summary.get("excluded", [])],
         "unexplained": {**_NO_UNEXPLAINED, **summary.get("unexplained", {})},
+        "loads": [_load(e, summary) for e in loads(data)],
         "depends_on": [(c, names.channel(c).label) for c in summary.get("unexplained", {}).get("depends_on") or []],
         "nothing_added": same_model(data),
         "dependence": [p for p in shown if p.name[0] != "\x00"],
@@ -228,6 +231,18 @@ def _found(data: ReportData, e: dict[str, Any]) -> dict[str, Any]:
         "stability": words.percent(None if stability is None else 100 * stability, signed=False, decimals=0),
         "twins": [names.effect(t) for t in e.get("indistinguishable_from") or []],
         "rmse": words.pair(e.get("test_rmse_before"), e.get("test_rmse_after")),
+    }
+
+
+def _load(e: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:
+    """A load that switches: its sentence, its dwell times and its energy in each test trip."""
+    state, test = e["state"], summary["split"]["test_trips"]
+    return {
+        "name": names.effect(e["id"]),
+        "said": words.switching(e),
+        "on_s": words.number(state["dwell_on_s"], 2, "s"),
+        "off_s": words.number(state["dwell_off_s"], 2, "s"),
+        "kwh": [(t, *(words.number(x) for x in state["kwh_by_trip"][t])) for t in test if t in state["kwh_by_trip"]],
     }
 
 

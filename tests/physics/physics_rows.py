@@ -64,6 +64,8 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "regen_efficiency": {"share": 0.2},
     "regen_limit": {"power_w": 3.1e4, "share": 0.8},
     "standstill_load": {"power_w": 2500.0, "by_door": 0.5},
+    "second_switching_load": {"power_w": 700.0, "share_0c": 0.2, "share_30c": 0.9},
+    "switching_load": {"power_w": 2300.0, "share_0c": 0.7, "share_20c": 0.1, "memory_s": 40.0},
     "step_change": {"power_w": 900.0, "c_rr": 1e-3, "loss": 0.04, "at_trip": 1.0},
     "traction_limit": {"power_w": 9.1e4},
     "voltage_dependence": {"per_v": 5e-4, "at_v": 640.0},

@@ -14,6 +14,7 @@ from hdev_jax.diagnosis.competition.mode import add_mode
 from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import widened, without
 from hdev_jax.diagnosis.competition.state import State, Verdict
+from hdev_jax.diagnosis.competition.switching import add_switching, decoded_again, mistaken, with_states
 from hdev_jax.diagnosis.competition.unnamed_step import add_unnamed
 from hdev_jax.diagnosis.competition.verdicts import verdicts_of
 from hdev_jax.diagnosis.scores.scores import score_all
@@ -21,7 +22,7 @@ from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import ParameterTable
 from hdev_jax.physics import Vehicle
 
-__all__ = ["compete", "named_alone"]
+__all__ = ["compete", "named_alone", "rows_with"]
 
 Tell = Callable[[str], None]
 
@@ -51,18 +52,18 @@ def compete(
     state = remember(0, declared)
     for step in range(1, training.settings.most_effects + 3):
         rng = np.random.default_rng([seed, step])
-        state = remember(step, lambda s=state, k=step, r=rng: _step(_rows_with(training, s), s, k, r, tell))
+        state = remember(step, lambda s=state, k=step, r=rng: _step(rows_with(training, s), s, k, r, tell))
         if state.finished:
             break
     return state
 
 
-def _rows_with(training: Training, state: State) -> Training:
-    """The training rows with the channels of the terms that the state holds."""
+def rows_with(training: Training, state: State) -> Training:
+    """The training rows with the channels of the terms, and the decoded loads, that the state holds."""
     for term in state.terms:
         if not training.rows.segments.has(TERM):
             training = training.with_channel(TERM, term.column(training.rows.segments)[: training.rows.rows])
-    return training
+    return with_states(training, state)
 
 
 def _step(training: Training, state: State, step: int, rng: np.random.Generator, tell: Tell) -> State:
@@ -79,7 +80,11 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
         new = two_exchanged(round_) or forward(round_, skip=state.refused)
         if new is None and state.refused:
             new = forward(round_, skip=tuple(round_.reasons))  # tried just now: no second time
-        for add in (add_cycle, add_mode):
+        if new is not None and mistaken(state, new):
+            switching, verdict = add_switching(training, state, rng.spawn(1)[0])
+            sought += [verdict] if verdict is not None else []
+            new = switching or new
+        for add in (add_cycle, add_switching, add_mode):
             # last: the residual without an effect that depends on traffic is not noise, and may have cycles
             if new is None and not state.terms:
                 new, verdict = add(training, state, rng.spawn(1)[0])
@@ -88,10 +93,14 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
         if new is None and (added := add_unnamed(round_)) is not None:
             training, new = added
             tell("added a term without a name")
+    asked = {v.id for v in sought}
+    sought += [v for v in state.verdicts if v.id not in asked and training.library[v.id].searched]
     if new is None:
         state = replace(state, found=classes(scores, state))
         return replace(state, verdicts=verdicts_of(round_, sought), finished=True)
-    kept = backward(training, new, newest=len(new.terms) > len(state.terms))
+    if new.hidden is not state.hidden:
+        training = with_states(training, new)
+    kept = decoded_again(training, backward(training, new, newest=len(new.terms) > len(state.terms)))
     for id_ in set(new.ids) - set(kept.ids):
         tell(f"taking {id_} out again: {kept.removed[id_]}")
     trail = {**kept.trail, ",".join(kept.ids): [float(x) for x in kept.fit.values]} if not kept.terms else kept.trail
@@ -105,7 +114,7 @@ def named_alone(training: Training, state: State) -> State:
     if not state.terms:
         return state
     alone = without(training, state, *(t.id for t in state.terms))
-    kept = backward(training, alone, newest=True)
+    kept = decoded_again(training, backward(training, alone, newest=True))
     lost = [f for f in alone.found if f.id not in kept.ids]
     verdicts = tuple(Verdict(f.id, f.gain, f.q_value, kept.removed[f.id]) for f in lost)
     return replace(kept, verdicts=(*verdicts, *state.verdicts))

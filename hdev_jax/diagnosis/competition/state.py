@@ -3,12 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from jaxtyping import Float
+
 from hdev_jax.diagnosis.candidates.unnamed import Term
 from hdev_jax.diagnosis.gates.rejection import Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.inference import Calibration
+from hdev_jax.inference.states import Switching
 
-__all__ = ["Found", "State", "Verdict"]
+__all__ = ["Found", "Hidden", "State", "Verdict"]
 
 
 @dataclass(frozen=True)
@@ -45,13 +49,24 @@ class Verdict:
     by_rows: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """The loads with a hidden state that the vehicle has: their ids, the model that decodes them, and the share of
+    each training row that each is on."""
+
+    ids: tuple[str, ...]
+    model: Switching
+    on: Float[np.ndarray, "row load"]
+
+
 @dataclass(frozen=True)
 class State:
     """The vehicle as fitted so far, the effects found in order, and the verdicts on all others.
 
     `terms` are those without a name; `removed` says why added effects were removed again; `refused` passed the gates of
     their scores but not the later ones, and are tried again only before the end; `tested` are exchanges of two that
-    were tried; `trail` holds the values of fits by the effects that they had.
+    were tried; `trail` holds the values of fits by the effects that they had; `hidden` are the loads whose states were
+    decoded.
     """
 
     fit: Calibration
@@ -64,6 +79,7 @@ class State:
     tested: tuple[str, ...] = ()
     trail: Mapping[str, list[float]] = field(default_factory=dict)
     finished: bool = False
+    hidden: Hidden | None = None
 
     @property
     def barred(self) -> frozenset[str]:

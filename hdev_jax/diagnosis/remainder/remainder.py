@@ -59,7 +59,7 @@ class Formula:
 
 def remainder(
     problem: Problem, split: Split, predicted: np.ndarray, declared: np.ndarray, formula: Formula | None,
-    settings: Settings, *, seed: int, tell: Callable[[str], None] = lambda _: None,
+    settings: Settings, *, given: np.ndarray, seed: int, tell: Callable[[str], None] = lambda _: None,
 ) -> Remainder:  # fmt: skip
     """Five tests of the residual: the term without a name that passed the gates of the search, a flexible learner
     validated by trip, periods, change points, random intercepts of trips.
@@ -68,10 +68,11 @@ def remainder(
     only where cross-validation over training clusters confirms it. The others are tests against coloured noise. What
     is reported is measured on test rows; `rms` is of training rows alone.
 
-    **Arguments:** predictions of the model with the found effects and of the declared one on every row of the log.
+    **Arguments:** predictions of the model with the found effects and of the declared one on every row of the log, and
+    `given` the decoded states of its loads, of which the residual is (the first where it has none).
     """
     columns, names = features(problem, predicted, declared)
-    train, test = (side(problem, problem.rows(trips), predicted, columns) for trips in (split.train, split.test))
+    train, test = (side(problem, problem.rows(trips), given, columns) for trips in (split.train, split.test))
     tell("what remains: a flexible learner, validated by trip")
     correction, share_train, p_learner, order = learn(train, test, names, seed)
     share = share_of(test.residual, correction)
@@ -83,6 +84,8 @@ def remainder(
     change = change_point(white, train.trip, settings)
     levels = levels_of(train, train.residual, settings)  # a common offset is part of them, and is separated below
     rmse = float(np.sqrt(np.mean(test.residual**2)))
+    # what switches is in no other channel of the log: it stays in the free run's error
+    hidden = float(np.mean((problem.measured - predicted)[problem.rows(split.test)] ** 2)) - rmse**2
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     parts: list[str] = []
     depends: list[str] = []
@@ -94,7 +97,7 @@ def remainder(
     if formula is not None:
         floor = min(floor, after)
         depends += formula.channels
-        added = (formula.predicted - predicted)[problem.rows(split.train)]
+        added = (formula.predicted - given)[problem.rows(split.train)]
         sizes.append(float(np.sqrt(np.mean(added**2))))
         error = f"test RMSE {rmse:.4g} → {after:.4g} {problem.unit}"
         parts.append(f"it follows {formula.words}, which is no effect of the library ({error})")
@@ -129,6 +132,7 @@ def remainder(
     elif mean and levels is not None and levels.significant:
         sizes.append(abs(mean))
         parts.append(f"an offset of about {mean:+.2g} {problem.unit} that all trips share")
+    floor = float(np.sqrt(floor**2 + max(hidden, 0.0)))
     grows = scales_with(train, settings) if parts else None
     if grows is not None:
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")

@@ -9,11 +9,12 @@ import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, realised
 from hdev_jax.diagnosis.candidates.unnamed import Factor, Term, describing
-from hdev_jax.diagnosis.competition.state import Found, State, Verdict
+from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration, Coefficient, ParameterTable
+from hdev_jax.inference.states import Switching
 from hdev_jax.physics import Effect, Vehicle
 
 __all__ = ["from_plain", "to_plain"]
@@ -38,6 +39,9 @@ def to_plain(state: State) -> dict[str, Any]:
         "tested": list(state.tested),
         "trail": dict(state.trail),
         "finished": state.finished,
+        "hidden": None
+        if state.hidden is None
+        else {"ids": list(state.hidden.ids), "model": dict(vars(state.hidden.model)), "on": state.hidden.on},
     }
 
 
@@ -67,7 +71,15 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, training: Training) 
         tuple(plain["tested"]),
         dict(plain["trail"]),
         bool(plain["finished"]),
+        _hidden(plain["hidden"]),
     )
+
+
+def _hidden(plain: Mapping[str, Any] | None) -> Hidden | None:
+    if plain is None:
+        return None
+    model: dict[str, Any] = {**plain["model"], "base_w": float(plain["model"]["base_w"])}
+    return Hidden(tuple(plain["ids"]), Switching(**model), plain["on"])
 
 
 def _held(table: ParameterTable, vehicle: Vehicle) -> ParameterTable:

@@ -9,6 +9,7 @@ from scipy import stats
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.remainder.remainder import Remainder
+from hdev_jax.diagnosis.result.hidden import Given, errors_by_knowledge, state_block
 from hdev_jax.diagnosis.result.intervals import Open
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Calibration, cluster_rows
@@ -128,8 +129,10 @@ def summarise(
     left: Remainder,
     leeway: Mapping[str, Mapping[str, Open]],
     settings: Settings,
+    given: Given | None = None,
 ) -> dict[str, Any]:
-    """The contract's diagnosis.json. `leeway`: by effect and parameter, what is left open."""
+    """The contract's diagnosis.json. `leeway`: by effect and parameter, what is left open; `given`: the decoded states
+    of loads that switch."""
     weight, y = problem.weight(), problem.measured
     train, test = problem.rows(split.train), problem.rows(split.test)
 
@@ -147,6 +150,7 @@ def summarise(
         {
             **_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count, settings.most_in_class),
             "order": k + 1,
+            **({"state": state_block(problem, split, given, f.id)} if given and f.id in given.ids else {}),
         }
         for k, f in enumerate(state.found)
     ]
@@ -172,7 +176,7 @@ def summarise(
             "unused_trips": split.names(split.unused),
         },
         "before": block(predicted[0]),
-        "after": block(predicted[-1]),
+        "after": {**block(predicted[-1]), **(errors_by_knowledge(problem, split, given) if given else {})},
         "baseline": {"parameters": baseline_block(steps[0], state.absorbs)},
         "effects": effects,
         "candidates": candidates,

@@ -1,0 +1,133 @@
+"""Loads with a hidden state, on all rows of the log: errors by what they may know, and what each load took.
+
+Three errors are kept apart. The *free run* knows no measured power: a load has its expected share of time on. *One step
+ahead* knows the rows before: the filtered state, carried on by one row. *Given the states* knows the trip's measured
+power, this row's included: it explains and does not predict.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from scipy import stats
+
+from hdev_jax.diagnosis.competition.state import State
+from hdev_jax.diagnosis.competition.switching import residual_w
+from hdev_jax.inference import Calibration
+from hdev_jax.inference.states import Switching, decode, energy_draws, fit_switching, rows_of, shares_of
+from hdev_jax.physics.states import KNOTS_C, state_channel
+from hdev_jax.problem import Problem, Split, metrics
+from hdev_jax.segments import Segments, trip_slices
+from hdev_jax.targets import TARGETS
+
+__all__ = ["Given", "errors_by_knowledge", "given_states", "state_block"]
+
+DRAWS = 40
+NEAR_C = 5.0  # a temperature is reported where the training trips have one as near
+LEAST_S = 600.0  # of time there
+
+
+@dataclass(frozen=True)
+class Given:
+    """The log's rows with the decoded states (`segments`), predictions given them and one step ahead, the model that
+    decoded them, and the energy of each load in each trip [kWh]: mean, 5 % and 95 %."""
+
+    segments: Segments
+    predicted: np.ndarray
+    ahead: np.ndarray
+    ids: tuple[str, ...]
+    model: Switching
+    kwh: dict[str, dict[str, list[float]]]
+
+
+def given_states(problem: Problem, split: Split, state: State, fit: Calibration, seed: int) -> Given | None:
+    """The states on every row of the log by what was fitted to the training trips; None where nothing is hidden."""
+    if state.hidden is None or not state.hidden.ids:
+        return None
+    ids, seconds = state.hidden.ids, np.asarray(problem.segments.duration_s)
+
+    def told(on: np.ndarray) -> Segments:
+        return problem.segments.with_channels(**{state_channel(i): on[:, k] for k, i in enumerate(ids)})
+
+    off = told(np.zeros((len(seconds), len(ids))))
+    left = residual_w(problem.target, problem.measured - problem.predict(fit.vehicle, off), seconds)
+    rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
+    power = np.array([float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids])
+    model, _ = fit_switching(state.hidden.model, rows.take(problem.rows(split.train)), 1)
+    decoded = decode(model, rows)
+    where = told(decoded.on)
+    error = decoded.error_w / residual_w(problem.target, np.ones(len(seconds)), seconds)
+    kwh: dict[str, dict[str, list[float]]] = {i: {} for i in ids}
+    drawn = energy_draws(replace(model, power_w=power), rows, key=jax.random.key(seed), draws=DRAWS) / 1e3
+    errors = {c.path: float(e) for c, e in zip(fit.table.free, fit.errors, strict=True)}
+    rng = np.random.default_rng(seed)
+    trips = [problem.log.trip_names[t] for t, _ in trip_slices(rows.trip)]
+    for k, i in enumerate(ids):
+        wide = 1.0 + rng.standard_normal(DRAWS) * errors.get(f"effects.{i}.power_w", 0.0) / max(power[k], 1e-9)
+        each = drawn[:, k, :] * wide[:, None]
+        low, high = np.quantile(each, (0.05, 0.95), axis=0)
+        kwh[i] = {
+            t: [float(m), float(a), float(b)]
+            for t, m, a, b in zip(trips, drawn[:, k].mean(axis=0), low, high, strict=True)
+        }
+    return Given(
+        where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, told(decoded.ahead)) + error, ids,
+        model, kwh,
+    )  # fmt: skip
+
+
+def state_block(problem: Problem, split: Split, given: Given, effect_id: str) -> dict[str, Any]:
+    """What the contract's `state` of an effect holds: power, share of time on by temperature, dwell times, energy."""
+    k = given.ids.index(effect_id)
+    model, train = given.model, problem.rows(split.train)
+    on = np.asarray(given.segments.channels[state_channel(effect_id)])
+    rows = rows_of(problem.segments, np.zeros(len(on)), samples=True)
+    seconds = rows.duration_s
+    share = float(np.sum((seconds * on)[train]) / np.sum(seconds[train]))
+    memory = float(model.memory_s[k])
+    test = problem.rows(split.test)
+    per_kwh = TARGETS[problem.target].per_kwh or np.inf
+    total = float(np.sum((problem.measured * problem.weight())[test])) / per_kwh
+    return {
+        "power_w": float(model.power_w[k]),
+        "share_on": _shares(rows.take(train), on[train], share),
+        "mean_share_on": share,
+        "dwell_on_s": memory / max(1.0 - share, 1e-3),
+        "dwell_off_s": memory / max(share, 1e-3),
+        "kwh_by_trip": given.kwh[effect_id],
+        "share_of_test_energy": float(sum(given.kwh[effect_id][t][0] for t in split.names(split.test)) / total)
+        if abs(total) > 0
+        else None,
+    }
+
+
+def _shares(rows: Any, on: np.ndarray, share: float) -> list[list[float]]:
+    """Temperature, share of time on, 5 % and 95 % by the jackknife over trips; where the trips were so warm or cold."""
+    if not rows.has_temperature:
+        return []
+    best, trips = shares_of(rows, on), np.unique(rows.trip)
+    each = np.stack([shares_of(rows.take(m), on[m]) for t in trips if (m := rows.trip != t).any()] or [best])
+    n = len(each)
+    sd = np.sqrt((n - 1) / n * np.sum((each - each.mean(axis=0)) ** 2, axis=0))
+    half = sd * float(stats.t.ppf(0.95, max(n - 1, 1)))
+    out = []
+    for c, x, h in zip(KNOTS_C, best, half, strict=True):
+        if np.sum(rows.duration_s[np.abs(rows.temp_c - c) <= NEAR_C]) >= LEAST_S:
+            out.append([c, float(x), float(max(x - h, 0.0)), float(min(x + h, 1.0))])
+    return out
+
+
+def errors_by_knowledge(problem: Problem, split: Split, given: Given) -> dict[str, dict[str, Any]]:
+    """METRICS on the held-out test trips one step ahead and given the states."""
+    y, weight = problem.measured, problem.weight()
+
+    def of(predicted: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
+        return metrics(y[rows], predicted[rows], weight[rows])
+
+    test, trips = problem.rows(split.test), {problem.log.trip_names[i]: problem.rows([i]) for i in split.test}
+    return {
+        "one_step": of(given.ahead, test),
+        "given_states": of(given.predicted, test),
+        "given_states_by_trip": {name: of(given.predicted, rows) for name, rows in trips.items()},
+    }

@@ -1,0 +1,133 @@
+"""Loads that switch, decoded from made-up residuals whose states are known."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import signal
+
+from hdev_jax.inference.states import StateRows, Switching, decode, energy_draws, errors_alone, fit_switching, shares_of
+
+TRIPS, SECONDS = 6, 1800
+
+
+def residual(powers, *, row_s=1.0, noise_w=1500.0, kept=0.5, base_w=-2000.0, seed=0, shares=(0.3, 0.45), dwell_s=90.0):
+    """Rows with on/off loads: their residual, and the share of each row that each load is on."""
+    rng = np.random.default_rng(seed)
+    per = int(row_s)
+    on = np.zeros((TRIPS * SECONDS, len(powers)))
+    for trip in range(TRIPS):
+        for k, share in zip(range(len(powers)), shares, strict=False):
+            t, state = 0, rng.random() < share
+            while t < SECONDS:
+                length = max(1, round(rng.exponential(dwell_s if state else dwell_s * (1 - share) / share)))
+                on[trip * SECONDS + t : trip * SECONDS + min(t + length, SECONDS), k] = state
+                t, state = t + length, not state
+    on = on.reshape(-1, per, len(powers)).mean(axis=1)
+    n = len(on)
+    error = signal.lfilter([np.sqrt(1 - kept**2)], [1.0, -kept], rng.normal(0.0, noise_w, n))
+    trip = np.repeat(np.arange(TRIPS), n // TRIPS)
+    rows = StateRows(
+        base_w + on @ np.asarray(powers) + error, trip, np.full(n, row_s), np.full(n, 15.0), np.zeros(n, int),
+        0.1 if row_s < 2 else 0.9,
+    )  # fmt: skip
+    return rows, on
+
+
+def start(*powers, base_w=0.0):
+    n = len(powers)
+    return Switching(np.array(powers), base_w, np.full(2, 2000.0), np.full((n, 4), 0.4), np.full(n, 60.0))
+
+
+@pytest.mark.parametrize(("powers", "row_s"), [((6000.0,), 1.0), ((8000.0, 20000.0), 1.0), ((8000.0,), 10.0)])
+def test_powers_shares_and_states_come_back(powers, row_s):
+    rows, on = residual(powers, row_s=row_s)
+    model, decoded = fit_switching(start(*(0.7 * p for p in powers)), rows, 12)
+    np.testing.assert_allclose(model.power_w, powers, rtol=0.08)
+    np.testing.assert_allclose(model.base_w, -2000.0, atol=300.0)
+    np.testing.assert_allclose(decoded.on.mean(axis=0), on.mean(axis=0), atol=0.03)
+    assert np.mean((decoded.on > 0.5) == (on > 0.5)) > 0.93
+    assert abs(np.mean(model.error_s) + row_s / np.log(0.5)) < 0.6 * row_s
+
+
+def test_expectation_maximisation_never_loses_likelihood():
+    rows, _ = residual((6000.0,))
+    model, last = start(3000.0), -np.inf
+    for _ in range(8):
+        model, decoded = fit_switching(model, rows, 1)
+        assert decoded.log_likelihood > last - 1.0  # the memory is by moments
+        last = decoded.log_likelihood
+
+
+def test_a_long_row_holds_the_share_of_time_that_a_load_is_on():
+    rows, on = residual((20000.0,), row_s=10.0, noise_w=300.0, kept=0.0)
+    model, decoded = fit_switching(start(15000.0), rows, 8)
+    partly = (on > 0.05) & (on < 0.95)
+    assert partly.sum() > 50
+    assert np.mean(np.abs(decoded.on - on)[partly]) < 0.1
+    energy, true = (float(np.sum(x) * 10.0 / 3600.0) for x in (decoded.on @ model.power_w, on * 20000.0))
+    assert abs(energy - true) < 0.02 * true
+
+
+def test_one_step_ahead_uses_the_rows_before_alone():
+    rows, _ = residual((6000.0,))
+    model = start(6000.0, base_w=-2000.0)
+    first = decode(model, rows)
+    later = rows.residual_w.copy()
+    later[1000:SECONDS] += 9000.0
+    again = decode(model, replace(rows, residual_w=later))
+    np.testing.assert_allclose(again.ahead[:1001], first.ahead[:1001], atol=1e-9)
+    np.testing.assert_allclose(again.error_w[:1001], first.error_w[:1001], atol=1e-6)
+
+
+def test_trips_are_sequences_of_their_own():
+    rows, _ = residual((6000.0,))
+    model = start(6000.0, base_w=-2000.0)
+    whole = decode(model, rows)
+    each = [decode(model, rows.take(rows.trip == t)) for t in range(TRIPS)]
+    np.testing.assert_allclose(np.concatenate([d.on for d in each]), whole.on, atol=1e-9)
+    assert abs(sum(d.log_likelihood for d in each) - whole.log_likelihood) < 1e-6 * abs(whole.log_likelihood)
+
+
+def test_energy_drawn_is_about_the_energy_decoded():
+    rows, _ = residual((6000.0, 15000.0))
+    model, decoded = fit_switching(start(6000.0, 15000.0), rows, 6)
+    drawn = energy_draws(model, rows, key=jax.random.key(0), draws=30)
+    mean = np.stack([(decoded.on[rows.trip == t] * model.power_w).sum(axis=0) / 3600.0 for t in range(TRIPS)], axis=1)
+    assert drawn.shape == (30, 2, TRIPS)
+    assert np.all(np.abs(drawn.mean(axis=0) - mean) < 5 * drawn.std(axis=0) / np.sqrt(30) + 0.01 * mean + 5.0)
+
+
+def test_the_share_on_falls_with_temperature_where_it_does():
+    rng = np.random.default_rng(1)
+    n = 40_000
+    temp = np.repeat(rng.uniform(0.0, 30.0, 400), 100)
+    on = (rng.random(n) < np.interp(temp, (0, 30), (0.8, 0.0))).astype(float)
+    rows = StateRows(np.zeros(n), np.zeros(n, int), np.full(n, 1.0), temp, np.zeros(n, int))
+    np.testing.assert_allclose(shares_of(rows, on), (0.8, 0.533, 0.267, 0.005), atol=0.05)
+
+
+@given(seconds=st.floats(0.5, 60.0), seed=st.integers(0, 50))
+def test_means_over_rows_keep_time_and_energy(seconds, seed):
+    rng = np.random.default_rng(seed)
+    n = 200
+    trip = np.sort(rng.integers(0, 3, n))
+    rows = StateRows(rng.normal(0, 1e3, n), trip, rng.uniform(0.2, 3.0, n), np.full(n, 15.0), np.zeros(n, int))
+    coarse = rows.coarse(seconds)
+    for t in np.unique(trip):
+        a, b = rows.take(trip == t), coarse.take(coarse.trip == t)
+        np.testing.assert_allclose(np.sum(b.duration_s), np.sum(a.duration_s))
+        np.testing.assert_allclose(np.sum(b.duration_s * b.residual_w), np.sum(a.duration_s * a.residual_w))
+
+
+@pytest.mark.parametrize("value", [0.0, 5000.0])
+def test_a_constant_residual_gives_numbers(value):
+    n = 500
+    rows = StateRows(np.full(n, value), np.zeros(n, int), np.ones(n), np.full(n, 15.0), np.ones(n, int))
+    model, decoded = fit_switching(start(1000.0), rows, 3)
+    assert np.all(np.isfinite(decoded.on))
+    assert np.all(np.isfinite(model.power_w))
+    assert all(np.isfinite(errors_alone(rows)))
