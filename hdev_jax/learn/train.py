@@ -32,7 +32,9 @@ class NotFiniteError(DivergedError):
     """A loss or its slope is NaN or infinite; the batch that it came from: `epoch`, `step` and `rows` of the data."""
 
     def __init__(self, epoch: int, step: int, rows: np.ndarray):
-        self.epoch, self.step, self.rows = epoch, step, rows
+        self.epoch: int = epoch
+        self.step: int = step
+        self.rows: np.ndarray = rows
         few = ", ".join(map(str, rows[:8])) + (", …" if len(rows) > 8 else "")
         super().__init__(
             f"training: the loss or its slope is not finite in epoch {epoch}, batch {step} (entries {few} of the "

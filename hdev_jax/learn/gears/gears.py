@@ -38,8 +38,8 @@ PLACE = "place_after_reference"
 _RELATIVE = (PLACE, "step_below", "step_above", "reference_gear", "gears", "power_over_rated", "grade_rad")
 # By what is known: the paper's three; with the vehicle's sheet; with the sheet and the slope of the road, where the
 # trees tell the distance from the reference gear.
-FEATURES = {"paper": _PAPER, "sheet": (*_PAPER, *_SHEET), "relative": (*_PAPER, *_RELATIVE)}
-EVERY = tuple(dict.fromkeys(n for names in FEATURES.values() for n in names))
+FEATURES: dict[str, tuple[str, ...]] = {"paper": _PAPER, "sheet": (*_PAPER, *_SHEET), "relative": (*_PAPER, *_RELATIVE)}
+EVERY: tuple[str, ...] = tuple(dict.fromkeys(n for names in FEATURES.values() for n in names))
 
 
 class Gearbox(eqx.Module):

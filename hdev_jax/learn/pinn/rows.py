@@ -54,7 +54,7 @@ _RAW = (
     "gear", DISTANCE_SINCE_START,
 )  # fmt: skip
 _COLUMNS = ("grade_rad", "ambient_temp_c", "wind_speed_mps", "wet_road", "curvature_1pm", "gear", DISTANCE_SINCE_START)
-FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
+FEATURES: dict[str, tuple[str, ...]] = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
 # Those that a coefficient may depend on: not the power that is asked for, nor how steep it is.
 PHYSICAL = ("froude", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3",
             "warmth", "cornering")  # fmt: skip
