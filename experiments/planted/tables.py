@@ -58,8 +58,8 @@ LEGEND = {  # of each table that is there; the first of every page
         "Right: the share of logs with the right answer, with Wilson's 95 % interval. That is: all and only what "
         "was planted (each by its id, or in a class of at most three); with nothing planted, no name; with a cause "
         "outside the library, no wrong name (a constant load is right for the mean of one that switches); where a "
-        "coefficient absorbs the effect, or only more trips could decide, that this is said. Met: the share, and "
-        "with a cause outside the library the share called unexplained, is at least the wanted one",
+        "coefficient absorbs the effect, or only more trips could decide, that this is said. Met: the share is at "
+        "least the wanted one{unexplained}",
         "False name: logs in which an effect is named that was not planted. Called unexplained: logs in which "
         "structure is left (random intercepts of trips count, though they are noise there)",
     ),
@@ -128,8 +128,15 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
                  for r in (*rows, *apart, *sized, *against)],
         "better_than_paper": 0, "of": 0,
         "skipped": skipped, "missed": missed,
-        "notes": [line.format(ar=config.ar_coefficient) for table in shown for line in LEGEND.get(table, ())],
+        "notes": [line.format(ar=config.ar_coefficient, unexplained=_unexplained_wanted(config, done))
+                  for table in shown for line in LEGEND.get(table, ())],
     }  # fmt: skip
+
+
+def _unexplained_wanted(config: Config, done: Group) -> str:
+    """What is wanted besides of logs with a cause outside the library; empty where there are none."""
+    wanted = [w for t, _ in done if (w := config.cases[t["case"]].wanted_unexplained) is not None]
+    return f" and, with a cause outside the library, {max(wanted):g} of logs are called unexplained" if wanted else ""
 
 
 def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 __all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "notes", "numbers"]
 
 DECIDES = "Deciding number of each row; median, least and most over all starts of its fit"
+MOST_MISSED = 4  # targets that lead a page one by one
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
 
@@ -89,14 +90,17 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
     said += _sentences(metrics.get("findings", []))
-    if metrics.get("missed"):
-        said.append(f"Target missed: {'; '.join(metrics['missed'])}.")
+    if missed := metrics.get("missed"):
+        few = len(missed) <= MOST_MISSED
+        said.append(f"Target missed: {'; '.join(missed)}." if few else f"{len(missed)} targets missed: see the notes.")
     return said
 
 
 def notes(metrics: Mapping[str, Any]) -> list[str]:
     """What a reader needs for the tables and figures of a run."""
     said = _sentences(metrics.get("notes", []))
+    if len(missed := metrics.get("missed", [])) > MOST_MISSED:
+        said.append(f"Target missed: {'; '.join(missed)}.")
     if metrics.get("tasks_in_one_program"):
         said.append(f"{metrics['tasks_in_one_program']} tasks ran side by side in one program.")
     return said
