@@ -1,4 +1,4 @@
-"""The one training loop, of every network here: batches drawn anew each epoch, the whole epoch one compiled program.
+"""The one training loop, of every network here: new batches each epoch, the whole epoch one compiled program.
 
 What is trained is a pytree of weights; what is carried from batch to batch besides (running means of a batch
 normalisation) is its memory. Several members with starts, keys and settings of their own train in one program

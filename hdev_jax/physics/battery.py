@@ -245,8 +245,8 @@ class StepChange(Effect):
 class ModeChange(Effect):
     """A second mode that holds in some trips: a load, a rolling resistance, a loss, or regeneration that is weaker.
 
-    Which trips is sought, not declared; on a trip that nobody has fitted (`in_mode` NaN) it weighs as often as it was
-    seen.
+    The trips are searched for, not declared; on a trip outside the fit (`in_mode` NaN) z is the share of trips in the
+    mode.
     """
 
     id: ClassVar[str] = "mode_change"

@@ -151,7 +151,7 @@ class CabinWarmup(Effect):
 class PeriodicLoad(Effect):
     """A load that switches on and off: P while cos(2π(t/T + φ)) > cos(πD).
 
-    φ may differ from trip to trip; where it is not known (NaN), as on a trip that nobody has fitted, the load is its
+    φ may differ from trip to trip; where it is not known (NaN), as on a trip outside the fit, the load is its
     mean P·D.
     """
 

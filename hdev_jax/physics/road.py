@@ -170,7 +170,7 @@ class Headwind(Effect):
 
 
 class AirDensity(Effect):
-    """Drag with the density that temperature and altitude tell, where none is logged: s·(ρ/ρ₀ − 1)·½ρ₀C_dA·v²."""
+    """Drag with the air density of temperature and altitude, where none is logged: s·(ρ/ρ₀ − 1)·½ρ₀C_dA·v²."""
 
     id: ClassVar[str] = "air_density"
     label: ClassVar[str] = "air density"

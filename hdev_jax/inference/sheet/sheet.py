@@ -33,7 +33,7 @@ class Sheet:
 
     **Arguments:** `sections`, the keys of a sheet; a number is known, `(value, sd)` or `{"value": …, "sd": …}` a
     tabular prior: it is estimated. `library`, the effects that `effects` may name; `path`, the file that it stands in,
-    beside which an efficiency map is sought.
+    beside which an efficiency map is looked for.
 
     **Fields:** `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`); `gear_ratios` count
     from the first gear; `map_path` is where `efficiency_map` came from. **Raises:** `InputError`, one line with key,
