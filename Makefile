@@ -28,8 +28,11 @@ lint: $(READY)
 	@$(PY) -m ruff check .
 	@$(PY) -m ruff format --check .
 
+# Then whether every public name has a type; its long list is shown only where one has none.
 types: $(READY)
 	@$(PY) -m pyright
+	@found=$$(PATH="$(CURDIR)/$(VENV)/bin:$$PATH" PYTHONPATH=. \
+	    $(PY) -m pyright --verifytypes hdev_jax --ignoreexternal) || { echo "$$found"; exit 1; }
 
 # The site, into out/site: runs the notebooks, draws the effects, checks every link between its pages.
 docs: export NO_MKDOCS_2_WARNING := 1

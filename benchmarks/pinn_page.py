@@ -11,11 +11,11 @@ SIDES = {"ours": "ours", "cpu": "ours, on the processor", "loop": "plain JAX loo
 
 
 def page(out: Mapping[str, Any], limits: Mapping[str, float], command: str) -> str:
-    """The page, with what was wanted beside what was measured."""
+    """The page, with targets beside what was measured."""
     lines = [
         "# Networks with physics: speed", "",
         f"Made by `{command}` on {out['device']}, {out['cores']} cores, float32; load of the machine before it",
-        f"{out['load']:.1f}. Synthetic rows. Sides take an epoch each by turns; numbers are of the median epoch,",
+        f"{out['load']:.1f}. Synthetic rows. The programs take turns, one epoch each; numbers are of the median epoch,",
         "without compiling. PyTorch has the same network, batch and loss"
         + (f" (relative difference of both losses {out['same_loss']:.0e})." if "same_loss" in out else "."), "",
     ]  # fmt: skip
@@ -29,11 +29,11 @@ def page(out: Mapping[str, Any], limits: Mapping[str, float], command: str) -> s
                           if f"{part}_dropout_{dropout}_{side}_per_s" in out]  # fmt: skip
         lines += [
             "", "550,000 rows of which 70 % train, 100 epochs as long as the median one, with dropout: "
-            f"{out['paper_minutes']:.1f} minutes ({limits['paper_minutes']:g} wanted).",
+            f"{out['paper_minutes']:.1f} minutes (target {limits['paper_minutes']:g}).",
             "", _why(out, limits["over_loop"]), "",
         ]  # fmt: skip
     if "many_rows_s" in out:
-        lines += ["## Inference", "", "| what | measured | wanted |", "|---|---:|---:|"]
+        lines += ["## Inference", "", "| what | measured | target |", "|---|---:|---:|"]
         lines += [
             f"| one row, called from Python, the model's numbers compiled in | {out['ready_one_row_us']:.0f} µs | "
             f"{limits['ready_one_row_us']:g} µs |",
@@ -46,7 +46,7 @@ def page(out: Mapping[str, Any], limits: Mapping[str, float], command: str) -> s
         lines += [f"| {k.split('_')[1]} | {v:.2f} |" for k, v in out.items()
                   if k.startswith("members_") and k.endswith("_us") and "cpu" not in k]  # fmt: skip
         lines += ["", f"A grid of 75 weights and 3 seeds, 100 epochs each at the pace of 16 members: "
-                      f"{out['grid_minutes']:.1f} minutes ({limits['grid_minutes']:g} wanted)."]  # fmt: skip
+                      f"{out['grid_minutes']:.1f} minutes (target {limits['grid_minutes']:g})."]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -63,10 +63,10 @@ def _why(out: Mapping[str, Any], wanted: float) -> str:
     step = {side: 1024e3 / out[f"whole_dropout_0.1_{side}_per_s"] for side in ("ours", "loop")}
     over = step["loop"] / step["ours"]
     if over >= wanted:
-        return f"A step called from Python takes {over:.1f} times ours ({wanted:g} wanted)."
+        return f"A step called from Python takes {over:.1f} times ours (target {wanted:g})."
     return (
         f"A step takes {step['ours']:.2f} ms in ours and {step['loop']:.2f} ms when Python draws the batch and calls "
-        f"it: {over:.2f} times, {wanted:g} wanted. Both do the same arithmetic, and with this network it is nearly all "
+        f"it: {over:.2f} times, target {wanted:g}. Both do the same arithmetic, and with this network it is nearly all "
         f"of a step: what the loop adds, {step['loop'] - step['ours']:.2f} ms, would have to be {wanted - 1:g} times "
         "the arithmetic."
     )

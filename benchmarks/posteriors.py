@@ -26,7 +26,7 @@ __all__ = ["main"]
 
 DOC = Path(__file__).parents[1] / "docs" / "posteriors.md"
 WHAT = ("recursive", "fleet", "kernel", "rows")
-HEAD = ["| synthetic data | compiling [s] | measured | besides | wanted |", "|---|---:|---:|---:|---:|"]
+HEAD = ["| synthetic data | compiling [s] | measured | besides | target |", "|---|---:|---:|---:|---:|"]
 CONVERGED = 1.1  # R-hat above which draws say nothing of a speed or a mean
 TABLE = (("road.c_rr", "1", 0.006, 0.0008), ("road.cda_m2", "m²", 5.6, 0.5))
 

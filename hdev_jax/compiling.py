@@ -1,6 +1,6 @@
 """How XLA compiles: quickly where a log is small, and once: compiled programs are kept between commands.
 
-A search compiles the vehicle anew for every effect that it adds. With an efficiency map and a log of 2,000 rows that
+A search compiles the vehicle again for every effect that it adds. With an efficiency map and a log of 2,000 rows that
 is three quarters of the time, and programs that are not optimised bring the answer 2.6 times sooner; of a log of 40,000
 rows both take as long. Results differ in the last bits of a double.
 """

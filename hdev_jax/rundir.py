@@ -18,6 +18,7 @@ import time
 import tomllib
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +38,15 @@ __all__ = ["Run", "atomic_file", "config_digest", "is_complete", "open_run"]
 _CONFIG, _ENVIRONMENT, _CHECKPOINTS, _DIGEST = "config.toml", "environment.json", ".checkpoints", "config_sha256"
 
 
+@dataclass(eq=False)
 class Run:
-    """One run of a command. `open_run` makes it.
+    """One run of a command. `open_run` makes it."""
 
-    - `out`: the folder that the user named. `work`: where files are written, `DIR.partial` (`out` when `done`).
-    - `done`: `out` already holds the complete result of this configuration; there is nothing to do.
-    - `config`: the resolved configuration, plain values, as in `config.toml`. `digest`: its fingerprint.
-    """
-
-    def __init__(self, out: Path, work: Path, config: dict[str, Any], digest: str, done: bool):
-        self.out, self.work, self.config, self.digest, self.done = out, work, config, digest, done
+    out: Path  # the folder that the user named
+    work: Path  # where files are written: `DIR.partial`, or `out` when `done`
+    config: dict[str, Any]  # resolved, plain values, as in `config.toml`
+    digest: str  # fingerprint of the configuration
+    done: bool  # `out` holds the complete result of this configuration: there is nothing to do
 
     def path(self, *parts: str) -> Path:
         """A file in the run's folder; the folders above it are made."""

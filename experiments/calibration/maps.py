@@ -1,7 +1,7 @@
 """An efficiency map learned from a log of the synthetic fleet, against the true one, cell by cell of its grid.
 
 The vehicle is the true one but for its map, of which the learner knows the grid. A cell's error is the mean over its
-rows of the learned less the true efficiency at their operating points. Three logs of each vehicle: with noise on the
+rows of the learned minus the true efficiency at their operating points. Three logs of each vehicle: with noise on the
 energy alone, with every instrument as the fleet has it (speed, slope, a target that is late, dropouts), and with a
 sheet's vehicle in place of the true one, which lacks what the fleet hides from its sheets.
 """
@@ -116,7 +116,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         }  # fmt: skip
         lines.append({"name": name, "paper": None, "ours": ours})
         if task["log"] in config.asked_of and ours["within"] < 1.0:
-            missed.append(f"{name}: worst cell {ours['worst_percent']:.2f} %, {100 * config.within:g} wanted")
+            missed.append(f"{name}: worst cell {ours['worst_percent']:.2f} %, target {100 * config.within:g}")
         if not r["converged"]:
             missed.append(f"{name}: not converged")
     write_tables(run, "maps", [{"vehicle and log": r["name"], **r["ours"]} for r in lines], config.caption)
@@ -125,11 +125,11 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": lines, "missed": missed,
         "better_than_paper": 0, "of": 0,
         "notes": [
-            f"asked: every cell within {100 * config.within:g} % of the logs with {' and with '.join(config.asked_of)}",
-            f"cells of the map's grid (gear, speed, torque) with {config.least_rows} rows or more; an error is the "
-            "mean over the rows, in % points of efficiency, of learned less true at the points that the log shows",
-            "the learner knows the vehicle but for its map, the mass by trip and the grid; the sheet's vehicle lacks "
-            "all that the fleet hides, which its map then takes up",
+            f"Target: every cell within {100 * config.within:g} % on logs with {' and with '.join(config.asked_of)}",
+            f"A cell of the map's grid (gear, speed, torque) counts from {config.least_rows} rows; its error is the "
+            "mean over its rows of learned minus true efficiency, in percentage points",
+            "The fit knows the mass of each trip, the map's grid and all of the vehicle but its map; the sheet's "
+            "vehicle lacks every effect that the fleet hides, and its map absorbs them",
         ],
     }  # fmt: skip
 
@@ -148,7 +148,7 @@ def _figure(run: Run, results: Any, within: float) -> None:
         ax.set_xlabel("motor torque, % of the highest")
         ax.set_title(log.replace(", the", ",\nthe"))
         if k == 1:
-            ax.set_ylabel("learned less true efficiency, % points")
+            ax.set_ylabel("learned minus true efficiency [% points]")
         if k == len(logs):
             ax.legend(fontsize=6, loc="upper right")  # of the three, the panel with room
         ax.axhline(0.0, color=AFTER, linewidth=0.6)

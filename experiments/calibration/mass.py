@@ -180,22 +180,22 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
                     "sd": float(spread[1]), "c_rr": r["c_rr"][0]}  # fmt: skip
             low, high = config.slope_kg
             if not low <= line[1] <= high:
-                missed.append(f"{task['model']}: {line[1]:.0f} kg a passenger, {low:g} to {high:g} wanted")
-            lines.append({"data": f"{task['model']}, measured, missions held out", **ours})
+                missed.append(f"{task['model']}: {line[1]:.0f} kg a passenger, target {low:g} to {high:g}")
+            lines.append({"data": f"{task['model']}, measured, held-out missions", **ours})
             drawn.append((task["model"], against, mass, line))
         rows.append({"name": task["model"], "paper": None, "ours": ours})
     if every and np.median(every) > config.within_percent:
-        missed.append(f"fleet: {np.median(every):.1f} % in the median, {config.within_percent:g} wanted")
+        missed.append(f"fleet: {np.median(every):.1f} % in the median, target {config.within_percent:g}")
     write_tables(run, "mass", lines, config.caption)
     _figure(run, results, drawn)
-    note = f"fleet: {np.median(every):.2f} % in the median over {len(every)} trips" if every else "no fleet"
-    notes, shares = [note], [100.0 * line["inside_90"] for line in lines if "inside_90" in line]
+    said = [f"Fleet: median error {np.median(every):.2f} % over {len(every)} trips"] if every else []
+    shares = [100.0 * line["inside_90"] for line in lines if "inside_90" in line]
     if shares:
-        low = ": what the sheet lacks goes by trip and is not all in them" if min(shares) < 85.0 else ""
-        notes.append(f"intervals of 90 % hold the true mass in {min(shares):.0f} to {max(shares):.0f} % of trips{low}")
+        low = "; they do not cover all that the sheet lacks and that differs by trip" if min(shares) < 85.0 else ""
+        said.append(f"90 % intervals hold the true mass in {min(shares):.0f} to {max(shares):.0f} % of trips{low}")
     return {
         "artefact": config.artefact, "data": "synthetic fleet; ztbus where the row says measured", "synthetic": True,
-        "rows": rows, "better_than_paper": 0, "of": 0, "missed": missed, "notes": notes,
+        "rows": rows, "better_than_paper": 0, "of": 0, "missed": missed, "findings": said,
     }  # fmt: skip
 
 

@@ -171,7 +171,10 @@ def _fleet(task: dict[str, Any], rng: np.random.Generator, key: Any) -> tuple[Wo
     for k, c in enumerate(table.free):
         for name, true in (("mean", mean), ("spread", spread)):
             truth[f"{name} of {_short(c)}"], found[f"{name} of {_short(c)}"] = true[k], _thin(draws, name)[:, k]
-        truth[f"{_short(c)} of one"], found[f"{_short(c)} of one"] = theta[0, k], _thin(draws, "theta")[:, 0, k]
+        truth[f"{_short(c)} of one vehicle"], found[f"{_short(c)} of one vehicle"] = (
+            theta[0, k],
+            _thin(draws, "theta")[:, 0, k],
+        )
     return truth, found
 
 
@@ -228,8 +231,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         middle = np.mean(np.abs(away) < 0.45 * (DRAWS + 1))
         ours = {"worlds": len(values), **ps, "in_middle_90": float(middle), "mean_rank": float(np.mean(values))}
         rows.append({"name": f"{kind}, {name}", "paper": None, "ours": ours})
-        lines.append({"posterior": kind, "coefficient": name, "worlds": len(values), "p of the histogram": ps["p"],
-                      "of the mean": ps["p_mean"], "of the spread": ps["p_spread"], "in the middle 90 %": middle,
+        lines.append({"posterior": kind, "coefficient": name, "worlds": len(values), "p, histogram": ps["p"],
+                      "p, mean": ps["p_mean"], "p, spread": ps["p_spread"], "in the middle 90 %": middle,
                       "mean rank": np.mean(values)})  # fmt: skip
     tests = [r["ours"][k] for r in rows for k in ("p", "p_mean", "p_spread")]
     least, passed = min(tests), min(tests) * len(tests) > LEAST_P
@@ -239,12 +242,14 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "artefact": config.artefact, "data": "synthetic", "synthetic": True, "rows": rows,
         "better_than_paper": 0, "of": 0, "logs": sum(len(next(iter(result.values()))) for _, result in results),
         "missed": [] if passed else [f"ranks that are not uniform: p {least:.2g} among {len(tests)} tests"],
-        "notes": [
-            f"{DRAWS} draws of each world, {APART} apart in a chain: the rank is a number from 0 to {DRAWS}.",
+        "findings": [
             f"{'Passed' if passed else 'Not passed'}: the least p of {len(tests)} tests is {least:.2g}; below "
-            f"{LEAST_P / len(tests):.1g} it would be beyond chance at {100 * LEAST_P:.0f} %.",
-            "Noise and the size that it grows with are believed before the rows are seen; where they are not given, "
-            "hdev takes both from the same rows.",
+            f"{LEAST_P / len(tests):.1g} it would be significant at {100 * LEAST_P:.0f} %",
+        ],
+        "notes": [
+            f"{DRAWS} draws of each world, {APART} apart in a chain: ranks run from 0 to {DRAWS}",
+            "The prior of the noise, and the size that the noise grows with, are fixed before the rows are seen; hdev, "
+            "where they are not given, takes both from the same rows",
         ],
     }  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What the loop does on the measured logs: `python -m experiments.measured.logs [PART …] --work DIR`, from a checkout.
+"""The diagnosis on measured logs: `python -m experiments.measured.logs [PART …] --work DIR`, from a checkout.
 
 Parts: niro (trained on each trip in turn), road (the Niro's force balance), ztbus (three folds of missions), withheld
 (a known channel of ZTBus taken out of the log). Each run is one `hdev diagnose`; a run that is there already is read,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from experiments.measured import figures
+from experiments.measured.compared import changes, fold_and_what, new_names, withheld
 from experiments.measured.tables import (
     Runs,
     by_chance,
@@ -24,8 +25,8 @@ from experiments.measured.tables import (
     size_table,
     table,
 )
-from experiments.measured.told import changes, fold_and_what, new_names, withheld
 from experiments.measured.withheld import WITHHELD
+from experiments.runner.page import folded
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.report import names
 
@@ -36,23 +37,22 @@ FOLDER = "figures/real_logs"
 COLD_C = 12.0  # heating runs below: splits the missions of ZTBus into about a third and two thirds
 HEAD = """# Measured logs
 
-What the diagnosis finds in two public logs, how far that depends on the training trips, and what stays unexplained;
-with a channel taken out of the log, what it concludes without it. Made by
+What the diagnosis finds in two public logs, how far that depends on the training trips, and what stays unexplained.
+Made by
 
     python -m experiments.measured.logs --work DIR --write
 
-from the diagnosis.json of each run. Everything here is measured. Every error is on held-out test trips, and predictions
-use no measured power (free run). Effects were added to the library with both logs in view, so this page does not show
-how the diagnosis does on a log that nobody has seen: planted_summary.md does, for synthetic ones. Cost is the wall
-clock of one run, compiling included, on a shared machine, and its peak memory."""
+from the diagnosis.json of each run. All data are measured. Every error is on held-out test trips, and predictions use
+no measured power (free run). The library was extended while looking at both logs, so errors on a new log may be larger;
+planted_summary.md has synthetic logs from seeds not used in development. Cost is the wall-clock time of one run,
+compiling included, on a shared machine, and its peak memory."""
 READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with what was found.
-- *found*: the loop added the effect. *one of a class*: it added one of several that this log cannot tell apart.
-- The number behind it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
-  the share in which it, or its class, comes first of its kind when its turn comes.
-- Sizes are as in diagnosis.json with their standard deviation. *furthest apart*: the largest difference between two
-  training sets, in standard deviations of that difference as if the two were independent. Sizes *agree* where that is
-  no more than equal ones differ by in 95 % of cases, by the number of sets {chance} (Tukey's
-  studentized range)."""
+- *found*: the diagnosis added the effect. *one of a class*: it added one of several that this log cannot distinguish.
+- The number after it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
+  the share in which the effect, or its class, is again the best of its kind.
+- Sizes are as in diagnosis.json with their standard deviation. *largest difference*: between two training sets, in
+  standard deviations of the difference as if the two were independent. Sizes *agree* where it is at most what equal
+  ones reach in 95 % of cases: {chance} sets (Tukey's studentized range)."""
 
 
 def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]) -> tuple[str, dict[str, bytes]]:
@@ -105,18 +105,16 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             within = ""
             if len(by_trip) > 1:
                 low, high = pooled_interval(by_trip)
-                within = f" (90 %: {low:.2f} to {high:.2f}, from how {len(by_trip)} test trips differ)"
-            found = (
-                f"Every one of them finds {named(always)}." if always else "There is no effect that all of them find."
-            )
+                within = f" (90 %: {low:.2f} to {high:.2f}, over {len(by_trip)} test trips)"
+            found = f"All find {named(always)}." if always else "No effect is found by all."
             if turned := [r for r in size_rows(runs) if len({np.sign(v) for _, v, _ in r.cells.values()}) > 1]:
                 said = names.verbose_join([" or ".join(f"`{p}`" for p in row.paths) for row in turned])
-                found += f" They do not agree on the sign of {said}."
+                found += f" The sign of {said} differs."
             if len(runs) > 1:
                 found += f" {_agreeing(runs)}"
             out.append(
                 f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. {found} "
-                f"In {open_} of {len(runs)} the loop says that something more is missing."
+                f"In {open_} of {len(runs)} the diagnosis reports unexplained structure."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)
@@ -125,7 +123,7 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
         new = new_names(r, full, {k: v for k, v in folds.items() if k != fold})
         a, b = r["after"]["test"]["rmse"], full["after"]["test"]["rmse"]
         rest = [signature(x["unexplained"]) for x in (r, full)]
-        says = f" Of the rest it says, without: {rest[0]}; with: {rest[1]}." if rest[0] != rest[1] else ""
+        says = f" Unexplained, without: {rest[0]}; with: {rest[1]}." if rest[0] != rest[1] else ""
         out.append(
             f"- **{WITHHELD[what][0].capitalize()} withheld** (fold {fold}): test RMSE {a:.2f} kW without, {b:.2f} "
             f"with; lost: {named(lost)}; new names: {named(new)}.{says}"
@@ -150,11 +148,18 @@ def _reading(runs: Runs) -> list[str]:
     return READING.format(draws=SETTINGS.resamples, clusters=clusters, chance=chance).splitlines()
 
 
+def _details(runs: Runs, head: str, caution: str) -> list[str]:
+    """How to read the tables, and every size, folded."""
+    sizes = [*size_table(runs, head), "", *_agreement(runs, caution)]
+    lines = folded("How to read this", "\n".join(_reading(runs)))
+    return [*lines, "", *folded("Every size", "\n".join(sizes)), ""]
+
+
 def _agreement(runs: Runs, caution: str) -> list[str]:
     """How many sizes agree between training sets, and which do not."""
     lines = [f"{_agreeing(runs)} {caution}"]
     if together := {k: r["together"] for k, r in runs.items() if r["together"]}:
-        lines += ["", "Coefficients that a training set knows together far better than one by one:", ""]
+        lines += ["", "Strongly correlated coefficients, by training set:", ""]
         lines += [f"- {k}: {line}." for k, said in together.items() for line in said]
     return lines
 
@@ -168,7 +173,7 @@ def _agreeing(runs: Runs) -> str:
     text += f"{close} {'agrees' if close == 1 else 'agree'}."
     if apart:
         said = names.verbose_join([f"{' or '.join(f'`{p}`' for p in r.paths)} ({r.furthest():.1f} sd)" for r in apart])
-        text += f" Further apart: {said}."
+        text += f" Differing more: {said}."
     return text
 
 
@@ -179,7 +184,7 @@ def _left_notes(runs: Runs) -> list[str]:
 
 def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
     lines = ["## Kia Niro: battery power from motor torque and speed", ""]
-    lines += ["The sheet declares two efficiencies. Trained on one trip, tested on the others, each trip in turn.", ""]
+    lines += ["The sheet declares two efficiencies. Each trip in turn is the training trip; the others are tested.", ""]
     rows = []
     for trip, r in runs.items():
         before, after = ([m["mse"] for m in r[when]["test_by_trip"].values()] for when in ("before", "after"))
@@ -188,6 +193,7 @@ def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
             [trip, f"{np.mean(before):.3f}", f"{np.mean(after):.4f}", str(r["parameters_fitted"]), f"{worst:+.2f} %",
              str(len(r["effects"])), _cost(r)]
         )  # fmt: skip
+    lines += _picture("niro_errors.png", "Kia Niro: test error before and after, by trip")[1:]
     lines += table(
         ["trained on trip", "before, mean test MSE [kW²]", "after", "parameters", "worst trip energy", "effects found",
          "cost"],
@@ -197,11 +203,9 @@ def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
         "",
         "The paper's network of 282 parameters, trained on trip 1 (its table VIII): 0.1604 in free run; LSTM 0.2322.",
     ]
-    lines += _picture("niro_errors.png", "Kia Niro: test error before and after, by trip")
-    lines += ["### Stability over training trips", "", *_reading(runs), "", *found_table(runs, "trip"), ""]
-    lines += [*size_table(runs, "trip"), ""]
-    lines += _agreement(runs, f"No two of the {len(runs)} training sets share a row.")
+    lines += ["", "### Stability over training trips", "", *found_table(runs, "trip")]
     lines += _picture("niro_sizes.png", "Kia Niro: sizes by training trip with 90 % bars")
+    lines += _details(runs, "trip", f"No two of the {len(runs)} training sets share a row.")
     lines += ["### What stays unexplained", "", *left_table(runs, "trained on trip", "kW"), *_left_notes(runs)]
     blocks = {
         f"trained on trip {trip}, tested on ": [
@@ -225,7 +229,7 @@ def _road(r: Mapping[str, Any]) -> tuple[list[str], dict[str, bytes]]:
     for name, m in {"all": {k: r[k]["test"] for k in ("before", "after")}, **r["subsets"]}.items():
         b, a = m["before"]["rmse"], m["after"]["rmse"]
         rows.append([name, str(m["after"]["n"]), f"{b:.1f}", f"{a:.1f}", f"{100 * (1 - a / b):.1f} %"])
-    lines += table(["rows of trips 2-4", "n", "before, RMSE [N]", "after", "less by"], rows)
+    lines += table(["rows of trips 2-4", "n", "before, RMSE [N]", "after", "reduction"], rows)
     lines += [
         "",
         f"Training trip: {r['before']['train']['rmse']:.0f} N before. Found: {named(found_ids(r))}. Cost: {_cost(r)}.",
@@ -254,18 +258,17 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
          str(len(r["effects"])), _cost(r)]
         for k, r in runs.items()
     ]  # fmt: skip
+    lines += _picture("ztbus_errors.png", "ZTBus: test error before and after, by mission")[1:]
     lines += table(
         ["fold", "missions to train / test", "before, RMSE [kW]", "after", "parameters", "effects found", "cost"], rows
     )
     lines += ["", *_pooled(before, after, warm)]
-    lines += _picture("ztbus_errors.png", "ZTBus: test error before and after, by mission")
-    lines += ["### Stability over folds", "", *_reading(runs), "", *found_table(runs, "fold"), ""]
-    lines += [*size_table(runs, "fold"), ""]
-    caution = "Two folds share training missions, so the true distance in sd is larger than the one given."
-    lines += _agreement(runs, caution)
+    lines += ["", "### Stability over folds", "", *found_table(runs, "fold")]
     lines += _picture("ztbus_sizes.png", "ZTBus: sizes by fold with 90 % bars")
+    caution = "Folds share training missions, so differences in sd are larger than given."
+    lines += _details(runs, "fold", caution)
     lines += ["### What stays unexplained", "", *left_table(runs, "fold", "kW"), *_left_notes(runs), ""]
-    lines += ["Where the rest is, test RMSE [kW] before → after:", "", *_subsets(runs)]
+    lines += folded("Where the rest is", "\n".join(["Test RMSE [kW] before → after:", "", *_subsets(runs)]))
     order = sorted(after, key=lambda n: warm.get(n, 0.0))
     label = {n: f"{n[:18]} h{f', {warm[n]:.1f} °C' if n in warm else ''}".replace("_", " ") for n in order}
     blocks = {"": [(label[n], before[n]["rmse"], after[n]["rmse"]) for n in order]}
@@ -281,7 +284,7 @@ def _pooled(before: Mapping[str, Any], after: Mapping[str, Any], warm: Mapping[s
     error = np.array([m["pe_percent"] for m in after.values()])
     rows = [
         ["RMSE before → after", f"{pooled_rmse([*before.values()]):.2f} → {pooled_rmse([*after.values()]):.2f} kW"],
-        ["signed mean of the missions' energy errors", f"{error.mean():+.2f} %"],
+        ["mean energy error of missions, signed", f"{error.mean():+.2f} %"],
         ["mean absolute energy error", f"{np.abs(error).mean():.2f} %"],
     ]
     for label, cold in ((f"missions at {COLD_C:.0f} °C and colder", True), ("warmer missions", False)):

@@ -180,11 +180,11 @@ def size_table(runs: Runs, head: str) -> list[str]:
         apart = row.furthest()
         unit = "–" if row.unit == "1" else row.unit
         rows.append([paths, unit, *size, f"{apart:.1f} sd" if math.isfinite(apart) else "–"])
-    return table(["size", "unit", *(f"{head} {k}" for k in runs), "furthest apart"], rows)
+    return table(["size", "unit", *(f"{head} {k}" for k in runs), "largest difference"], rows)
 
 
 def nearest(result: Mapping[str, Any]) -> str:
-    """The candidate that comes nearest of those turned down, with its score and the reason; a dash for none.
+    """The rejected candidate that comes nearest, with its score and the reason; a dash for none.
 
     One whose best size is impossible, or that the log cannot tell from a fitted coefficient, is near to nothing.
     """
@@ -198,7 +198,7 @@ def nearest(result: Mapping[str, Any]) -> str:
 
 
 def left_table(runs: Runs, head: str, unit: str) -> list[str]:
-    """What each run leaves: error, what nothing in the log predicts, and what the loop says of the rest."""
+    """What each run leaves: error, noise floor, and what the diagnosis says of the rest."""
     rows = []
     for run, r in runs.items():
         u = r["unexplained"]
@@ -209,14 +209,14 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
              words.number(u["noise_floor_rmse"]), share, on, signature(u), nearest(r)]
         )  # fmt: skip
     return table(
-        [head, "verdict", f"test RMSE after [{unit}]", "left beside the learner or the formula",
-         "a flexible learner still predicts", "depends on", "what it looks like", "nearest candidate turned down"],
+        [head, "verdict", f"test RMSE after [{unit}]", f"noise floor [{unit}]",
+         "share that a learner predicts", "depends on", "signature", "best rejected candidate"],
         rows,
     )  # fmt: skip
 
 
 def signature(unexplained: Mapping[str, Any]) -> str:
-    """The loop's sentence about what is left, and its formula where it has one."""
+    """The sentence about what is left, and its formula where it has one."""
     text = str(unexplained["signature"]).removeprefix("What is left: ").removeprefix("What is left ").rstrip(".")
     formula = unexplained.get("expression")
     return f"{text}; formula: `{formula}`" if formula else text

@@ -168,7 +168,7 @@ def _chain(rows: Rows, test: np.ndarray, x: np.ndarray, reference: np.ndarray, t
 
 
 def _confusion(rows: Rows, told: np.ndarray) -> list[list[int]]:
-    """Counts of unseen routes [true gear, told gear]."""
+    """Counts of unseen routes [true gear, predicted gear]."""
     at = rows.where(rows.unseen_routes)
     table = np.zeros((MOST_GEARS, MOST_GEARS), dtype=int)
     np.add.at(table, (rows.gear[at] - 1, told[at] - 1), 1)

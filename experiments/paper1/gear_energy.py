@@ -1,4 +1,4 @@
-"""What the surrogate's gear costs in energy: each vehicle as it truly is, with the true gear and with what was told."""
+"""What the surrogate's gear costs in energy: the true vehicle with its true gear and with the predicted one."""
 
 from functools import cache
 from typing import Any

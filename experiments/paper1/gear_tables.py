@@ -58,14 +58,17 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     short = config.artefact.rpartition("/")[2]
     write_tables(run, short, [_line(r) for r in rows], config.caption)
     if lines := [*_beside_bound(config, found, bound)]:
-        write_tables(run, f"{short}_bounds", lines, f"{config.figure}/{config.sets[-1]} beside its bound, in %")
+        write_tables(run, f"{short}_bounds", lines, f"{config.figure}/{config.sets[-1]} against its bound, in %")
     write_tables(
-        run, f"{short}_speed", [*_speed(found)], "Time of a prediction, as it was on this machine while it worked"
+        run, f"{short}_speed", [*_speed(found)], "Time of a prediction on this machine, with other processes running"
     )
     write_tables(run, f"{short}_energy", [*_energy(found)], _ENERGY)
     shown = found.get(f"{config.figure}/{config.sets[-1]}") or next(iter(found.values()))
     write_tables(
-        run, f"{short}_confusion", [*_confusion(shown)], "Rows of unseen routes by true gear (down) and told gear"
+        run,
+        f"{short}_confusion",
+        [*_confusion(shown)],
+        "Rows of unseen routes by true gear (down) and predicted gear (across)",
     )
     _figure(run, short, shown)
     compared = [r for r in rows if r["paper"] and r["ours"]]
@@ -76,23 +79,24 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         "better_than_paper": sum(r["ours"][headline] >= r["paper"][headline] for r in compared), "of": len(compared),
         "missed": [*_missed(config, found, bound)],
         "notes": [
-            f"Synthetic fleet. Rows: {', '.join(map(str, counts))} of training, of unseen routes, of unseen variants "
-            f"({', '.join(config.held_variants)}); vehicles of one speed are left out",
-            "bound: rows outside the hysteresis band are certain; inside it, the held-out accuracy of a classifier "
-            "that is given the two gears and all that decides in the band, without noise. The Bayes bound is not lower",
-            "equation 1: as the paper prints it, with true negatives in every class's sum, it is the accuracy over the "
-            "number of classes (12), at most 1/12; the paper's 'over 90 %' is the usual accuracy",
-            "paper: speed, requested torque and mass alone cannot tell variants apart: the same speed is another gear "
-            "in another gearbox; sheet: with motor speed by gear and power over rated, and the number of gears; "
-            "relative: what is told is the distance from the gear of rated motor speed, and the slope is read too",
-            "filter: a hidden Markov filter over the row-by-row probabilities; previous_gear: the measured one as a "
-            "feature; chain: that classifier with the previous gear known only from its own telling",
+            "rows of training, of unseen routes and of unseen variants "
+            f"({', '.join(config.held_variants)}): {', '.join(map(str, counts))}; single-speed vehicles are left out",
+            "bound: outside the hysteresis band the gear is certain; inside it, the held-out accuracy of a classifier "
+            "that gets the two possible gears and every deciding input without noise. Bayes' accuracy is at least this",
+            "equation 1, as printed in the paper, counts true negatives in the sum of every class: it is the accuracy "
+            "over the number of classes (12), at most 1/12; the paper's 'over 90 %' is the usual accuracy",
+            "paper: inputs are speed, requested torque and mass, which cannot distinguish variants: the same speed is "
+            "another gear in another gearbox; sheet: motor speed by gear, power over rated power and the number of "
+            "gears besides; relative: the slope besides, and the output is the distance from the gear of rated motor "
+            "speed",
+            "filter: a hidden Markov filter over the row-by-row probabilities; previous_gear: the measured previous "
+            "gear is an input; chain: the same classifier, with its own last prediction as the previous gear",
             f"searches: Optuna, {config.trials} trials, {config.folds} folds of whole routes, on at most "
             f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
-            "balanced: the same probabilities, told as the likeliest gear where each is as common as any other in "
-            "training (weights of classes in the decision, not in the fit); gears rarer than a share that the search "
-            f"chooses count as that common; gears of fewer than {LEAST_ROWS} rows in what is scored are left out, of "
-            "bounds too; a bound's gears count as common as they are in what is scored, which can only raise it",
+            "balanced: from the same probabilities, the likeliest gear if all gears were equally common in training "
+            "(class weights in the decision, not in the fit); gears rarer than a share chosen in the search count as "
+            f"that common; gears of fewer than {LEAST_ROWS} scored rows are left out, of bounds too; for a bound, "
+            "gears are as common as in the scored rows, which can only raise it",
         ],
     }  # fmt: skip
 
@@ -111,14 +115,15 @@ def _beside_bound(config: Any, found: Mapping[str, Any], bound: Mapping[str, flo
                 if key in bound:
                     own = found[name]["scores"][key]
                     line |= {kind: f"{100 * own:.1f}", f"{kind} bound": f"{100 * bound[key]:.1f}"}
-                    line[f"{kind}, points behind"] = f"{100 * (bound[key] - own):.1f}"
+                    line[f"{kind}, points below bound"] = f"{100 * (bound[key] - own):.1f}"
                     line[f"{kind}, previous gear known"] = f"{100 * memory[key]:.1f}" if key in memory else None
             yield {**line, "rows of rare gears": bound.get(f"rare_rows_{split}{end}")}
 
 
 _ENERGY = (
-    "What a wrong gear costs (synthetic): energy against that with the true gear, worst vehicle and mean, and against "
-    "the measured energy; hard: the likeliest gear; soft: probabilities in the kernel; none: always the highest gear"
+    "What a wrong gear costs (synthetic): energy added to that with the true gear (worst vehicle, mean of vehicles), "
+    "and errors against the measured energy; hard: the likeliest gear; soft: probabilities in the kernel; none: always "
+    "the highest gear"
 )
 
 
@@ -170,8 +175,8 @@ def _energy(found: Mapping[str, Any]) -> Any:
             added = {k: c["added_percent"][way] for k, c in cars.items()} if way != "true" else {}
             worst = max(added, key=lambda k: abs(added[k])) if added else None
             yield {
-                "model": name, "gear": way, "added, worst [%]": added[worst] if worst else None, "of": worst,
-                "added, mean of sizes [%]": float(np.mean(np.abs([*added.values()]))) if added else None,
+                "model": name, "gear": way, "added, worst [%]": added[worst] if worst else None, "worst vehicle": worst,
+                "added, mean absolute [%]": float(np.mean(np.abs([*added.values()]))) if added else None,
                 "RMSE [Wh]": float(np.mean([c["rmse_wh"][way] for c in cars.values()])),
                 "trip error [%]": float(np.mean([c["trip_percent"][way] for c in cars.values()])),
                 "s per million rows": r["speed"].get("kernel_s_per_million", r["speed"]["library_s_per_million"])
@@ -186,7 +191,7 @@ def _confusion(result: Mapping[str, Any]) -> Any:
 
 
 def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -> Any:
-    """Where the chosen model falls short of what is wanted, each with its number."""
+    """Where the chosen model misses its target, each with its number."""
     name = f"{config.figure}/{config.sets[-1]}"
     if name not in found:
         return
@@ -198,7 +203,7 @@ def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -
                 if key in bound and r["scores"][key] < bound[key] - points:
                     yield f"{name}: {key} {100 * r['scores'][key]:.1f} %, bound {100 * bound[key]:.1f} %"
     if r["scores"]["accuracy_unseen_routes"] < min(POOLED, bound["accuracy_unseen_routes"]):
-        yield f"{name}: pooled {100 * r['scores']['accuracy_unseen_routes']:.1f} %, wanted 90 %"
+        yield f"{name}: pooled {100 * r['scores']['accuracy_unseen_routes']:.1f} %, target 90 %"
     with_memory = {f"{name}+filter": r["memory"]}
     if (other := f"{name}+previous_gear") in found:
         with_memory |= {other: found[other]["scores"], f"{other}+chain": found[other]["memory"]}
@@ -207,7 +212,7 @@ def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -
         f"{kind}_{split}{end}" for kind in ("accuracy", "balanced") for split in POINTS for end in GROUPS.values()
     ):
         if with_memory[best].get(key, 1.0) < WITH_MEMORY:
-            yield f"{best}: {key} {100 * with_memory[best][key]:.1f} %, wanted 98 %"
+            yield f"{best}: {key} {100 * with_memory[best][key]:.1f} %, target 98 %"
     for way in ("hard", "soft"):
         for car, c in r["energy"].items():
             if abs(c["added_percent"][way]) >= WORST_PERCENT:
@@ -232,7 +237,7 @@ def _figure(run: Run, name: str, result: Mapping[str, Any]) -> None:
     share = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
     image = below.imshow(share, vmin=0, vmax=1, cmap="viridis", origin="lower", aspect="auto")
     ticks = range(len(table))
-    below.set(xlabel="told gear", ylabel="true gear", xticks=ticks, yticks=ticks)
+    below.set(xlabel="predicted gear", ylabel="true gear", xticks=ticks, yticks=ticks)
     below.set_xticklabels([str(k + 1) for k in ticks])
     below.set_yticklabels([str(k + 1) for k in ticks])
     fig.colorbar(image, ax=below, label="share of the true gear's rows, unseen routes")

@@ -23,7 +23,7 @@ __all__ = ["Diagnosed", "diagnosis_key"]
 
 SHEET = CONFIGS / "vehicles" / "kia_niro.toml"
 TARGET = "battery_power_kw"
-LOOP = ("diagnosis", "problem", "inference", "physics")  # what the loop is made of
+LOOP = ("diagnosis", "problem", "inference", "physics")  # what a diagnosis is made of
 
 
 def diagnosis_key(settings: Mapping[str, Any]) -> dict[str, str]:

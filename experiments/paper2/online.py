@@ -150,14 +150,14 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
         "better_than_paper": 0, "of": 0, "logs": 4,
         "notes": [
-            "The ageing is planted into measured power; everything else is as measured. A loss is whatever the battery "
-            "gives beyond the shaft in a row, what is early or late among it",
+            "Ageing is simulated by raising the losses in the measured power; everything else is as measured. A row's "
+            "loss is battery power minus shaft power where that is positive, timing differences included",
             *([] if memory is None else [
-                f"memory of {memory:g} min, the best of {', '.join(f'{m:g}' for m in config.memories_min)} on the "
-                f"second half of trip 1 after the first{', at the edge of what was tried' if edge else ''}",
-                "frozen: with the coefficients of trip 1; followed: each row by what was learned before it; before and "
-                "after: the whole trip with the coefficients that were known at its first row and at its last",
-                "a short memory follows the driving as well as the car's age",
+                f"memory: {memory:g} min, the best of {', '.join(f'{m:g}' for m in config.memories_min)} when followed "
+                f"from the first half of trip 1 through the second{', at the edge of the grid' if edge else ''}",
+                "frozen: coefficients of trip 1; followed: each row is predicted from the rows before it; before and "
+                "after: the whole trip with the coefficients known at its first row and at its last",
+                "A short memory follows the driving as well as the car's age",
             ]),
         ],
     }  # fmt: skip

@@ -89,7 +89,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         "rows": [{"name": "pedal", "paper": paper or None, "ours": change}],
         "better_than_paper": 0, "of": 0, "logs": 1,
         "notes": [
-            "Trained on the first two thirds of trip 1 and judged on its last: the other trips hold no pedal in the "
-            "public files, and the paper judged on them",
+            "Trained on the first two thirds of trip 1 and tested on the last; the paper tested on the other trips, "
+            "whose public files have no pedal",
         ],
     }  # fmt: skip

@@ -100,8 +100,9 @@ def _line(
     return {
         "model": name, "number": key.replace("_", " "), "paper": _digits(theirs), "ours": _digits(own),
         "ratio": own / theirs if theirs and own is not None else None,
-        "starts": several.get("starts"), **{k: _digits(several.get(k)) for k in ("least", "median", "most")},
-        "their mean": _digits(several.get("ensemble")),
+        "median": _digits(several.get("median")),
+        "least to most": f"{_digits(several['least'])}–{_digits(several['most'])}" if several else None,
+        "ensemble": _digits(several.get("ensemble")),
     }  # fmt: skip
 
 
@@ -118,16 +119,19 @@ def _words(x: Any) -> str | None:
 def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     """What the columns and rows are, where the table does not say."""
     several = [n for n in found if len(found[n]["losses"]) > 1]
+    starts = {n: f"{n} ({len(found[n]['losses'])} starts)" for n in several}
     rules = {
-        "least": "ours is the start of least loss on trip 1", "ensemble": "ours is the mean of all starts' predictions"
+        "least": "ours is the start with the lowest loss on trip 1",
+        "ensemble": "ours is the mean of all starts' predictions",
     }  # fmt: skip
     said = [
-        f"{', '.join(names)}: {words}"
+        f"{', '.join(starts[n] for n in names)}: {words}"
         for rule, words in rules.items()
         if (names := [n for n in several if config.models[n].rule == rule])
     ]
     if several:
-        said.append("least, median and most are over the starts, each number by itself, read afterwards")
+        said.append("median, least to most: over all starts, each number by itself, after ours was chosen")
+        said.append("ensemble: the mean of all starts' predictions")
         said.append("the starts of a model are fitted side by side in one program (vmap)")
     for n in found:
         if found[n]["converged"] and not all(found[n]["converged"]):
@@ -140,8 +144,8 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     for n in found:
         if settings := found[n]["settings_found"]:
             best = ", ".join(f"{k.replace('_', ' ')} {_words(x)}" for k, x in settings.items())
-            searched = f"the best of {config.models[n].trials} settings (Optuna, by rows of trip 1 left out)"
+            searched = f"the best of {config.models[n].trials} settings (Optuna, on held-out rows of trip 1)"
             said.append(f"{n}: {searched if config.models[n].kind == 'classical' else 'found on trip 1'}: {best}")
     if "change_percent" in config.show and config.order[0] in found:
-        said.append(f"change percent: of the test mean, against {config.order[0]}")
+        said.append(f"change percent: of the test mean, relative to {config.order[0]}")
     return [*said, *(f"{n}: {config.models[n].why}" for n in found if config.models[n].why)]

@@ -66,7 +66,8 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         paper = config.paper.get(name)
         if name in config.reasons:
             rows.append({"name": name, "paper": paper, "ours": None, "reason": config.reasons[name]})
-            lines.append({"quantity": name.replace("_", " "), **_beside({}, paper or {}), "ours": config.reasons[name]})
+            beside = _beside({}, paper or {})
+            lines.append({"quantity": name.replace("_", " "), **beside, "why not": config.reasons[name]})
             continue
         ours = {f"trip{t}": found[t][name] for t in found}
         rows.append({"name": name, "paper": paper, "ours": ours})
@@ -90,10 +91,9 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
 
 
 def _beside(ours: Mapping[str, float], paper: Mapping[str, float]) -> dict[str, Any]:
-    """A trip after the other: the paper's number, ours, their ratio."""
-    out: dict[str, Any] = {}
-    for t in dict.fromkeys([*paper, *ours]):
-        own, theirs = ours.get(t), paper.get(t)
-        trip = t.replace("trip", "trip ")
-        out |= {f"{trip}, paper": theirs, trip: own, f"{trip}, ratio": own / theirs if own and theirs else None}
-    return out
+    """By trip: the paper's number, then ours."""
+    shown = lambda x: "–" if x is None else f"{x:.3g}"  # noqa: E731
+    return {
+        t.replace("trip", "trip "): f"{shown(paper.get(t))} → {shown(ours.get(t))}"
+        for t in dict.fromkeys([*paper, *ours])
+    }

@@ -23,7 +23,7 @@ class Mission:
     """One file of ZTBus by distance: `length_m` of road or a halt in each row.
 
     **Fields:** `name`, of the file without its end time; `bus`, of `BUSES`; `segments`, NumPy columns `[row]` with the
-    channels of `configs/adapters/ztbus.toml` less the targets, so that no model is told the force of its drive (what
+    channels of `configs/adapters/ztbus.toml` less the targets, so that no model is given the force of its drive (what
     the driver does, brake, halt brake and doors, is among them: a model that is to foresee a drive leaves it out);
     `energy_wh`, `[row]`, positive into the bus.
 

@@ -98,9 +98,9 @@ def kernel(m: Member, effects: Mapping[str, Mapping[str, float]], *, rows: int =
     training rows. A shape that is not given has its usual value.
 
     Sizes in closed form, thresholds by search between, and where the mass is among the effects what each trip's is off
-    by about the mean: a random effect of the trips, whose variance the trips tell (EM; Laird and Ware 1982). Otherwise
-    a few trips that are heavier than logged would be told as drag and rolling resistance. `rows` and `trips`: what
-    other vehicles have, so that they share what is compiled.
+    by about the mean: a random effect of the trips, whose variance is estimated from them (EM; Laird and Ware 1982).
+    Otherwise a few trips that are heavier than logged would be taken for drag and rolling resistance. `rows` and
+    `trips`: what other vehicles have, so that they share what is compiled.
     """
     train = m.where(0)
     size = _whole(len(train), rows)

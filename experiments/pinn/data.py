@@ -22,7 +22,7 @@ from hdev_jax.segments import Segments
 
 __all__ = ["Data", "Known", "Member", "load", "weighed"]
 
-# What no network and no learner is told: it would tell the force of the drive, and with it the energy.
+# What no network and no learner gets: it would give away the force of the drive, and with it the energy.
 TELLS = ("requested_torque_nm", "brake_pressure_pa", "halt_brake", "door_open", "passengers", "gear_middle")
 SPLIT = (0.70, 0.15)  # training and validation, by route (paper 1, section 3.3.2); the rest tests
 

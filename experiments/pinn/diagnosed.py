@@ -71,7 +71,7 @@ def _diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, di
     with tempfile.TemporaryDirectory() as folder:
         write_sheet(m.variant, FleetConfig(), Path(folder))
         problem = prepare(_log_of(m, known), read_sheet(Path(folder) / f"{m.id}.toml"))
-        # one route more than is learnt from: the loop wants a test trip, and what it says of that is not used
+        # one route more than is learnt from: a diagnosis needs a test trip, and what it says of that is not used
         split = split_trips(problem.log, None, [problem.log.trip_names[-1]])
         done = diagnose(problem, split, LIBRARY, seed=seed, tell=progress.step)
     found = {e["id"]: {k: p["value"] for k, p in e["parameters"].items()} for e in done.summary["effects"]}

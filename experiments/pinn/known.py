@@ -72,5 +72,5 @@ def _loose(car: Vehicle, m: Member, sd: float) -> np.ndarray:
 
 
 def _unit(m: Member, p: Parameter) -> float:
-    """What a parameter is told in for vehicles to be alike."""
+    """The unit in which a parameter is alike in all vehicles."""
     return float(m.vehicle.mass_kg) if p.unit == "W" else 1.0

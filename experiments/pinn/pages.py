@@ -31,31 +31,33 @@ from hdev_jax.rundir import Run
 
 __all__ = ["coefficients", "grid", "shares", "table"]
 
-HELD = ("features without units hold the energy by the calibrated kernel, and efficiencies are read there: only a "
-        "black box with no kernel, where there is one, is without physics")  # fmt: skip
-GIVEN = ("ours and the closed form are given the list of effects that the fleet hides; what diagnoses of "
-         "training routes name by themselves is in models that say so")  # fmt: skip
+HELD = ("inputs without units include the energy of the calibrated kernel and efficiencies at its operating point: "
+        "only models called 'no kernel' are without physics")  # fmt: skip
+GIVEN = ("ours and the closed form are given the list of effects that the fleet hides; models 'as diagnosed' have the "
+         "effects that the diagnosis of training routes names")  # fmt: skip
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
 NAMEABLE = {
-    WAYS["kernel"]: "effects of the given list, in closed form",
-    f"{OURS}, effects as diagnosed, {FORM}": "effects that diagnoses of training routes name, by closed form of all "
-    "vehicles,",
+    WAYS["kernel"]: "the given effects in closed form",
+    f"{OURS}, effects as diagnosed, {FORM}": "the effects named by diagnosis, in closed form for all vehicles,",
 }
 
 
-def _line(name: str, use: str, found: list[dict[str, Any]], of: tuple[int, int]) -> dict[str, Any]:
+def _line(
+    name: str, use: str, found: list[dict[str, Any]], of: tuple[int, int], paper: Mapping[str, float]
+) -> dict[str, Any]:
     """A row of the table; of several seeds, errors are of all of them together."""
     p = pooled(found)
     return {
-        "model": name, "rows of": use, "n": of[0], "trips": of[1], "RMSE [Wh]": p["rmse_wh"],
-        "PE [%]": p["pe_percent"], "PE of a trip, mean [%]": p["trip_pe_mean"],
-        "|PE| of a trip, median [%]": p["trip_pe_median"],
+        "model": name if use == "test" else f"{name}: {use}",
+        "RMSE [Wh]": p["rmse_wh"], "paper RMSE": paper.get("rmse"),
+        "PE [%]": p["pe_percent"], "paper PE": paper.get("pe"), "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
         "C_d·A error, median of vehicles [%]": p.get("cda_m2_error_percent"), "in 90 %": p.get("inside_90"),
+        "PE of a trip, mean [%]": p["trip_pe_mean"], "n": of[0], "trips": of[1],
     }  # fmt: skip
 
 
@@ -67,27 +69,27 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     rows, lines = [], []
     for (way, use), found in gathered.items():
         p = pooled(found)
-        line = _line(way, use, found, every[way, use])
         name = NAMED.get(way, way)
         paper = config.paper.get(name) if use == "test" else None
-        lines.append({"data": data, **line, "paper RMSE": (paper or {}).get("rmse"),
-                      "paper PE": (paper or {}).get("pe")})  # fmt: skip
+        lines.append(_line(way, use, found, every[way, use], paper or {}))
         mine = {"rmse": p.pop("rmse_wh"), "pe": p.pop("pe_percent"), **p}
         rows.append({"name": name if use == "test" else f"{name} ({use})", "paper": paper, "ours": mine})
     for model, (n, lost) in trainings(results).items():
         if n == lost:
             name, said = NAMED.get(model, model), f"diverged, {lost} of {n} trainings"
-            lines.append({"data": data, "model": f"{model}: {said}", "rows of": "test", "n": 0})
+            lines.append({"model": f"{model}: {said}", "n": 0})
             rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": said})
     write_tables(run, "table", lines, config.caption)
     at_bound = _at_bound(results)
     if at_bound:
         bound = [{"model": n, "c_rr": 100 * b["c_rr"], "C_d·A": 100 * b["cda_m2"]} for n, b in at_bound.items()]
-        caption = "Share of predictions within 1 % of the range of a bound [%], test rows of all trainings"
+        caption = "Share of predictions at a bound, within 1 % of the range [%], test rows of all trainings"
         write_tables(run, "bounds", bound, caption)
     effects = _effects(results)
     if effects:
-        write_tables(run, "effects", effects, "What the diagnosis found, by vehicle: how often, and its median size")
+        write_tables(
+            run, "effects", effects, "Effects found by diagnosing single vehicles: in how many, and the median size"
+        )
     model_bars(run, gathered, data)
     used = {t["name"]: r["effects"] for t, r in results if "effects" in r and t["model"].get("effects")}
     return {
@@ -95,10 +97,10 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
         "better_than_paper": 0, "of": 0, "headline": "rmse", "missed": _missed(config, gathered, at_bound),
         "notes": [
             "the paper's numbers are of its own, private fleet; ours are of "
-            + ("measured buses" if config.data == "ztbus" else "a synthetic one, whose noise they share by no means"),
-            "training, validation and test by route" if config.data == "fleet" else "missions held out, by fold",
+            + ("measured buses" if config.data == "ztbus" else "a synthetic one with other noise"),
+            "training, validation and test by route" if config.data == "fleet" else "held-out missions, by fold",
             HELD,
-            "errors of coefficients: median of predicted over true, less one; spray counts as air",
+            "coefficient errors: median of predicted over true, minus one; spray counts as air drag",
             *diverged(results),
             *still_better(results),
             *([GIVEN] if config.data == "fleet" else []),
@@ -116,13 +118,15 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     base, learned = square.get(WAYS["bayesian"]), square.get(LEARNED)
     if base is None or learned is None or base - learned < LEAST_LEARNED * base:
         return []
-    what = f"what {LEARNED} learns beyond the calibrated declared physics ({base**0.5:.4g} to {learned**0.5:.4g} Wh)"
+    what = (
+        f"'{LEARNED}' lowers the RMSE of the calibrated declared physics from {base**0.5:.4g} to {learned**0.5:.4g} Wh"
+    )
     out = []
     for way, whose in NAMEABLE.items():
         if way in square:
             share = 100 * (base - square[way]) / (base - learned)
-            told = f"take off {share:.0f} % as much squared error" if share > 0 else "take nothing off"
-            out.append(f"{what}: {whose} {told} without any network")
+            removed = f"{share:.0f} % of that gain in squared error" if share > 0 else "nothing of that gain"
+            out.append(f"{what}; {whose} reach {removed} without any network")
     return out
 
 
@@ -143,7 +147,7 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": rows,
         "better_than_paper": 0, "of": 0, "missed": [],
-        "notes": ["the paper prints no numbers beside its boxes, and could not know the truth", *diverged(results)],
+        "notes": ["the paper prints no numbers for its boxes, and its true values are unknown", *diverged(results)],
     }  # fmt: skip
 
 
@@ -160,17 +164,17 @@ def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound:
         limit = 1.0 if config.data == "fleet" else 3.0
         pe = mine["pe_percent"] if config.data == "fleet" else mine["trip_pe_mean"]
         if abs(pe) > limit:
-            out.append(f"ours: PE {pe:+.2f} %, ±{limit:g} wanted")
+            out.append(f"ours: PE {pe:+.2f} %, target ±{limit:g}")
         if PAPER_MODEL in test and mine["rmse_wh"] > 0.9 * test[PAPER_MODEL]["rmse_wh"]:
-            out.append(f"ours: RMSE {mine['rmse_wh'] / test[PAPER_MODEL]['rmse_wh']:.2f} of the paper's, 0.9 wanted")
+            out.append(f"ours: RMSE {mine['rmse_wh'] / test[PAPER_MODEL]['rmse_wh']:.2f} of the paper's, target 0.9")
         best = min(test, key=lambda k: test[k]["rmse_wh"])
         if config.data == "ztbus" and best != OURS:
             out.append(f"ours: RMSE {mine['rmse_wh']:.1f} Wh, the best is {best} with {test[best]['rmse_wh']:.1f}")
         for k in ("c_rr", "cda_m2"):
             if mine.get(f"{k}_error_percent", 0.0) > 5.0:
-                out.append(f"ours: {k} off by {mine[f'{k}_error_percent']:.1f} % in the median of vehicles, 5 wanted")
+                out.append(f"ours: {k} off by {mine[f'{k}_error_percent']:.1f} % in the median of vehicles, target 5")
             if mine.get(f"{k}_error_worst", 0.0) > 5.0:
-                out.append(f"ours: {k} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, 5 wanted")
+                out.append(f"ours: {k} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, target 5")
     out += [f"{n}: {100 * max(b.values()):.1f} % at a bound" for n, b in at_bound.items() if n == OURS]
     return out
 
@@ -228,10 +232,10 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
         for (way, use), found in gathered.items():
             seeds = [pooled([f])["rmse_wh"] for f in found]
             curves.setdefault((way, use), []).append((share, seeds))
-            lines.append({"share": share, "training routes": counts and counts["routes"],
-                          "training rows": counts and counts["training"], "model": way, "rows of": use,
-                          "n": found[0]["rows"], "seeds": len(seeds), "RMSE [Wh]": float(np.median(seeds)),
-                          "least": min(seeds), "most": max(seeds), "PE [%]": pooled(found)["pe_percent"]})  # fmt: skip
+            lines.append({"share": share, "training routes": counts and counts["routes"], "model": way, "rows of": use,
+                          "RMSE [Wh]": float(np.median(seeds)), "least": min(seeds), "most": max(seeds),
+                          "PE [%]": pooled(found)["pe_percent"], "training rows": counts and counts["training"],
+                          "n": found[0]["rows"], "seeds": len(seeds)})  # fmt: skip
     write_tables(run, "shares", lines, config.caption)
     routes = {x["share"]: x["training routes"] for x in lines if x["training routes"]}
     learning_curves(run, curves, routes)
@@ -241,9 +245,9 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
                   "ours": {"rmse_wh": x["RMSE [Wh]"], "pe_percent": x["PE [%]"]}} for x in lines],
         "missed": _against_black_boxes(config, curves),
         "notes": [
-            "the line is the median over seeds, the band all; seeds are of networks' weights: routes are drawn once, "
-            "and LightGBM draws nothing",
-            f"{TAUGHT}: what few routes leave vehicles without any is in test, not there",
+            "Figure: the line is the median over seeds, the band all of them; a seed draws a network's first weights, "
+            "while routes are drawn once and LightGBM draws nothing",
+            f"{TAUGHT}: without the vehicles that have no training route",
             HELD, GIVEN, *still_better(results), *diverged(results),
         ],
     }  # fmt: skip
@@ -265,7 +269,9 @@ def _against_black_boxes(config: Any, curves: Mapping[tuple[str, str], list[tupl
                     continue
                 ratio = float(np.median(mine_at[share]) / np.median(others[share]))
                 if ratio > 0.7:
-                    out.append(f"{100 * share:g} % of the routes, {use}: RMSE {ratio:.2f} of {other}'s, 0.7 wanted")
+                    out.append(
+                        f"{100 * share:g} % of the routes, {use}: RMSE {ratio:.2f} of that of {other}, target 0.7"
+                    )
     return out
 
 
@@ -284,10 +290,10 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
     best = min(lines, key=lambda x: x["RMSE [Wh]"])
     lost = sum("diverged" in r for _, r in results)
     where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"
-    note = f"{lost} of {len(results)} diverged; best at λ = {where}: {best['RMSE [Wh]']:.2f} Wh"
+    note = f"Best at λ = {where}: {best['RMSE [Wh]']:.2f} Wh; {lost} of {len(results)} trainings diverged"
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "better_than_paper": 0, "of": 0,
         "rows": [{"name": f"{x['λ₁']:g}, {x['λ₂']:g}, {x['λ₃']:g}", "paper": None, "ours": {"rmse_wh": x["RMSE [Wh]"]}}
                  for x in lines],
-        "missed": [], "notes": [note, "chosen by nobody: the paper's weights stand in table 2"],
+        "missed": [], "findings": [note], "notes": ["Table 2 has the paper's weights, not the best of this grid"],
     }  # fmt: skip

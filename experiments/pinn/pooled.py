@@ -1,9 +1,9 @@
 """Coefficients and sizes of networks that are not trained: what the rows of each vehicle say in closed form, vehicles
 of one fleet being alike as far as their rows say so.
 
-A vehicle alone hardly tells some things apart (drag and a rolling resistance that grows with v²). What is alike in all
-vehicles (the second, over its usual size) is told by all of their rows, and then the first is known too. Rows count as
-independent, and the sheets' own sds are not used: how far tables are off is learned from the fleet.
+A vehicle alone hardly distinguishes some things (drag, and a rolling resistance that grows with v²). What is alike in
+all vehicles (the second, over its usual size) is estimated from all of their rows, and then the first is known too.
+Rows count as independent, and the sheets' own sds are not used: how far tables are off is learned from the fleet.
 """
 
 import json
@@ -32,7 +32,7 @@ _PASSES = 5  # linearisations, the first at the tables; products (mass and rolli
 
 
 class _Unit(NamedTuple):
-    """How the fleet's coefficients are told: as logarithms over their tables, or from null values, in usual sizes."""
+    """The units of the fleet's coefficients: as logarithms over their tables, or from null values, in usual sizes."""
 
     null: float
     size: float
@@ -47,16 +47,16 @@ class _Unit(NamedTuple):
         p = next(p for p in LIBRARY[id].parameters if p.name == name)
         return cls(p.null, p.scale, False)
 
-    def told(self, value: float) -> tuple[float, float]:
+    def scaled(self, value: float) -> tuple[float, float]:
         """A value in these units, and how much of its own unit one of these is there."""
         if not self.log:
             return (value - self.null) / self.size, self.size
         value = max(value, _LEAST_SHARE * self.null)
         return float(np.log(value / self.null)) / self.size, value * self.size
 
-    def value(self, told: float) -> float:
-        """The value that `told` tells."""
-        return self.null * float(np.exp(self.size * told)) if self.log else self.null + self.size * told
+    def value(self, scaled: float) -> float:
+        """The value of a number in these units."""
+        return self.null * float(np.exp(self.size * scaled)) if self.log else self.null + self.size * scaled
 
 
 class Fleet(NamedTuple):
@@ -69,11 +69,11 @@ class Fleet(NamedTuple):
     def put(self, car: Vehicle, m: Member, number: int, effects: Mapping[str, Mapping[str, float]]) -> Vehicle:
         """A vehicle with these effects, all as vehicle `number` has them; past the trained ones as their medians."""
         own = self.theta[number] if number < len(self.theta) else np.median(self.theta, axis=0)
-        told = dict(zip(self.names, own, strict=True))
+        given = dict(zip(self.names, own, strict=True))
         whole, table = listed(m, effects)
         car = car.plus(*(whole.effect(id) for id in effects))
-        table = table.with_free(**{c.name: c.name in told for c in table.free})
-        return table.insert(car, np.array([_Unit.of(m, c).value(told[c.name]) for c in table.free]))
+        table = table.with_free(**{c.name: c.name in given for c in table.free})
+        return table.insert(car, np.array([_Unit.of(m, c).value(given[c.name]) for c in table.free]))
 
 
 @cache
@@ -91,7 +91,7 @@ def fleet(data: Data, effects: str) -> Fleet:
     alone = np.full((len(pairs), len(names)), np.nan)
     for v, at in enumerate(places):
         for i, j, unit in at:
-            alone[v, j] = unit.told(values[v][i])[0]
+            alone[v, j] = unit.scaled(values[v][i])[0]
             values[v][i] = unit.value(0.0)  # what a few rows say alone may be anything; products of that more so
     spread = np.log(np.clip(np.nan_to_num(np.nanstd(alone, axis=0), nan=1.0), 0.02, 2.0))
     for _ in range(_PASSES):
@@ -121,7 +121,7 @@ def _sums(
             continue
         fit, noise = c.again(m, values[v]), float(c.fit.posterior.sigma)
         mine, at = [i for i, _, _ in places[v]], [j for _, j, _ in places[v]]
-        where, size = np.array([unit.told(float(fit.at[i])) for i, _, unit in places[v]]).T
+        where, size = np.array([unit.scaled(float(fit.at[i])) for i, _, unit in places[v]]).T
         step = size / np.asarray(fit.scale)[mine]
         here = np.asarray(fit.statistics.gram)[np.ix_(mine, mine)] * np.outer(step, step) / noise**2
         slope = np.asarray(fit.statistics.moment)[mine] * step / noise**2

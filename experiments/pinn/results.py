@@ -54,10 +54,10 @@ def trainings(results: Results) -> dict[str, tuple[int, int]]:
 def still_better(results: Results) -> list[str]:
     """Which models were still getting better when their epochs were over."""
     still = sorted({t["name"] for t, r in results if r.get("still_better")})
-    return [f"still better at the last epoch, in some training: {', '.join(still)}"] if still else []
+    return [f"validation error still falling at the last epoch, in some training: {', '.join(still)}"] if still else []
 
 
 def diverged(results: Results) -> list[str]:
     """How many trainings diverged, where any did."""
     lost = [f"{model} {k} of {n}" for model, (n, k) in trainings(results).items() if k]
-    return [f"trainings that diverged, and are in no error: {', '.join(lost)}"] if lost else []
+    return [f"diverged trainings, left out of all errors: {', '.join(lost)}"] if lost else []

@@ -31,11 +31,11 @@ class Case(Strict):
     # what each log should say: the planted effects by name (nothing, where the library has no name for one of them);
     # that a declared coefficient took them (with none planted: none is far off); that more trips would tell
     asked: Literal["named", "absorbed", "not_decidable"] = "named"
-    wanted: float | None = None  # least share of logs that do as asked
+    wanted: float | None = None  # least share of logs with the right answer
     # least share that name exactly what was planted, with no class; of all logs, and of what has no twin by itself
     wanted_alone: float | None = None
     wanted_unexplained: float | None = None  # least share in which something is called unexplained
-    wanted_pooled: float | None = None  # least share as asked over all settings of the case together
+    wanted_pooled: float | None = None  # least share of right answers over all settings of the case together
 
 
 class Config(Strict):

@@ -25,7 +25,7 @@ COLOURS = {
 }
 LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, classes set aside", "stlsq": "STLSQ (PySINDy)",
           "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}  # fmt: skip
-NOISES = {"white": "white", "ar1": "AR(1)", "ar1_white": "AR(1)\n+ white", "trip_levels": "levels\nof trips",
+NOISES = {"white": "white", "ar1": "AR(1)", "ar1_white": "AR(1)\n+ white", "trip_levels": "random\nintercepts",
           "student_t": "Student's t", "trip_variance": "variance\nby trip"}  # fmt: skip
 LEVEL = 5.0  # per cent of logs with nothing planted that may be given a name
 
@@ -102,7 +102,7 @@ def false_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
             axes.bar(x, 100 * y, 0.75 / len(methods), color=COLOURS[method], label=LABELS[method] if k == 0 else None)
             axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
             highest = max(highest, 102 * high)
-    axes.axhline(LEVEL, color="#333", lw=0.8, ls=":", label=f"{LEVEL:g} %: the most that is wanted")
+    axes.axhline(LEVEL, color="#333", lw=0.8, ls=":", label=f"{LEVEL:g} %: target, at most")
     axes.set_xticks(range(len(noises)), [NOISES[n] for n in noises], fontsize=8)
     axes.set(ylabel="something named [%]", ylim=(0, highest), title="Synthetic logs with nothing missing")
     tidy(axes)

@@ -1,7 +1,7 @@
 """What a model that knows the cause makes of a log: its error on the same test trips, from the same training trips.
 
 The declared vehicle with what was planted, in the library's form and with the true shapes; sizes and declared
-coefficients are refitted as whitened rows have them, since that is where the loop may take its sizes from too.
+coefficients are refitted by generalised least squares, for the diagnosis may take its sizes from there too.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ def confusable(planted: Sequence[str], synthetic: SyntheticLog, problem: Problem
 
     What was measured without its noise, by the noise's own colour: an effect that in the planted one's place leaves
     less log-likelihood than `TELLS` would pass a test that knows both, in too many of the noises that might have been.
-    All that is planted beside it is known. Other effects come in the best of the ways that the loop tries, linearly
+    All that is planted beside it is known. Other effects come in the best way that the diagnosis tries, linearly
     about a fit without the planted one, while the planted one is refitted; for large effects that difference counts as
     evidence, even between identical columns (`scores.TWINS`).
     """

@@ -2,8 +2,8 @@
 
 Each gets the help it needs: the declared model's coefficients are projected off, what they take up whole is left out,
 every effect comes in the way that fits it best (its sizes and the shapes they are at), columns have unit variance.
-None knows of trips but the lasso, whose folds are trips. Effects that the loop seeks elsewhere than in columns have no
-column here.
+None knows of trips but the lasso, whose folds are trips. Effects that the diagnosis does not search by column have
+no column here.
 """
 
 import time

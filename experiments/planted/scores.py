@@ -62,7 +62,7 @@ def false(planted: Sequence[str], named: Sequence[Entry]) -> bool:
 
 
 def absorbed(planted: Sequence[str], result: Mapping[str, Any]) -> bool:
-    """Whether nothing is named, and for each planted effect a coefficient that cannot be told from it is far off."""
+    """Whether nothing is named, and for each planted effect a coefficient that absorbs it is far off."""
     far = [b for b in result["baseline"].values() if abs(b["prior_z"]) > SETTINGS.far]
     return not result["named"] and all(any(k in b["absorbs"] for b in far) for k in planted)
 
@@ -79,8 +79,8 @@ def not_decidable(planted: Sequence[str], result: Mapping[str, Any]) -> bool:
 
 
 def alike(planted: Sequence[str], result: Mapping[str, Any]) -> list[set[str]]:
-    """For each planted effect the names that are right: itself, its twin, what its columns cannot be told from on this
-    log by the loop's own rule, and the class in which the loop names it."""
+    """For each planted effect the names that are right: itself, its twin, what this log cannot distinguish from it
+    by the diagnosis's own rule, and the class in which the diagnosis names it."""
     out = []
     for k in planted:
         entry = next((set(n["class"]) for n in result["named"] if k in n["class"]), set())

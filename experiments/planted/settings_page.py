@@ -28,9 +28,9 @@ sets `--fdr`; from Python, `diagnose(…, settings=Settings(close=0.9))` sets an
 
 Made by `{command}`.
 
-Half and double: the changed value, with one setting changed at a time, and what it does to the study of planted effects
-(synthetic logs): logs named as they should be, of all logs, and logs with an effect named that was not planted. Whole
-numbers are rounded up; a share or probability is not doubled beyond 1. {result}
+Half and double: the study of planted effects (synthetic logs), run again with one setting changed. A cell has the new
+value, logs with the right answer of all logs, and logs in which an effect is named that was not planted. Whole numbers
+are rounded up; a share or probability is not doubled beyond 1. {result}
 
 The study runs all of them, or one:
 

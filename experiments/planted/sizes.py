@@ -1,4 +1,4 @@
-"""The planted study's sizes and errors: do intervals hold what they should, is the error after that of an oracle?"""
+"""The planted study's sizes and errors: do intervals hold the planted size, is the error that of an oracle?"""
 
 from typing import Any
 
@@ -15,8 +15,8 @@ NEAR_ORACLE = 1.05
 # of the noise, from which on an oracle's error is out of reach of a model that found nothing: √(1 + 0.5²) = 1.118
 TELLING = 0.5
 CAPTION = (
-    "Planted effects: sizes of what was named itself (n sizes) and errors after the loop (n logs), of every log with "
-    "an effect to be named; met where the share is in the wanted range"
+    "Planted effects: intervals of sizes (n sizes, of effects named by their own id) and test errors (n logs), over "
+    "all logs with an effect to be named; met: the share is in the wanted range"
 )
 
 
@@ -45,11 +45,11 @@ def _covered(able: Group) -> list[dict[str, Any]]:
 
 
 def _near_oracle(able: Group) -> list[dict[str, Any]]:
-    """Is the error after the loop that of an oracle: size by size, and where finding nothing would not pass.
+    """Is the error after the diagnosis that of an oracle: size by size, and where finding nothing would not pass.
 
     The oracle of what the library holds in another form is the noise itself.
     """
-    name = "test error after within 5 % of an oracle's"
+    name = "test error within 5 % of the oracle's"
     near = [
         (t["size"], _in_library(t), r["test_rmse"]["after"] < NEAR_ORACLE * r["oracle_rmse"])
         for t, r in able if t["size"] and scores.nameable(t["effects"])

@@ -1,4 +1,4 @@
-"""Tables of the planted study: one row for each setting, what was asked of it beside what came out."""
+"""Tables of the planted study: one row for each setting, targets and results."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -50,16 +50,16 @@ LEGEND = {  # of each table that is there; the first of every page
     "": (
         "Size: RMS of the planted effect's column, after the declared model's own columns are projected off it, over "
         "the RMS of the noise. Noise: white; ar1, each row follows the one before by {ar:g}; ar1_white, a fifth of the "
-        "variance is white; trip_levels, half of it is a level of each trip; student_t, ar1 with innovations of 3 "
-        "degrees of freedom; trip_variance, ar1 whose size differs by trip. Logs hold energy by road segment, those "
-        "called shaft samples of electric power with the motor's torque and speed",
+        "variance is white; trip_levels, half of it is a random intercept of each trip; student_t, ar1 with "
+        "innovations of 3 degrees of freedom; trip_variance, ar1 whose size differs by trip. Logs hold energy by road "
+        "segment, those called shaft samples of electric power with the motor's torque and speed",
     ),
     "planted": (
         "Right: the share of logs with the right answer, with Wilson's 95 % interval. That is: all and only what "
         "was planted (each by its id, or in a class of at most three); with nothing planted, no name; with a cause "
         "outside the library, no wrong name (a constant load is right for the mean of one that switches); where a "
         "coefficient absorbs the effect, or only more trips could decide, that this is said. Met: the share is at "
-        "least the wanted one",
+        "least the wanted one{unexplained}",
         "False name: logs in which an effect is named that was not planted. Called unexplained: logs in which "
         "structure is left (random intercepts of trips count, though they are noise there)",
     ),
@@ -80,10 +80,10 @@ LEGEND = {  # of each table that is there; the first of every page
         "wanted one, and so is that with no class, where one is wanted",
     ),
     "planted_rivals": (
-        "Ours needs an entry that holds the planted effect, ours_first (classes set aside, what each entry is called) "
-        "its very name, so that a twin named first is false there. A rival's name is right where it is the planted "
-        "effect, its twin, what this log cannot tell from it, or in the class that ours gives. Seconds of ours hold "
-        "compiling, the more the fewer logs there are of a kind",
+        "Ours is right where an entry, a name or a class, holds the planted effect; ours_first where the first name of "
+        "each entry is the planted effect, so that a twin named first is false. A rival's name is right where it is "
+        "the planted effect, its twin, an effect that this log cannot distinguish from it, or in the class that ours "
+        "gives. Seconds of ours include compiling, whose share is larger where there are few logs of a kind",
     ),
 }
 
@@ -128,8 +128,15 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
                  for r in (*rows, *apart, *sized, *against)],
         "better_than_paper": 0, "of": 0,
         "skipped": skipped, "missed": missed,
-        "notes": [line.format(ar=config.ar_coefficient) for table in shown for line in LEGEND.get(table, ())],
+        "notes": [line.format(ar=config.ar_coefficient, unexplained=_unexplained_wanted(config, done))
+                  for table in shown for line in LEGEND.get(table, ())],
     }  # fmt: skip
+
+
+def _unexplained_wanted(config: Config, done: Group) -> str:
+    """What is wanted besides of logs with a cause outside the library; empty where there are none."""
+    wanted = [w for t, _ in done if (w := config.cases[t["case"]].wanted_unexplained) is not None]
+    return f" and, with a cause outside the library, {max(wanted):g} of logs are called unexplained" if wanted else ""
 
 
 def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
@@ -139,8 +146,8 @@ def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
     what = sorted({k for effects in left for k in effects if not comparable([k])})
     if not left:
         return ""
-    out = f"; without {len(left)} logs of {' or '.join(what)}, sought by trip, not by column"
-    return f"{out}; ours of all logs is in the first table"
+    out = f"; without {len(left)} logs of {' or '.join(what)}, which are searched by trip and have no column"
+    return f"{out}; the first table has all logs"
 
 
 def _met(row: dict[str, Any]) -> dict[str, Any]:
@@ -150,12 +157,12 @@ def _met(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _short_of(row: dict[str, Any]) -> str:
-    """What a row that is short has, and what is wanted of it."""
+    """What a row below its target has, and the target."""
     if "wanted_range" in row:
         low, high = row["wanted_range"]
-        return f"{row['share']:.3g}, {low:g} to {high:g} wanted"
+        return f"{row['share']:.3g}, target {low:g} to {high:g}"
     return "; ".join(
-        f"{words} {row[share]:.3g}, {row[least]:g} wanted"
+        f"{words} {row[share]:.3g}, target {row[least]:g}"
         for share, (words, least) in WANTED.items() if row.get(least) is not None and row[share] < row[least]
     )  # fmt: skip
 

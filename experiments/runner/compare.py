@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
 
-__all__ = ["DECIDES", "check", "comparison", "headlines", "numbers", "told"]
+__all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "notes", "numbers"]
 
-DECIDES = "The number that decides of each row; least to most are over starts"
+DECIDES = "Deciding number of each row; median, least and most over all starts of its fit"
+MOST_MISSED = 4  # targets that lead a page one by one
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
 
@@ -51,7 +52,7 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A line for each row of a run that says which quantity decides (`metrics["headline"]`), whether the paper has it.
 
-    With the spread over starts, where the row has one (`spread`: least, median, most, starts).
+    With the spread over starts, where the row has one (`spread`: least, median, most).
     """
     quantity = metrics.get("headline")
     lines = []
@@ -62,7 +63,8 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
             {
                 "name": row["name"], "quantity": quantity, "paper": paper, "ours": own,
                 "ratio": own / paper if own is not None and paper else None,
-                **{k: spread.get(k) for k in ("starts", "least", "median", "most")}, "why_not": row.get("reason"),
+                "median": spread.get("median"),
+                "least to most": [spread["least"], spread["most"]] if spread else None, "why_not": row.get("reason"),
             }
         )  # fmt: skip
     return lines
@@ -72,25 +74,41 @@ def _number(x: Any) -> float | None:
     return float(x) if isinstance(x, Real) and not isinstance(x, bool) else None
 
 
-def told(metrics: Mapping[str, Any]) -> list[str]:
-    """What a page says of a run before its tables: how much there is in it, what is missing, how it compares."""
+def findings(metrics: Mapping[str, Any]) -> list[str]:
+    """What leads a page: how much data there is, what is missing, which targets are missed, how it compares, and what
+    the run found (`metrics["findings"]`)."""
     said = []
     if "logs" in metrics:
-        said.append(f"{metrics['logs']} logs{', all synthetic' if metrics['synthetic'] else ''}.")
+        n, kind = metrics["logs"], "synthetic" if metrics["synthetic"] else "measured"
+        said.append(f"{n} {kind} {'log' if n == 1 else 'logs'}.")
     elif metrics["synthetic"]:
         said.append("Synthetic data.")
     if metrics["tasks_left_out"]:
-        said.append(f"{metrics['tasks_left_out']} more are in the config and were not run.")
-    if metrics.get("tasks_in_one_program"):
-        said.append(f"{metrics['tasks_in_one_program']} of its tasks ran side by side in one program.")
+        said.append(f"Not run: {metrics['tasks_left_out']} more tasks of the config.")
     if metrics.get("skipped"):
-        said.append(f"{len(metrics['skipped'])} could not be made as asked for.")
-    if metrics.get("missed"):
-        said.append(f"Below its target: {'; '.join(metrics['missed'])}.")
+        said.append(f"{len(metrics['skipped'])} could not be made as the config says.")
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
-    said += [f"{note.rstrip('.')}." for note in metrics.get("notes", [])]
+    said += _sentences(metrics.get("findings", []))
+    if missed := metrics.get("missed"):
+        few = len(missed) <= MOST_MISSED
+        said.append(f"Target missed: {'; '.join(missed)}." if few else f"{len(missed)} targets missed: see the notes.")
     return said
+
+
+def notes(metrics: Mapping[str, Any]) -> list[str]:
+    """What a reader needs for the tables and figures of a run."""
+    said = _sentences(metrics.get("notes", []))
+    if len(missed := metrics.get("missed", [])) > MOST_MISSED:
+        said.append(f"Target missed: {'; '.join(missed)}.")
+    if metrics.get("tasks_in_one_program"):
+        said.append(f"{metrics['tasks_in_one_program']} tasks ran side by side in one program.")
+    return said
+
+
+def _sentences(lines: Sequence[str]) -> list[str]:
+    """Each with a full stop."""
+    return [f"{line.rstrip('.')}." for line in lines]
 
 
 def numbers(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -217,7 +217,7 @@ def _collected(plan: Plan, pairs: list[tuple[dict[str, Any], Any]], run: Run) ->
     except (LookupError, StopIteration, ValueError) as e:
         if not plan.left_out:
             raise
-        raise InputError(f"{plan.name}: cannot be told without the {plan.left_out} tasks that have not been run") from e
+        raise InputError(f"{plan.name}: cannot be shown: {plan.left_out} of its tasks have not been run") from e
 
 
 def _environment(where: Where) -> dict[str, Any]:

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.compare import DECIDES, comparison, headlines, told
+from experiments.runner.compare import DECIDES, comparison, findings, headlines, notes
 from experiments.runner.config import shown
 from experiments.runner.tables import cells, markdown, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
-__all__ = ["Section", "of_run", "write_docs", "write_html", "write_list_docs", "write_page"]
+__all__ = ["Section", "folded", "of_run", "part", "write_docs", "write_html", "write_list_docs", "write_page"]
+
+MOST_COLUMNS = 8  # of the table that a page shows
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
@@ -30,7 +32,7 @@ h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made
 {% if sections | length > 1 and s.title %}<h2 id="{{ s.anchor }}">{{ s.title }}</h2>{% endif %}
 {% if s.synthetic %}<p><span class="tag">synthetic</span></p>{% endif %}
 {% for line in s.made %}<p class="made">{{ line }}</p>{% endfor %}
-{% if s.told %}<ul>{% for line in s.told %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
+{% if s.said %}<ul>{% for line in s.said %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
 {% if s.links %}<p>{% for name, to in s.links %}<a href="{{ to }}">{{ name }}</a> {% endfor %}</p>{% endif %}
 {% for caption, lines in s.tables %}<div class="scroll"><table><caption>{{ caption }}</caption><thead><tr>
 {% for h in lines[0] %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
@@ -45,12 +47,12 @@ h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page: how it was `made`, what is `told` of it, tables (caption, lines), figures (name, PNG)."""
+    """A part of a page: how it was `made`, what is `said` of it, tables (caption, lines), figures (name, PNG)."""
 
     title: str
     synthetic: bool = False
     made: Sequence[str] = ()
-    told: Sequence[str] = ()
+    said: Sequence[str] = ()
     links: Sequence[tuple[str, str]] = ()
     tables: Sequence[tuple[str, list[list[str]]]] = field(default_factory=list)
     figures: Sequence[tuple[str, str]] = field(default_factory=list)
@@ -76,7 +78,7 @@ def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = ()
         title=metrics["artefact"],
         synthetic=metrics["synthetic"],
         made=made,
-        told=[*told(metrics), f"{metrics['seconds']} s."],
+        said=[*findings(metrics), *notes(metrics), f"{metrics['seconds']} s."],
         links=links,
         tables=tables,
         figures=[(p.stem.replace("_", " "), base64.b64encode(p.read_bytes()).decode("ascii")) for p in images],
@@ -116,7 +118,7 @@ def write_docs(
     ]
     for k, folder in enumerate(folders):
         lines += ["", f"## {points[k]}", ""] if k < len(points) and points[k] else []
-        lines += _lines(folder, docs, name, "" if len(folders) == 1 else f"{k}_")
+        lines += _lines(folder, Path(config), docs, name, "" if len(folders) == 1 else f"{k}_")
     (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -141,14 +143,18 @@ def write_list_docs(
             "",
         ]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
+        compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
+        lines += [f"At least as good as the paper in {better} of {compared}.", ""] if compared else []
         if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
-            lines += [markdown(cells(first, 4), DECIDES)]
+            lines += [_narrow(markdown(cells(first, 4), DECIDES)), ""]
         for path, folders in runs.items():
             lines += [f"## {path.stem}", ""]
             for k, folder in enumerate(folders):
-                lines += [*_lines(folder, docs, home.name, f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"), ""]
+                before = f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"
+                lines += [*_lines(folder, path, docs, home.name, before), ""]
         if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
-            lines += ["## Paper against ours", "", markdown(cells(against, 4), "Every number of the paper")]
+            every_number = markdown(cells(against, 4), "Every number of the paper").rstrip()
+            lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number)]
         pages.append(docs / f"{home.name}.md")
         pages[-1].write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     return pages
@@ -158,24 +164,51 @@ def _by(arguments: str) -> str:
     return f"Made by `python -m experiments {arguments}`."
 
 
-def _lines(folder: Path, docs: Path, name: str, before: str) -> list[str]:
-    """What a page says of the run in `folder`: a sentence, its figures, which are put under `docs/figures/NAME/`, its
-    first table; notes and other tables folded."""
+def _lines(folder: Path, config: Path, docs: Path, name: str, before: str) -> list[str]:
+    """What a page says of the run in `folder`; its figures are put under `docs/figures/NAME/`."""
     metrics = json.loads((folder / "metrics.json").read_text())
-    first, *notes = told(metrics) or [""]
-    lines, home = [first], docs / "figures" / name
+    figures, home = [], docs / "figures" / name
     for figure in sorted((folder / "figures").glob("*.png")):
         home.mkdir(parents=True, exist_ok=True)
         to = home / (figure.name if before == f"{figure.stem}_" else f"{before}{figure.name}")
         to.write_bytes(figure.read_bytes())
-        lines += ["", f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})"]
-    tables = [t.read_text(encoding="utf-8").rstrip() for t in sorted((folder / "tables").glob("*.md"))]
-    lines += ["", *tables[:1]] if tables else []
+        figures.append(f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})")
+    files = sorted((folder / "tables").glob("*.md"), key=lambda path: (path.stem != "table", path.stem))
+    tables = [path.read_text(encoding="utf-8") for path in files]
+    return part([*_about(config), *findings(metrics)], figures, tables, notes(metrics))
+
+
+def part(said: Sequence[str], figures: Sequence[str], tables: Sequence[str], notes: Sequence[str]) -> list[str]:
+    """A part of a page: what it shows and found, its figures, its first table; notes and other tables folded."""
+    lines = [" ".join(said)]
+    for figure in figures:
+        lines += ["", figure]
+    first = _narrow(tables[0]) if tables else ""
+    more = [t.rstrip() for t in tables if t.rstrip() != first]
+    lines += ["", first] if first else []
     if notes:
-        lines += ["", *folded("What the columns mean", "\n".join(f"- {line}" for line in notes))]
-    if tables[1:]:
-        lines += ["", *folded("More tables", "\n\n".join(tables[1:]))]
+        lines += ["", *folded("Notes", "\n".join(f"- {line}" for line in notes))]
+    if more:
+        lines += ["", *folded("More tables", "\n\n".join(more))]
     return lines
+
+
+def _about(config: Path) -> list[str]:
+    """The first sentence of the comment that heads a config: what it is; none where it has no comment."""
+    comment = re.match(r"(?:#.*\n)+", config.read_text(encoding="utf-8"))
+    text = " ".join(line.lstrip("# ") for line in comment.group().splitlines()) if comment else ""
+    return [re.split(r"(?<=[.]) (?=[A-Z0-9])", text)[0]] if text else []
+
+
+def _narrow(table: str) -> str:
+    """A table of Markdown with at most `MOST_COLUMNS` columns: of more, the first ones."""
+    most = MOST_COLUMNS + 1  # the first part is what is before the first bar: nothing
+    lines = table.rstrip().split("\n")
+    return "\n".join("|".join([*_split(x)[:most], ""]) if x.startswith("|") else x for x in lines)
+
+
+def _split(row: str) -> list[str]:
+    return re.split(r"(?<!\\)\|", row.removesuffix("|"))
 
 
 def folded(title: str, text: str) -> list[str]:

@@ -133,9 +133,9 @@ def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
     tables = [("Runs", cells(rows))] if rows else []
     tables += [(DECIDES, cells(first, 4))] if first else []
     tables += [("Paper against ours", cells(lines, 4))] if lines else []
-    told = [] if came.made else ["No config of the list has been run."]
-    told += [f"Not made: {why}." for why in came.reasons()]
-    return Section("", told=told, links=[(p.title, f"#{p.anchor}") for p in parts], tables=tables)
+    said = [] if came.made else ["No config of the list has been run."]
+    said += [f"Not made: {why}." for why in came.reasons()]
+    return Section("", said=said, links=[(p.title, f"#{p.anchor}") for p in parts], tables=tables)
 
 
 def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:

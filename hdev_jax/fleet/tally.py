@@ -21,14 +21,17 @@ class Tally:
     """Running sums of one vehicle. `add` a batch at a time."""
 
     def __init__(self, variant: Variant, effects: dict[str, dict[str, Any]]):
-        self.variant, self.effects = variant, effects
-        self.rows = self.trips = self.halts = 0
+        self.variant: Variant = variant
+        self.effects: dict[str, dict[str, Any]] = effects
+        self.rows: int = 0
+        self.trips: int = 0
+        self.halts: int = 0
         self.sums: dict[str, float] = {}
         self.parts: dict[str, float] = {}
-        self.gears = np.zeros(variant.gears, int)
-        self.grade = np.zeros(len(GRADE_EDGES) - 1)
-        self.accel = np.zeros(len(ACCEL_EDGES) - 1)
-        self.kwh_per_km = np.zeros(0)
+        self.gears: np.ndarray = np.zeros(variant.gears, int)
+        self.grade: np.ndarray = np.zeros(len(GRADE_EDGES) - 1)
+        self.accel: np.ndarray = np.zeros(len(ACCEL_EDGES) - 1)
+        self.kwh_per_km: np.ndarray = np.zeros(0)
         self.points: dict[str, np.ndarray] = {}
         self.route: dict[str, np.ndarray] = {}
 

@@ -1,4 +1,4 @@
-"""The one training loop, of every network here: batches drawn anew each epoch, the whole epoch one compiled program.
+"""The one training loop, of every network here: new batches each epoch, the whole epoch one compiled program.
 
 What is trained is a pytree of weights; what is carried from batch to batch besides (running means of a batch
 normalisation) is its memory. Several members with starts, keys and settings of their own train in one program
@@ -32,7 +32,9 @@ class NotFiniteError(DivergedError):
     """A loss or its slope is NaN or infinite; the batch that it came from: `epoch`, `step` and `rows` of the data."""
 
     def __init__(self, epoch: int, step: int, rows: np.ndarray):
-        self.epoch, self.step, self.rows = epoch, step, rows
+        self.epoch: int = epoch
+        self.step: int = step
+        self.rows: np.ndarray = rows
         few = ", ".join(map(str, rows[:8])) + (", …" if len(rows) > 8 else "")
         super().__init__(
             f"training: the loss or its slope is not finite in epoch {epoch}, batch {step} (entries {few} of the "

@@ -1,4 +1,4 @@
-"""One raw table to the contract's columns in SI: headers parsed, an adapter's rules applied, text told from numbers."""
+"""One raw table to the contract's columns in SI: headers parsed, an adapter's rules applied, text or numbers."""
 
 from dataclasses import dataclass
 from typing import Any

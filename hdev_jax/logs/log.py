@@ -27,7 +27,7 @@ class Log:
     **Fields:** `segments`; `measured`, what is positive out of the battery and kept out of the channels
     (`battery_power_w`, `energy_wh`); `trip_names[trip[i]]` and `vehicle_names[segments.vehicle[i]]` name row i;
     `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from; `part`,
-    where one trip is told apart into several: the part that each row is in, in the place of its trip among the names.
+    where one trip is split into several: the part that each row is in, in the place of its trip among the names.
     """
 
     segments: Segments

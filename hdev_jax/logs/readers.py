@@ -1,4 +1,4 @@
-"""Files in: bytes to raw tables, every way in which a file is not what it claims told in one line."""
+"""Files in: bytes to raw tables, every way in which a file is not what it claims reported in one line."""
 
 import csv
 import gzip

@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
 from hdev_jax.physics.parameter import Choice, Shape, Size, Switch
 from hdev_jax.units import GRAVITY_MPS2
 
@@ -36,20 +36,20 @@ LIMITS = 90  # order of the switches: after every load and loss they act on
 class BatteryResistance(Effect):
     """Loss in the battery's resistance: R·P²/V²."""
 
-    id: ClassVar = "battery_resistance"
-    label: ClassVar = "battery resistance"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "R·P²/V²"
-    source: ClassVar = "Plett, Battery Management Systems, vol. 1 (Rint model)"
-    needs: ClassVar = ("voltage_v|nominal_voltage_v",)  # the latter a sheet's
+    id: ClassVar[str] = "battery_resistance"
+    label: ClassVar[str] = "battery resistance"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "R·P²/V²"
+    source: ClassVar[str] = "Plett, Battery Management Systems, vol. 1 (Rint model)"
+    needs: ClassVar[Names] = ("voltage_v|nominal_voltage_v",)  # the latter a sheet's
     # packs of vehicles have 0.03 to 0.3 Ω when warm, about three times that at −20 °C
-    parameters: ClassVar = (Size("resistance_ohm", "Ω", 0.0, 0.1, 0.0, 1.0, least=1e-4),)
-    mistaken_for: ClassVar = ("copper_loss",)
-    separated_by: ClassVar = "pulses of current at several states of charge"
-    order: ClassVar = 50
+    parameters: ClassVar[Parameters] = (Size("resistance_ohm", "Ω", 0.0, 0.1, 0.0, 1.0, least=1e-4),)
+    mistaken_for: ClassVar[Names] = ("copper_loss",)
+    separated_by: ClassVar[str] = "pulses of current at several states of charge"
+    order: ClassVar[int] = 50
     resistance_ohm: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         volts = jnp.maximum(jnp.abs(jnp.asarray(car.voltage(row))), 1.0)
         return self.resistance_ohm * (point.power_w / volts) ** 2
 
@@ -57,25 +57,25 @@ class BatteryResistance(Effect):
 class VoltageDependence(Effect):
     """Consumption that follows the voltage: P·k·(V − V₀)."""
 
-    id: ClassVar = "voltage_dependence"
-    label: ClassVar = "dependence on the battery's voltage"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·k·(V − V₀)"
-    source: ClassVar = "inverter efficiency against DC voltage"
-    needs: ClassVar = ("voltage_v",)
-    parameters: ClassVar = (
+    id: ClassVar[str] = "voltage_dependence"
+    label: ClassVar[str] = "dependence on the battery's voltage"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P·k·(V − V₀)"
+    source: ClassVar[str] = "inverter efficiency against DC voltage"
+    needs: ClassVar[Names] = ("voltage_v",)
+    parameters: ClassVar[Parameters] = (
         # an inverter's efficiency moves by a few percent over 100 V
         Size("per_v", "1/V", 0.0, 5e-4, -5e-3, 5e-3, least=1e-6, label="per volt"),
         # where the sheet's efficiencies hold; far off it is a gain of the power, which they may not be able to absorb
         Shape("at_v", "V", 650.0, 50.0, 200.0, 1000.0, grid=(350.0, 550.0, 600.0, 650.0, 700.0, 800.0)),
     )
-    mistaken_for: ClassVar = ("battery_resistance",)
-    separated_by: ClassVar = "long trips from full to empty"
-    order: ClassVar = 40
+    mistaken_for: ClassVar[Names] = ("battery_resistance",)
+    separated_by: ClassVar[str] = "long trips from full to empty"
+    order: ClassVar[int] = 40
     per_v: Any
     at_v: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return point.power_w * self.per_v * (row.channels["voltage_v"] - self.at_v)
 
 
@@ -86,18 +86,18 @@ class EfficiencyScale(Effect):
     is `gear_efficiency` where the vehicle has one gear.
     """
 
-    id: ClassVar = "efficiency_scale"
-    label: ClassVar = "scale of the efficiency"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "s·|P|"
-    source: ClassVar = "paper 1, eq. 5 (η); paper 2, eq. 6, 10 and 11"
-    parameters: ClassVar = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
-    mistaken_for: ClassVar = ("gear_efficiency", "copper_loss", "inverter_loss")
-    separated_by: ClassVar = "driving and braking at the same power, at several torques"
-    order: ClassVar = -10  # before the loads: at the entry to the battery
+    id: ClassVar[str] = "efficiency_scale"
+    label: ClassVar[str] = "scale of the efficiency"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "s·|P|"
+    source: ClassVar[str] = "paper 1, eq. 5 (η); paper 2, eq. 6, 10 and 11"
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    mistaken_for: ClassVar[Names] = ("gear_efficiency", "copper_loss", "inverter_loss")
+    separated_by: ClassVar[str] = "driving and braking at the same power, at several torques"
+    order: ClassVar[int] = -10  # before the loads: at the entry to the battery
     scale: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.scale * jnp.abs(point.power_w)
 
 
@@ -107,41 +107,41 @@ class RegenEfficiency(Effect):
     With a regenerating efficiency that is estimated it is that one under another name.
     """
 
-    id: ClassVar = "regen_efficiency"
-    label: ClassVar = "efficiency of regeneration"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "s·max(−P, 0)"
-    source: ClassVar = "paper 2, eq. 7-9 (η_rg)"
-    parameters: ClassVar = (Size("share", "1", 0.0, 0.1, -0.3, 1.0, least=0.005),)
-    mistaken_for: ClassVar = ("friction_blending", "mass_scale", "power_gain", "mode_change")
-    separated_by: ClassVar = "coasting and braking on the flat, and the balance of charge"
-    order: ClassVar = 25
+    id: ClassVar[str] = "regen_efficiency"
+    label: ClassVar[str] = "efficiency of regeneration"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "s·max(−P, 0)"
+    source: ClassVar[str] = "paper 2, eq. 7-9 (η_rg)"
+    parameters: ClassVar[Parameters] = (Size("share", "1", 0.0, 0.1, -0.3, 1.0, least=0.005),)
+    mistaken_for: ClassVar[Names] = ("friction_blending", "mass_scale", "power_gain", "mode_change")
+    separated_by: ClassVar[str] = "coasting and braking on the flat, and the balance of charge"
+    order: ClassVar[int] = 25
     share: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.share * jnp.maximum(-point.power_w, 0.0)
 
 
 class FrictionBlending(Effect):
     """Braking power that the friction brakes take: s·|P| less recovered while the brake has pressure."""
 
-    id: ClassVar = "friction_blending"
-    label: ClassVar = "blending of the friction brake"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "−s·min(P, 0)·[p_brake > p₀]"
-    source: ClassVar = "paper 2, eq. 7-9 (η_rg)"
-    needs: ClassVar = ("brake_pressure_pa",)
-    parameters: ClassVar = (
+    id: ClassVar[str] = "friction_blending"
+    label: ClassVar[str] = "blending of the friction brake"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "−s·min(P, 0)·[p_brake > p₀]"
+    source: ClassVar[str] = "paper 2, eq. 7-9 (η_rg)"
+    needs: ClassVar[Names] = ("brake_pressure_pa",)
+    parameters: ClassVar[Parameters] = (
         Size("share", "1", 0.0, 0.3, 0.0, 1.0, least=0.01),
         Choice("above_pa", "Pa", 2e4, 2e4, 0.0, 1e6, grid=(0.0, 2e4, 1e5)),
     )
-    mistaken_for: ClassVar = ("regen_cutoff", "regen_limit")
-    separated_by: ClassVar = "braking with and without pressure at one speed"
-    order: ClassVar = 30
+    mistaken_for: ClassVar[Names] = ("regen_cutoff", "regen_limit")
+    separated_by: ClassVar[str] = "braking with and without pressure at one speed"
+    order: ClassVar[int] = 30
     share: Any
     above_pa: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         pressed = row.channels["brake_pressure_pa"] > self.above_pa
         return -self.share * jnp.where(pressed, jnp.minimum(point.power_w, 0.0), 0.0)
 
@@ -152,42 +152,42 @@ class RegenLimit(Effect):
     s = 1 is a hard limit; brakes that blend act in part.
     """
 
-    id: ClassVar = "regen_limit"
-    label: ClassVar = "limit of regeneration"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "s·max(−P − P_lim, 0)"
-    source: ClassVar = "charge limit of the battery management"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "regen_limit"
+    label: ClassVar[str] = "limit of regeneration"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "s·max(−P − P_lim, 0)"
+    source: ClassVar[str] = "charge limit of the battery management"
+    parameters: ClassVar[Parameters] = (
         Switch("power_w", "W", OFF_W, 5e3, 500.0, OFF_W, grid=_ladder(1e4, 3.5e5, 27)),
         Choice("share", "1", 1.0, 0.3, 0.0, 1.0, grid=(1.0, 0.5)),
     )
-    mistaken_for: ClassVar = ("friction_blending", "regen_efficiency")
-    separated_by: ClassVar = "hard braking from speed, battery full"
-    order: ClassVar = LIMITS
+    mistaken_for: ClassVar[Names] = ("friction_blending", "regen_efficiency")
+    separated_by: ClassVar[str] = "hard braking from speed, battery full"
+    order: ClassVar[int] = LIMITS
     power_w: Any
     share: Any = 1.0
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.share * jnp.maximum(-point.power_w - self.power_w, 0.0)
 
 
 class RegenCutoff(Effect):
     """Nothing is recovered below v₀: −min(P, 0)·[v < v₀]."""
 
-    id: ClassVar = "regen_cutoff"
-    label: ClassVar = "cut-off of regeneration at low speed"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "−min(P, 0)·[v < v₀]"
-    source: ClassVar = "blending out of regeneration at walking pace"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "regen_cutoff"
+    label: ClassVar[str] = "cut-off of regeneration at low speed"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "−min(P, 0)·[v < v₀]"
+    source: ClassVar[str] = "blending out of regeneration at walking pace"
+    parameters: ClassVar[Parameters] = (
         Switch("speed_mps", "m/s", 0.0, 1.0, 0.3, 12.0, grid=(1.0, 1.7, 2.5, 3.5, 4.5, 5.5, 6.5, 8.0, 10.0)),
     )
-    mistaken_for: ClassVar = ("friction_blending",)
-    separated_by: ClassVar = "slow braking to standstill"
-    order: ClassVar = LIMITS - 1
+    mistaken_for: ClassVar[Names] = ("friction_blending",)
+    separated_by: ClassVar[str] = "slow braking to standstill"
+    order: ClassVar[int] = LIMITS - 1
     speed_mps: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         # an edge of 0.1 m/s, about as fine as speeds are measured, so that v₀ has a slope; nothing at the null v₀ = 0
         below = jax.nn.sigmoid((self.speed_mps - row.speed_mps) / 0.1)
         return jnp.where(self.speed_mps > 0, -below * jnp.minimum(point.power_w, 0.0), 0.0)
@@ -196,46 +196,46 @@ class RegenCutoff(Effect):
 class TractionLimit(Effect):
     """The drive gives no more than P_lim: − max(P − P_lim, 0)."""
 
-    id: ClassVar = "traction_limit"
-    label: ClassVar = "limit of traction power"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "−max(P − P_lim, 0)"
-    source: ClassVar = "derating of motor or battery"
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (Switch("power_w", "W", OFF_W, 1e4, 5e3, OFF_W, grid=_ladder(3e4, 5e5, 12)),)
-    mistaken_for: ClassVar = ("copper_loss",)
-    separated_by: ClassVar = "full throttle uphill"
-    order: ClassVar = LIMITS
+    id: ClassVar[str] = "traction_limit"
+    label: ClassVar[str] = "limit of traction power"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "−max(P − P_lim, 0)"
+    source: ClassVar[str] = "derating of motor or battery"
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (Switch("power_w", "W", OFF_W, 1e4, 5e3, OFF_W, grid=_ladder(3e4, 5e5, 12)),)
+    mistaken_for: ClassVar[Names] = ("copper_loss",)
+    separated_by: ClassVar[str] = "full throttle uphill"
+    order: ClassVar[int] = LIMITS
     power_w: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return -jnp.maximum(point.power_w - self.power_w, 0.0)
 
 
 class StepChange(Effect):
     """A change that stays, from trip k on: a load, a rolling resistance, or a loss in proportion to power."""
 
-    id: ClassVar = "step_change"
-    label: ClassVar = "step change of a coefficient"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "[trip ≥ k]·(ΔP + Δc·m·g·v + Δg·|P|)"
-    source: ClassVar = "ageing, a service event, a fault"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "step_change"
+    label: ClassVar[str] = "step change of a coefficient"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "[trip ≥ k]·(ΔP + Δc·m·g·v + Δg·|P|)"
+    source: ClassVar[str] = "ageing, a service event, a fault"
+    parameters: ClassVar[Parameters] = (
         Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
         Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
         Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
         Choice("at_trip", "1", 0.0, 1.0, grid=()),  # every trip with three of the same vehicle on either side
     )
-    variants: ClassVar = (("power_w",), ("c_rr",), ("loss",))
-    mistaken_for: ClassVar = ("rolling_temperature", "mass_scale")
-    separated_by: ClassVar = "the same trip again, before and after a service"
-    order: ClassVar = 20
+    variants: ClassVar[tuple[Names, ...]] = (("power_w",), ("c_rr",), ("loss",))
+    mistaken_for: ClassVar[Names] = ("rolling_temperature", "mass_scale")
+    separated_by: ClassVar[str] = "the same trip again, before and after a service"
+    order: ClassVar[int] = 20
     power_w: Any
     c_rr: Any
     loss: Any
     at_trip: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         at_trip = jnp.asarray(self.at_trip)
         after = jnp.where(jnp.asarray(row.trip).astype(at_trip.dtype) >= at_trip - 0.5, 1.0, 0.0)
         weight = car.mass(row) * GRAVITY_MPS2 * row.speed_mps
@@ -245,16 +245,16 @@ class StepChange(Effect):
 class ModeChange(Effect):
     """A second mode that holds in some trips: a load, a rolling resistance, a loss, or regeneration that is weaker.
 
-    Which trips is sought, not declared; on a trip that nobody has fitted (`in_mode` NaN) it weighs as often as it was
-    seen.
+    The trips are searched for, not declared; on a trip outside the fit (`in_mode` NaN) z is the share of trips in the
+    mode.
     """
 
-    id: ClassVar = "mode_change"
-    label: ClassVar = "change of operating mode"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "z·(ΔP + Δc·m·g·v + Δg·|P| + Δr·max(−P, 0)), z of each trip 0 or 1"
-    source: ClassVar = "limp mode, weak regeneration, a second driver's setting"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "mode_change"
+    label: ClassVar[str] = "change of operating mode"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "z·(ΔP + Δc·m·g·v + Δg·|P| + Δr·max(−P, 0)), z of each trip 0 or 1"
+    source: ClassVar[str] = "limp mode, weak regeneration, a second driver's setting"
+    parameters: ClassVar[Parameters] = (
         Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
         Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
         Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
@@ -263,11 +263,11 @@ class ModeChange(Effect):
         Choice("in_mode", "1", float("nan"), 1.0, 0.0, 1.0),
     )
     # a load that is there in some trips only could be anything: it may be declared, but is not looked for
-    variants: ClassVar = (("regeneration",), ("loss",), ("c_rr",))
-    searched: ClassVar = "trips"
-    mistaken_for: ClassVar = ("step_change", "mass_scale")
-    separated_by: ClassVar = "the same trip in either mode"
-    order: ClassVar = 20
+    variants: ClassVar[tuple[Names, ...]] = (("regeneration",), ("loss",), ("c_rr",))
+    searched: ClassVar[str] = "trips"
+    mistaken_for: ClassVar[Names] = ("step_change", "mass_scale")
+    separated_by: ClassVar[str] = "the same trip in either mode"
+    order: ClassVar[int] = 20
     power_w: Any
     c_rr: Any
     loss: Any
@@ -275,7 +275,7 @@ class ModeChange(Effect):
     share: Any
     in_mode: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         z = jnp.where(jnp.isnan(self.in_mode), self.share, self.in_mode)
         weight = car.mass(row) * GRAVITY_MPS2 * row.speed_mps
         recovered = jnp.maximum(-point.power_w, 0.0)

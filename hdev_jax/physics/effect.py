@@ -18,16 +18,26 @@ __all__ = [
     "STAGES",
     "Car",
     "Effect",
+    "GoesWith",
     "Grouped",
+    "Names",
+    "Parameters",
     "Point",
     "Real",
+    "Row",
+    "Signal",
     "Stage",
     "resolve",
 ]
 
 Stage = Literal["sensors", "road", "driveline", "machine", "battery"]
 STAGES: tuple[Stage, ...] = ("sensors", "road", "driveline", "machine", "battery")
+GoesWith = Literal["", "weight", "air"]
+Names = tuple[str, ...]
+Parameters = tuple[Parameter, ...]
 Real = Float[Array, ""]
+Row = Segments  # of one row: its columns are scalars
+Signal = Float[Array, " row"]  # one value for each row
 
 
 class Point(eqx.Module):
@@ -45,13 +55,13 @@ class Grouped(eqx.Module):
     values: Float[Array, "*row group"] = eqx.field(converter=as_array)
     by: str = eqx.field(static=True)
 
-    def at(self, row: Segments) -> Real:
+    def at(self, row: Row) -> Real:
         """The value that holds for this row; ids below 0 take the first, ids past the end the last."""
         key = getattr(row, self.by) if self.by in ("vehicle", "trip") else row.channels[self.by]
         return self.values[jnp.clip(jnp.asarray(key).astype(int), 0, self.values.shape[0] - 1)]
 
 
-def resolve(tree: Any, row: Segments) -> Any:
+def resolve(tree: Any, row: Row) -> Any:
     """The same tree with each `Grouped` coefficient replaced by its value for this row."""
     is_grouped: Callable[[Any], bool] = lambda x: isinstance(x, Grouped)  # noqa: E731
     return jax.tree.map(lambda x: x.at(row) if is_grouped(x) else x, tree, is_leaf=is_grouped)
@@ -73,7 +83,7 @@ def _is_class_variable(annotation: Any) -> bool:
 class Ratios(Protocol):
     """What effects read of the driveline."""
 
-    def ratio_radpm(self, row: Segments) -> Any:
+    def ratio_radpm(self, row: Row) -> Any:
         """Motor speed over vehicle speed [rad/m]."""
         ...
 
@@ -100,7 +110,7 @@ class Car(Protocol):
         """The effect of that id."""
         ...
 
-    def mass(self, row: Segments) -> Any:
+    def mass(self, row: Row) -> Any:
         """Total mass [kg]."""
         ...
 
@@ -108,11 +118,11 @@ class Car(Protocol):
         """c_rr of the declared rolling resistance."""
         ...
 
-    def drag(self, row: Segments) -> Any:
+    def drag(self, row: Row) -> Any:
         """½ρ·C_d·A of the declared drag [N/(m/s)²]."""
         ...
 
-    def voltage(self, row: Segments) -> Any:
+    def voltage(self, row: Row) -> Any:
         """Voltage of the battery [V]."""
         ...
 
@@ -135,18 +145,18 @@ class Effect(eqx.Module):
     stage: ClassVar[Stage]
     equation: ClassVar[str]
     source: ClassVar[str] = ""
-    needs: ClassVar[tuple[str, ...]] = ()
-    lacks: ClassVar[tuple[str, ...]] = ()  # channels whose presence makes the effect pointless
+    needs: ClassVar[Names] = ()
+    lacks: ClassVar[Names] = ()  # channels whose presence makes the effect pointless
     instead: ClassVar[str] = ""  # why it does, in a phrase; default: the log has the channel itself
-    entries: ClassVar[tuple[str, ...]] = ("road", "wheel", "shaft")  # where the chain may be entered for it to act
-    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    entries: ClassVar[Names] = ("road", "wheel", "shaft")  # where the chain may be entered for it to act
+    parameters: ClassVar[Parameters] = ()
     ordered: ClassVar[tuple[tuple[str, str], ...]] = ()  # pairs of parameters of which the first is the lower
-    variants: ClassVar[tuple[tuple[str, ...], ...]] = ()  # sets of sizes tried together; default: all of them
-    mistaken_for: ClassVar[tuple[str, ...]] = ()
+    variants: ClassVar[tuple[Names, ...]] = ()  # sets of sizes tried together; default: all of them
+    mistaken_for: ClassVar[Names] = ()
     separated_by: ClassVar[str] = ""
     order: ClassVar[int] = 0  # limits come after what they limit
     of_battery: ClassVar[bool] = False  # says nothing of a force or a torque
-    goes_with: ClassVar[Literal["", "weight", "air"]] = ""
+    goes_with: ClassVar[GoesWith] = ""
     declared: ClassVar[Mapping[str, str]] = {}  # fields of a declared term with their keys in a sheet
     searched: ClassVar[str] = ""  # where it is looked for, if its columns are not known before it is found
 
@@ -193,30 +203,30 @@ class Effect(eqx.Module):
         """Measurements as this effect says they should have been, by trip."""
         return segments
 
-    def sense(self, row: Segments, car: Car) -> Segments:
+    def sense(self, row: Row, car: Car) -> Row:
         """One row's measurements, corrected."""
         return row
 
-    def force(self, row: Segments, car: Car) -> Real | float:
+    def force(self, row: Row, car: Car) -> Real | float:
         """Force that the road asks for besides [N]."""
         return 0.0
 
-    def split(self, row: Segments, car: Car) -> tuple[Real | float, Real | float]:
+    def split(self, row: Row, car: Car) -> tuple[Real | float, Real | float]:
         """Of its force the parts that go with the weight and with the air [N]."""
         if not self.goes_with:
             return 0.0, 0.0
         force = self.force(row, car)
         return (force, 0.0) if self.goes_with == "weight" else (0.0, force)
 
-    def drive(self, row: Segments, car: Car, point: Point) -> Real | float:
+    def drive(self, row: Row, car: Car, point: Point) -> Real | float:
         """Loss in the driveline as a force at the wheel [N]."""
         return 0.0
 
-    def power(self, row: Segments, car: Car, point: Point) -> Real | float:
+    def power(self, row: Row, car: Car, point: Point) -> Real | float:
         """Power besides, at the machine or the battery [W]."""
         return 0.0
 
-    def observe(self, column: Float[Array, " row"], segments: Segments) -> Float[Array, " row"]:
+    def observe(self, column: Signal, segments: Segments) -> Signal:
         """The predicted column as the instrument would show it, by trip."""
         return column
 

@@ -1,11 +1,12 @@
 """Loads of the vehicle that draw on the battery whatever the drive does."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
 from hdev_jax.physics.parameter import Choice, Shape, Size
 
 __all__ = [
@@ -26,46 +27,46 @@ HEATING_BELOW_C, COOLING_ABOVE_C = 18.0, 22.0  # usual set points of a city bus'
 class Auxiliary(Effect):
     """The declared auxiliary load of the sheet, `[battery] auxiliary_w`."""
 
-    id: ClassVar = "auxiliary"
-    label: ClassVar = "declared auxiliary load"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P_aux"
-    source: ClassVar = "paper 1, section 3.2 (loads)"
-    declared: ClassVar = {"auxiliary_w": "battery.auxiliary_w"}
+    id: ClassVar[str] = "auxiliary"
+    label: ClassVar[str] = "declared auxiliary load"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P_aux"
+    source: ClassVar[str] = "paper 1, section 3.2 (loads)"
+    declared: ClassVar[Mapping[str, str]] = {"auxiliary_w": "battery.auxiliary_w"}
     auxiliary_w: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.auxiliary_w
 
 
 class AuxiliaryPower(Effect):
     """A constant load besides the declared one."""
 
-    id: ClassVar = "auxiliary_power"
-    label: ClassVar = "constant auxiliary load"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P₀"
-    source: ClassVar = "paper 2, section III-A (loads left out there)"
+    id: ClassVar[str] = "auxiliary_power"
+    label: ClassVar[str] = "constant auxiliary load"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P₀"
+    source: ClassVar[str] = "paper 2, section III-A (loads left out there)"
     # electric heaters of articulated buses have 40 to 60 kW
-    parameters: ClassVar = (Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=5.0, constant=True),)
-    mistaken_for: ClassVar = ("power_gain", "inverter_loss")
-    separated_by: ClassVar = "standing still with the vehicle on, and with it off"
+    parameters: ClassVar[Parameters] = (Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=5.0, constant=True),)
+    mistaken_for: ClassVar[Names] = ("power_gain", "inverter_loss")
+    separated_by: ClassVar[str] = "standing still with the vehicle on, and with it off"
     power_w: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.power_w
 
 
 class HvacPower(Effect):
     """Heating below one temperature and cooling above another: k₁·max(T₁−T, 0) + k₂·max(T−T₂, 0)."""
 
-    id: ClassVar = "hvac_power"
-    label: ClassVar = "cabin heating and cooling"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "k₁·max(T₁−T, 0) + k₂·max(T−T₂, 0)"
-    source: ClassVar = "Basma et al., Energy 207 (2020) (bus cabin, steady state)"
-    needs: ClassVar = ("ambient_temp_c",)
-    parameters: ClassVar = (
+    id: ClassVar[str] = "hvac_power"
+    label: ClassVar[str] = "cabin heating and cooling"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "k₁·max(T₁−T, 0) + k₂·max(T−T₂, 0)"
+    source: ClassVar[str] = "Basma et al., Energy 207 (2020) (bus cabin, steady state)"
+    needs: ClassVar[Names] = ("ambient_temp_c",)
+    parameters: ClassVar[Parameters] = (
         # an articulated bus loses about 1 kW/K through its skin and its doors
         Size("below_w_per_k", "W/K", 0.0, 100.0, 0.0, 3e3, least=1.0, label="below the heating limit"),
         Size("above_w_per_k", "W/K", 0.0, 100.0, 0.0, 3e3, least=1.0, label="above the cooling limit"),
@@ -78,16 +79,16 @@ class HvacPower(Effect):
             of="above_w_per_k", label="cooling limit"
         ),
     )  # fmt: skip
-    ordered: ClassVar = (("heat_c", "cool_c"),)
-    variants: ClassVar = (("below_w_per_k",), ("above_w_per_k",), ("below_w_per_k", "above_w_per_k"))
-    mistaken_for: ClassVar = ("rolling_temperature", "air_density")
-    separated_by: ClassVar = "standing still on hot and cold days"
+    ordered: ClassVar[tuple[tuple[str, str], ...]] = (("heat_c", "cool_c"),)
+    variants: ClassVar[tuple[Names, ...]] = (("below_w_per_k",), ("above_w_per_k",), ("below_w_per_k", "above_w_per_k"))
+    mistaken_for: ClassVar[Names] = ("rolling_temperature", "air_density")
+    separated_by: ClassVar[str] = "standing still on hot and cold days"
     below_w_per_k: Any
     above_w_per_k: Any
     heat_c: Any
     cool_c: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         t = row.channels["ambient_temp_c"]
         heating = self.below_w_per_k * jnp.maximum(self.heat_c - t, 0.0)
         return heating + self.above_w_per_k * jnp.maximum(t - self.cool_c, 0.0)
@@ -99,21 +100,21 @@ class PassengerHeat(Effect):
     The temperatures that part heating from cooling are those of `hvac_power` where the vehicle has it.
     """
 
-    id: ClassVar = "passenger_heat"
-    label: ClassVar = "warmth of the passengers"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "h·N·([T > T₂] − [T < T₁])"
-    source: ClassVar = "Basma et al., Energy 207 (2020) (occupants in the cabin's heat balance)"
-    needs: ClassVar = ("passengers", "ambient_temp_c")
-    parameters: ClassVar = (
+    id: ClassVar[str] = "passenger_heat"
+    label: ClassVar[str] = "warmth of the passengers"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "h·N·([T > T₂] − [T < T₁])"
+    source: ClassVar[str] = "Basma et al., Energy 207 (2020) (occupants in the cabin's heat balance)"
+    needs: ClassVar[Names] = ("passengers", "ambient_temp_c")
+    parameters: ClassVar[Parameters] = (
         Size("w_per_passenger", "W", 0.0, 50.0, 0.0, 150.0, least=1.0, label="power per passenger"),
     )
-    mistaken_for: ClassVar = ("hvac_power", "mass_scale")
-    separated_by: ClassVar = "an hour at standstill, full and empty"
-    order: ClassVar = 10
+    mistaken_for: ClassVar[Names] = ("hvac_power", "mass_scale")
+    separated_by: ClassVar[str] = "an hour at standstill, full and empty"
+    order: ClassVar[int] = 10
     w_per_passenger: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         t = row.channels["ambient_temp_c"]
         heat_c, cool_c = HEATING_BELOW_C, COOLING_ABOVE_C
         if car.has("hvac_power"):  # a side that costs nothing has no temperature to speak of
@@ -128,21 +129,21 @@ class PassengerHeat(Effect):
 class CabinWarmup(Effect):
     """A load that dies away after the start: P·exp(−t/t₀)."""
 
-    id: ClassVar = "cabin_warmup"
-    label: ClassVar = "cabin warm-up"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·exp(−t/t₀)"
-    source: ClassVar = "Basma et al., Energy 207 (2020) (cabin transient)"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "cabin_warmup"
+    label: ClassVar[str] = "cabin warm-up"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P·exp(−t/t₀)"
+    source: ClassVar[str] = "Basma et al., Energy 207 (2020) (cabin transient)"
+    parameters: ClassVar[Parameters] = (
         Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
         Shape("tau_s", "s", 900.0, 600.0, 60.0, 7200.0, grid=(300.0, 900.0, 2400.0), label="time constant"),
     )
-    mistaken_for: ClassVar = ("tyre_warmup",)
-    separated_by: ClassVar = "standing still early and late"
+    mistaken_for: ClassVar[Names] = ("tyre_warmup",)
+    separated_by: ClassVar[str] = "standing still early and late"
     power_w: Any
     tau_s: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         t = row.time_s + 0.5 * row.duration_s
         return self.power_w * jnp.exp(-t / self.tau_s)
 
@@ -150,30 +151,30 @@ class CabinWarmup(Effect):
 class PeriodicLoad(Effect):
     """A load that switches on and off: P while cos(2π(t/T + φ)) > cos(πD).
 
-    φ may differ from trip to trip; where it is not known (NaN), as on a trip that nobody has fitted, the load is its
+    φ may differ from trip to trip; where it is not known (NaN), as on a trip outside the fit, the load is its
     mean P·D.
     """
 
-    id: ClassVar = "periodic_load"
-    label: ClassVar = "periodic load"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·[cos 2π(t/T + φ) > cos πD], φ by trip"
-    source: ClassVar = "thermostat with hysteresis"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "periodic_load"
+    label: ClassVar[str] = "periodic load"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P·[cos 2π(t/T + φ) > cos πD], φ by trip"
+    source: ClassVar[str] = "thermostat with hysteresis"
+    parameters: ClassVar[Parameters] = (
         Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
         Shape("period_s", "s", 900.0, 300.0, 20.0, 7200.0, grid=(600.0, 1200.0, 1500.0)),
         Shape("duty", "1", 0.5, 0.2, 0.05, 0.95, grid=(0.3, 0.5, 0.7)),
         Choice("phase", "1", float("nan"), 0.25, -1.0, 1.0),
     )
-    searched: ClassVar = "spectrum"
-    mistaken_for: ClassVar = ("standstill_load",)
-    separated_by: ClassVar = "an hour at standstill"
+    searched: ClassVar[str] = "spectrum"
+    mistaken_for: ClassVar[Names] = ("standstill_load",)
+    separated_by: ClassVar[str] = "an hour at standstill"
     power_w: Any
     period_s: Any
     duty: Any
     phase: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.power_w * self.on(row.time_s, row.duration_s)
 
     def on(self, start_s: Any, duration_s: Any) -> Any:
@@ -195,21 +196,21 @@ class PeriodicLoad(Effect):
 class StandstillLoad(Effect):
     """A load while standing still: P·[v = 0], all of the time or only while the doors are open."""
 
-    id: ClassVar = "standstill_load"
-    label: ClassVar = "load at standstill"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·[v < 0.1 m/s]·(1 − d + d·door)"
-    source: ClassVar = "PTO, doors and kneeling of city buses"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "standstill_load"
+    label: ClassVar[str] = "load at standstill"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P·[v < 0.1 m/s]·(1 − d + d·door)"
+    source: ClassVar[str] = "PTO, doors and kneeling of city buses"
+    parameters: ClassVar[Parameters] = (
         Size("power_w", "W", 0.0, 1000.0, 0.0, 1e5, least=10.0),
         Choice("by_door", "1", 0.0, 1.0, 0.0, 1.0, grid=(0.0, 1.0)),
     )
-    mistaken_for: ClassVar = ("auxiliary_power", "periodic_load")
-    separated_by: ClassVar = "parked, the load on and off"
+    mistaken_for: ClassVar[Names] = ("auxiliary_power", "periodic_load")
+    separated_by: ClassVar[str] = "parked, the load on and off"
     power_w: Any
     by_door: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         flag = 1.0 - self.by_door + self.by_door * row.get("door_open", 1.0)
         return self.power_w * jnp.where(row.speed_mps < STANDSTILL_MPS, flag, 0.0)
 
@@ -217,21 +218,21 @@ class StandstillLoad(Effect):
 class CoolingPower(Effect):
     """Cooling of the battery: k·max(T_batt − T₀, 0)."""
 
-    id: ClassVar = "cooling_power"
-    label: ClassVar = "cooling power"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "k·max(T_batt − T₀, 0)"
-    source: ClassVar = "thermostat of a battery chiller"
-    needs: ClassVar = ("battery_temp_c",)
-    parameters: ClassVar = (
+    id: ClassVar[str] = "cooling_power"
+    label: ClassVar[str] = "cooling power"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "k·max(T_batt − T₀, 0)"
+    source: ClassVar[str] = "thermostat of a battery chiller"
+    needs: ClassVar[Names] = ("battery_temp_c",)
+    parameters: ClassVar[Parameters] = (
         # chillers of batteries have 2 to 10 kW, reached within 5 to 10 K
         Size("w_per_k", "W/K", 0.0, 100.0, 0.0, 2e3, least=1.0),
         Shape("start_c", "°C", 25.0, 4.0, 5.0, 45.0, grid=(20.0, 25.0, 30.0)),
     )
-    mistaken_for: ClassVar = ("hvac_power",)
-    separated_by: ClassVar = "standing still after hard driving"
+    mistaken_for: ClassVar[Names] = ("hvac_power",)
+    separated_by: ClassVar[str] = "standing still after hard driving"
     w_per_k: Any
     start_c: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.w_per_k * jnp.maximum(row.channels["battery_temp_c"] - self.start_c, 0.0)

@@ -89,9 +89,9 @@ class Parameter:
 class Size(Parameter):
     """A size has a derivative at the null: its column is one `jvp`.
 
-    `least` is the smallest worth naming. `by`: one value for each id in that channel; `whole`: sought in the commonest
-    group too (nothing declared stands for it), and as one number where the log tells no groups. `constant`: it adds the
-    same in every row.
+    `least` is the smallest worth naming. `by`: one value for each id in that channel; `whole`: the commonest group
+    has one too (nothing declared stands for it), and a log without groups has one number. `constant`: it adds the same
+    in every row.
     """
 
     least: float = field(default=0.0, kw_only=True)

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from hdev_jax.physics.across import later_slope, low_pass, neighbours, shifted
-from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Row, Signal, Stage
 from hdev_jax.physics.parameter import Choice, Size, Switch
+from hdev_jax.segments import Segments
 
 __all__ = [
     "AccelerometerBias",
@@ -26,98 +27,98 @@ __all__ = [
 class MassScale(Effect):
     """The mass is another than logged: m·(1 + s)."""
 
-    id: ClassVar = "mass_scale"
-    label: ClassVar = "payload error"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "m → m·(1 + s)"
-    source: ClassVar = "paper 1, section 5 (mass as future work)"
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (Size("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.002),)
-    mistaken_for: ClassVar = ("rotating_mass",)
-    separated_by: ClassVar = "the same road empty and loaded"
+    id: ClassVar[str] = "mass_scale"
+    label: ClassVar[str] = "payload error"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "m → m·(1 + s)"
+    source: ClassVar[str] = "paper 1, section 5 (mass as future work)"
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.002),)
+    mistaken_for: ClassVar[Names] = ("rotating_mass",)
+    separated_by: ClassVar[str] = "the same road empty and loaded"
     scale: Any
 
-    def sense(self, row, car):
+    def sense(self, row: Row, car: Car) -> Row:
         return row.with_channels(mass_kg=jnp.asarray(car.mass(row) * (1.0 + self.scale)))
 
 
 class GradeBias(Effect):
     """The slope has an offset: θ + b. The same as rolling resistance on every log that is not out and back."""
 
-    id: ClassVar = "grade_bias"
-    label: ClassVar = "slope bias"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "θ → θ + b"
-    source: ClassVar = "mounting of an inclinometer"
-    needs: ClassVar = ("grade_rad",)
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (Size("bias_rad", "rad", 0.0, 2e-3, -0.05, 0.05, least=5e-5),)
-    mistaken_for: ClassVar = ("rolling",)
-    separated_by: ClassVar = "the same road out and back"
+    id: ClassVar[str] = "grade_bias"
+    label: ClassVar[str] = "slope bias"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "θ → θ + b"
+    source: ClassVar[str] = "mounting of an inclinometer"
+    needs: ClassVar[Names] = ("grade_rad",)
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (Size("bias_rad", "rad", 0.0, 2e-3, -0.05, 0.05, least=5e-5),)
+    mistaken_for: ClassVar[Names] = ("rolling",)
+    separated_by: ClassVar[str] = "the same road out and back"
     bias_rad: Any
 
-    def sense(self, row, car):
+    def sense(self, row: Row, car: Car) -> Row:
         return row.with_channels(grade_rad=row.channels["grade_rad"] + self.bias_rad)
 
 
 class GradeScale(Effect):
     """The slope is read too steep or too flat, as from heights that were smoothed: θ·(1 + s)."""
 
-    id: ClassVar = "grade_scale"
-    label: ClassVar = "scale of the slope"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "θ → θ·(1 + s)"
-    source: ClassVar = "differences of smoothed heights"
-    needs: ClassVar = ("grade_rad",)
-    entries: ClassVar = ("road",)
+    id: ClassVar[str] = "grade_scale"
+    label: ClassVar[str] = "scale of the slope"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "θ → θ·(1 + s)"
+    source: ClassVar[str] = "differences of smoothed heights"
+    needs: ClassVar[Names] = ("grade_rad",)
+    entries: ClassVar[Names] = ("road",)
     # a slope whose noise counts as slope is attenuated to half; a percentage taken for degrees is another matter
-    parameters: ClassVar = (Size("scale", "1", 0.0, 0.1, -0.6, 1.0, least=0.002),)
-    mistaken_for: ClassVar = ("mass_scale", "grade_lag")
-    separated_by: ClassVar = "accelerating on the flat, and the same hills again"
-    order: ClassVar = -1  # before an offset
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.1, -0.6, 1.0, least=0.002),)
+    mistaken_for: ClassVar[Names] = ("mass_scale", "grade_lag")
+    separated_by: ClassVar[str] = "accelerating on the flat, and the same hills again"
+    order: ClassVar[int] = -1  # before an offset
     scale: Any
 
-    def sense(self, row, car):
+    def sense(self, row: Row, car: Car) -> Row:
         return row.with_channels(grade_rad=row.channels["grade_rad"] * (1.0 + self.scale))
 
 
 class GradeLag(Effect):
     """The slope comes late: what is logged at t was the road at t − L."""
 
-    id: ClassVar = "grade_lag"
-    label: ClassVar = "lag of the slope"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "θ(t) → θ(t + L)"
-    source: ClassVar = "lag of a barometric altimeter"
-    needs: ClassVar = ("grade_rad",)
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (
+    id: ClassVar[str] = "grade_lag"
+    label: ClassVar[str] = "lag of the slope"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "θ(t) → θ(t + L)"
+    source: ClassVar[str] = "lag of a barometric altimeter"
+    needs: ClassVar[Names] = ("grade_rad",)
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (
         Switch("lag_s", "s", 0.0, 1.0, -60.0, 60.0, in_rows=True, smooth=True, least=0.05,
                   grid=(-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0)),
     )  # fmt: skip
-    mistaken_for: ClassVar = ("grade_bias",)
-    separated_by: ClassVar = "short hills, up and down"
+    mistaken_for: ClassVar[Names] = ("grade_bias",)
+    separated_by: ClassVar[str] = "short hills, up and down"
     lag_s: Any
 
-    def across(self, segments):
+    def across(self, segments: Segments) -> Segments:
         return segments.with_channels(grade_rad=later_slope(segments, self.lag_s))
 
 
 class SpeedScale(Effect):
     """Speed and distance are off by a factor, as by a wrong wheel radius: v·(1 + s)."""
 
-    id: ClassVar = "speed_scale"
-    label: ClassVar = "scale of the speed signal"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "v → v·(1 + s), d → d·(1 + s)"
-    source: ClassVar = "wear and pressure of tyres"
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
-    mistaken_for: ClassVar = ("mass_scale", "rotating_mass")
-    separated_by: ClassVar = "a position by satellite"
+    id: ClassVar[str] = "speed_scale"
+    label: ClassVar[str] = "scale of the speed signal"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "v → v·(1 + s), d → d·(1 + s)"
+    source: ClassVar[str] = "wear and pressure of tyres"
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    mistaken_for: ClassVar[Names] = ("mass_scale", "rotating_mass")
+    separated_by: ClassVar[str] = "a position by satellite"
     scale: Any
 
-    def sense(self, row, car):
+    def sense(self, row: Row, car: Car) -> Row:
         factor = 1.0 + self.scale
         return eqx.tree_at(
             lambda r: (r.distance_m, r.speed_start_mps, r.speed_end_mps),
@@ -129,90 +130,91 @@ class SpeedScale(Effect):
 class AccelerometerBias(Effect):
     """The accelerometer is tilted: a_sensor − b. Matters where the slope comes from it."""
 
-    id: ClassVar = "accelerometer_bias"
-    label: ClassVar = "bias of the accelerometer"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "a_sensor → a_sensor − b"
-    source: ClassVar = "mounting tilt"
-    needs: ClassVar = ("accel_mps2",)
-    lacks: ClassVar = ("grade_rad",)
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (Size("bias_mps2", "m/s²", 0.0, 0.05, -1.0, 1.0, least=0.002),)
-    mistaken_for: ClassVar = ("rolling",)
-    separated_by: ClassVar = "standing still on the flat"
+    id: ClassVar[str] = "accelerometer_bias"
+    label: ClassVar[str] = "bias of the accelerometer"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "a_sensor → a_sensor − b"
+    source: ClassVar[str] = "mounting tilt"
+    needs: ClassVar[Names] = ("accel_mps2",)
+    lacks: ClassVar[Names] = ("grade_rad",)
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (Size("bias_mps2", "m/s²", 0.0, 0.05, -1.0, 1.0, least=0.002),)
+    mistaken_for: ClassVar[Names] = ("rolling",)
+    separated_by: ClassVar[str] = "standing still on the flat"
     bias_mps2: Any
 
-    def sense(self, row, car):
+    def sense(self, row: Row, car: Car) -> Row:
         return row.with_channels(accel_mps2=row.channels["accel_mps2"] - self.bias_mps2)
 
 
 class TorqueOffset(Effect):
     """The torque signal has an offset and a gain: τ·(1 + g) + τ₀."""
 
-    id: ClassVar = "torque_offset"
-    label: ClassVar = "offset or gain of the torque signal"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "τ → τ·(1 + g) + τ₀"
-    source: ClassVar = "torque estimated from currents"
-    needs: ClassVar = ("motor_torque_nm",)
-    entries: ClassVar = ("shaft",)
-    parameters: ClassVar = (
+    id: ClassVar[str] = "torque_offset"
+    label: ClassVar[str] = "offset or gain of the torque signal"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "τ → τ·(1 + g) + τ₀"
+    source: ClassVar[str] = "torque estimated from currents"
+    needs: ClassVar[Names] = ("motor_torque_nm",)
+    entries: ClassVar[Names] = ("shaft",)
+    parameters: ClassVar[Parameters] = (
         Size("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.02),
         Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
     )
-    variants: ClassVar = (("offset_nm",), ("gain",), ("offset_nm", "gain"))
-    mistaken_for: ClassVar = ("iron_loss", "driveline_drag")
-    separated_by: ClassVar = "coasting at zero torque"
+    variants: ClassVar[tuple[Names, ...]] = (("offset_nm",), ("gain",), ("offset_nm", "gain"))
+    mistaken_for: ClassVar[Names] = ("iron_loss", "driveline_drag")
+    separated_by: ClassVar[str] = "coasting at zero torque"
     offset_nm: Any
     gain: Any
 
-    def sense(self, row, car):
+    def sense(self, row: Row, car: Car) -> Row:
         return row.with_channels(motor_torque_nm=row.channels["motor_torque_nm"] * (1.0 + self.gain) + self.offset_nm)
 
 
 class PowerGain(Effect):
     """The power sensor has a gain and an offset: P·(1 + g) + P₀."""
 
-    id: ClassVar = "power_gain"
-    label: ClassVar = "offset or gain of the power signal"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "P → P·(1 + g) + P₀"
-    source: ClassVar = "current sensor"
-    of_battery: ClassVar = True
-    parameters: ClassVar = (
+    id: ClassVar[str] = "power_gain"
+    label: ClassVar[str] = "offset or gain of the power signal"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "P → P·(1 + g) + P₀"
+    source: ClassVar[str] = "current sensor"
+    of_battery: ClassVar[bool] = True
+    parameters: ClassVar[Parameters] = (
         Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
         Size("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=5.0, constant=True),
     )
-    variants: ClassVar = (("gain",), ("gain", "offset_w"))  # an offset alone is auxiliary_power by another name
-    mistaken_for: ClassVar = ("auxiliary_power",)
-    separated_by: ClassVar = "the balance of charge over a trip"
-    order: ClassVar = 10
+    # an offset alone is auxiliary_power by another name
+    variants: ClassVar[tuple[Names, ...]] = (("gain",), ("gain", "offset_w"))
+    mistaken_for: ClassVar[Names] = ("auxiliary_power",)
+    separated_by: ClassVar[str] = "the balance of charge over a trip"
+    order: ClassVar[int] = 10
     gain: Any
     offset_w: Any
 
-    def observe(self, column, segments):
+    def observe(self, column: Signal, segments: Segments) -> Signal:
         return column * (1.0 + self.gain) + self.offset_w
 
 
 class TimeSkew(Effect):
     """The target's clock is late: P(t − s); positive where the target lags the other channels."""
 
-    id: ClassVar = "time_skew"
-    label: ClassVar = "time skew between channels"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "P(t) → P(t − s)"
-    source: ClassVar = "messages of several control units on one bus"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "time_skew"
+    label: ClassVar[str] = "time skew between channels"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "P(t) → P(t − s)"
+    source: ClassVar[str] = "messages of several control units on one bus"
+    parameters: ClassVar[Parameters] = (
         Switch("skew_s", "s", 0.0, 0.5, -30.0, 30.0, in_rows=True, smooth=True, least=0.005,
                   grid=(-4.0, -2.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0), label="skew"),
         Choice("cubic", "1", 0.0, 1.0, 0.0, 1.0, grid=(0.0, 1.0)),
     )  # fmt: skip
-    mistaken_for: ClassVar = ("sampling_filter", "rotating_mass")
-    separated_by: ClassVar = "steps of the pedal"
+    mistaken_for: ClassVar[Names] = ("sampling_filter", "rotating_mass")
+    separated_by: ClassVar[str] = "steps of the pedal"
     skew_s: Any
     cubic: Any
 
-    def observe(self, column, segments):
+    def observe(self, column: Signal, segments: Segments) -> Signal:
         return shifted(column, segments, self.skew_s, self.cubic)
 
 
@@ -222,12 +224,12 @@ class SamplingFilter(Effect):
     Negative taps sharpen: then it is the inputs that were smoothed.
     """
 
-    id: ClassVar = "sampling_filter"
-    label: ClassVar = "filter of the measured signal"
-    stage: ClassVar = "sensors"
-    equation: ClassVar = "P → P + Σ cⱼ·(P₋ⱼ − 2P + P₊ⱼ), or τ·dP/dt + P"
-    source: ClassVar = "Proakis and Manolakis, Digital Signal Processing (symmetric FIR; first-order lag)"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "sampling_filter"
+    label: ClassVar[str] = "filter of the measured signal"
+    stage: ClassVar[Stage] = "sensors"
+    equation: ClassVar[str] = "P → P + Σ cⱼ·(P₋ⱼ − 2P + P₊ⱼ), or τ·dP/dt + P"
+    source: ClassVar[str] = "Proakis and Manolakis, Digital Signal Processing (symmetric FIR; first-order lag)"
+    parameters: ClassVar[Parameters] = (
         Size("tap_1", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
         Size("tap_2", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
         Switch(
@@ -243,14 +245,14 @@ class SamplingFilter(Effect):
             label="time constant",
         ),
     )
-    variants: ClassVar = (("tap_1",), ("tap_1", "tap_2"), ("tau_s",))
-    mistaken_for: ClassVar = ("time_skew",)
-    separated_by: ClassVar = "steps of the pedal"
-    order: ClassVar = 5
+    variants: ClassVar[tuple[Names, ...]] = (("tap_1",), ("tap_1", "tap_2"), ("tau_s",))
+    mistaken_for: ClassVar[Names] = ("time_skew",)
+    separated_by: ClassVar[str] = "steps of the pedal"
+    order: ClassVar[int] = 5
     tap_1: Any
     tap_2: Any
     tau_s: Any  # None where only the taps are in use: the recursion is not run
 
-    def observe(self, column, segments):
+    def observe(self, column: Signal, segments: Segments) -> Signal:
         sharp = column + self.tap_1 * neighbours(column, segments, 1) + self.tap_2 * neighbours(column, segments, 2)
         return sharp if self.tau_s is None else low_pass(sharp, segments, self.tau_s)

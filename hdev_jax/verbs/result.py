@@ -54,7 +54,9 @@ class Result(ABC):
         self, answer: str, summary: Mapping[str, Any], sheet: str, predictive: Mapping[str, Any],
         data: ReportData | Callable[[], ReportData],
     ):  # fmt: skip
-        self.summary, self.sheet, self.predictive = dict(summary), sheet, dict(predictive)
+        self.summary: dict[str, Any] = dict(summary)
+        self.sheet: str = sheet
+        self.predictive: dict[str, Any] = dict(predictive)
         self._answer, self._data = answer, data
 
     @classmethod
@@ -255,7 +257,8 @@ class Prediction:
     """What a sheet predicts. `rows`: `trip_id, time_s, predicted, lower, upper, level`, a row for each of the log's."""
 
     def __init__(self, rows: "pd.DataFrame", answer: str):
-        self.rows, self._answer = rows, answer
+        self.rows: pd.DataFrame = rows
+        self._answer = answer
 
     def __str__(self) -> str:
         return self._answer

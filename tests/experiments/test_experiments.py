@@ -272,8 +272,8 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     assert part["tasks_left_out"] == 4
     write_docs(tmp_path / "docs", STUDIES / "planted.toml", [tmp_path / "c"], sets)
     page = (tmp_path / "docs" / "planted.md").read_text()
-    assert "1 logs, all synthetic" in page
-    assert "4 more are in the config" in page
+    assert "1 synthetic log." in page
+    assert "Not run: 4 more tasks of the config" in page
     assert "planted.toml --set cases.single.logs=3 --set" in page
     for name in re.findall(r"\]\((figures/[^)]*)\)", page):
         assert (tmp_path / "docs" / name).stat().st_size > 200

@@ -239,7 +239,7 @@ def test_what_is_kept_is_reported_on_and_nothing_else(tmp_path, config, capsys, 
     monkeypatch.setattr(squares, "collect", lambda c, results, run: real(c, [list(results)[3]], run))
     capsys.readouterr()
     assert main([*command[:1], "--out", str(tmp_path / "c"), *command[3:], "--kept"]) == 2
-    assert "toy: cannot be told without the 2 tasks that have not been run" in capsys.readouterr().err
+    assert "toy: cannot be shown: 2 of its tasks have not been run" in capsys.readouterr().err
     with pytest.raises(IndexError):
         run_config(config, ["count=2"], out=tmp_path / "d")
 

@@ -10,8 +10,8 @@ import tomli_w
 from matplotlib.axes import Axes
 
 from experiments.measured import figures, logs, page
+from experiments.measured.compared import changes, moved_sizes, new_names, sentences
 from experiments.measured.tables import pooled_interval, pooled_rmse, size_rows, size_table
-from experiments.measured.told import changes, moved_sizes, new_names, sentences
 from experiments.measured.withheld import compare_logs, without_columns, write_adapter
 from hdev_jax.errors import InputError
 from hdev_jax.logs import read_log
@@ -153,14 +153,14 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
             (row,) = size_rows(offsets(5.0, 5.0 + factor * bound, *[5.0 + 0.5 * bound] * (sets - 2)))
             assert row.agrees() == close
     assert "Of 1 sizes found more than once, 1 agrees." in page._agreement(offsets(5.0, 5.5), "")[0]
-    assert "0 agree. Further apart: `torque_offset.offset_nm` (2.1 sd)." in page._agreement(offsets(5.0, 8.0), "")[0]
+    assert "0 agree. Differing more: `torque_offset.offset_nm` (2.1 sd)." in page._agreement(offsets(5.0, 8.0), "")[0]
 
 
 def test_an_effect_whose_sign_turns_is_told_first(results):
     offsets = {"niro_1": -5.5, "niro_2": 0.7}  # Nm
     turned = {k: result([effect("torque_offset", "offset_nm", v, 0.1, "Nm")]) for k, v in offsets.items()}
     text, _ = page.page(turned, warm={}, rest={})
-    assert "They do not agree on the sign of `torque_offset.offset_nm`." in text.partition("## Kia Niro")[0]
+    assert "The sign of `torque_offset.offset_nm` differs." in text.partition("## Kia Niro")[0]
     text, _ = page.page(results, warm={}, rest={})
     assert "agree on the sign" not in text
 
@@ -197,7 +197,7 @@ def test_a_false_name_is_called_one(results):
     assert new_names(without, full, others) == ["step_change"]
     text = " ".join(sentences("outside temperature", without, full, others))
     assert "a **new name**" in text
-    assert "taken by what the full log does not bear out" in text
+    assert "it names what the full log does not confirm" in text
     assert new_names(without, full, {"2": result([STEP])}) == []  # another training set finds it with every channel
 
 
@@ -220,7 +220,7 @@ def test_what_two_runs_do_not_have_in_common_is_said(results):
 def test_runs_that_find_nothing_in_common(results):
     results["niro_2"]["effects"] = []
     text, _ = page.page(results, warm={}, rest={})
-    assert "There is no effect that all of them find." in text
+    assert "No effect is found by all." in text
 
 
 ADAPTER = {

@@ -156,7 +156,7 @@ def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
     quarter = [(t, result(test_rmse={"before": 1.03, "after": 1.03})) for t in every("single_quarter")]
     half = [(t, result(test_rmse={"before": 1.12, "after": 1.12})) for t in every("single")[:20]]
     rows = told(tmp_path, [*quarter, *half])
-    name = "test error after within 5 % of an oracle's"
+    name = "test error within 5 % of the oracle's"
     assert rows[f"{name}, size 0.25"]["share"] == 1.0
     assert rows[f"{name}, size 0.25"]["met"] is None
     assert rows[f"{name}, size 0.5"]["share"] == 0.0
@@ -266,7 +266,9 @@ def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):
     rows = told(tmp_path, done)
     assert rows["absorbed by a declared coefficient, 12 trips, ar1"]["met"] is False, "nothing is far off"
     assert rows["nothing to absorb, 12 trips, ar1"]["met"] is True
-    assert rows["only between trips, levels as large, size 0.7, 12 trips, trip_levels"]["met"] is False
+    assert (
+        rows["differs only between trips, random intercepts as large, size 0.7, 12 trips, trip_levels"]["met"] is False
+    )
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.physics import Effect, Size, Vehicle
+from hdev_jax.physics.effect import Car, Names, Parameters, Point, Real, Row, Stage
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS, TargetName
 from hdev_jax.units import registry, unit_of
@@ -89,33 +90,33 @@ class Term:
 class Described(Effect):
     """k times a column that was made for it, as power at the battery."""
 
-    id: ClassVar = "expression"
-    stage: ClassVar = "battery"
-    order: ClassVar = 80
-    equation: ClassVar = "k·term"
-    source: ClassVar = "found in the log by search"
-    needs: ClassVar = (TERM,)
-    parameters: ClassVar = (Size("k", "W", 0.0, 1000.0),)
+    id: ClassVar[str] = "expression"
+    stage: ClassVar[Stage] = "battery"
+    order: ClassVar[int] = 80
+    equation: ClassVar[str] = "k·term"
+    source: ClassVar[str] = "found in the log by search"
+    needs: ClassVar[Names] = (TERM,)
+    parameters: ClassVar[Parameters] = (Size("k", "W", 0.0, 1000.0),)
     k: Any
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.k * row.channels[TERM]
 
 
 class DescribedForce(Effect):
     """k times a column that was made for it, as a force at the wheels: for targets that the battery lies behind."""
 
-    id: ClassVar = Described.id
-    stage: ClassVar = "road"
-    order: ClassVar = 80
-    equation: ClassVar = Described.equation
-    source: ClassVar = Described.source
-    needs: ClassVar = (TERM,)
-    entries: ClassVar = ("road",)
-    parameters: ClassVar = (Size("k", "N", 0.0, 100.0),)
+    id: ClassVar[str] = Described.id
+    stage: ClassVar[Stage] = "road"
+    order: ClassVar[int] = 80
+    equation: ClassVar[str] = Described.equation
+    source: ClassVar[str] = Described.source
+    needs: ClassVar[Names] = (TERM,)
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (Size("k", "N", 0.0, 100.0),)
     k: Any
 
-    def force(self, row, car):
+    def force(self, row: Row, car: Car) -> Real:
         return self.k * row.channels[TERM]
 
 

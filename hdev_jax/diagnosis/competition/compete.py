@@ -102,7 +102,7 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
         training = with_states(training, new)
     kept = decoded_again(training, backward(training, new, newest=len(new.terms) > len(state.terms)))
     for id_ in set(new.ids) - set(kept.ids):
-        tell(f"taking {id_} out again: {kept.removed[id_]}")
+        tell(f"removed {id_}: {kept.removed[id_]}")
     trail = {**kept.trail, ",".join(kept.ids): [float(x) for x in kept.fit.values]} if not kept.terms else kept.trail
     refused = tuple(dict.fromkeys((*kept.refused, *round_.reasons)))
     tested = (*kept.tested, *round_.tested)

@@ -18,7 +18,7 @@ __all__ = ["Round", "forward"]
 
 @dataclass
 class Round:
-    """One step of the competition: the scores of all candidates, why some were turned down, which exchanges of two were
+    """One step of the competition: the scores of all candidates, why some were rejected, which exchanges of two were
     tested, and its random draws."""
 
     training: Training
@@ -41,7 +41,7 @@ class Round:
     def turned_down(self, id_: str, why: Rejection) -> None:
         """Note why a candidate is out for this round."""
         self.reasons[id_] = why
-        self.tell(f"turned down {id_}: {why}")
+        self.tell(f"rejected {id_}: {why}")
 
 
 def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] | None = None) -> State | None:

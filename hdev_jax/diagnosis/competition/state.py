@@ -1,4 +1,4 @@
-"""The state of the competition: the fitted vehicle, the effects found, the candidates turned down."""
+"""The state of the competition: the fitted vehicle, the effects found, the candidates rejected."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Why a candidate was turned down: an enumerated kind with its numbers, and the one place where it is worded."""
+"""Why a candidate was rejected: an enumerated kind with its numbers, and the one place where it is worded."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -31,7 +31,7 @@ class Noise:
 
     `coefficients[k]` predicts the row at position k of its trip from the k rows before it (the last line serves all
     later rows), `scales[k]` is the standard deviation of that prediction's error. `level_sd` is the standard deviation
-    of the trips' levels, `block_sd` that of the levels of blocks of `BLOCK_S` inside them: what wanders more slowly
+    of the trips' intercepts, `block_sd` that of intercepts of blocks of `BLOCK_S` inside them: what wanders more slowly
     than an autoregression of a few rows can follow. `trip_scale` multiplies `scales`, by trip in the order of the rows.
     """
 

@@ -1,4 +1,4 @@
-"""The plain values of diagnosis.json, from where the loop ended."""
+"""The plain values of diagnosis.json, from the final state of the search."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -294,7 +294,7 @@ def _by_trip(problem: Problem, state: State) -> list[str]:
 
 
 def _of_last_vehicle(problem: Problem, train: np.ndarray) -> list[str]:
-    """A note where trips of several vehicles train: a change that stays is sought in those of the last alone."""
+    """A note where trips of several vehicles train: a change that stays is searched for in those of the last alone."""
     ids = np.asarray(problem.segments.vehicle)[train]
     if len(np.unique(ids)) < 2:
         return []

@@ -29,7 +29,7 @@ def solved(a: Float[np.ndarray, "*way n n"], b: Float[np.ndarray, "*way n"]) -> 
 class NormalEquations:
     """Gram matrices by cluster of [Jacobian | candidates | residual], and the prior on the Jacobian's part.
 
-    Trips may have levels of their own: `levels` is what a level of 1 of each trip meets in the same columns, `squares`
+    Trips may have random intercepts: `levels` is what an intercept of 1 of each trip meets in these columns, `squares`
     its own square, `home` the cluster of the trip, `variances` those that are tried. Each model takes the variance
     that suits it: a candidate that explains the levels is not held against a variance that still contains them, which
     would let no statistic exceed the number of trips.
@@ -60,7 +60,7 @@ class NormalEquations:
         return self.variances[v] / (1.0 + self.variances[v] * self.squares)
 
     def by_cluster(self, v: int) -> Float[np.ndarray, "cluster d d"]:
-        """Gram matrices with levels of the v-th variance taken out."""
+        """Gram matrices with random intercepts of the v-th variance taken out."""
         if not self.variances[v]:
             return self.grams
         if v not in self._kept:

@@ -68,10 +68,10 @@ class Sums:
     """
 
     def __init__(self, width: int, clusters: int, trips: int):
-        self.grams = np.zeros((clusters, width, width))
-        self.levels = np.zeros((trips, width))
-        self.squares = np.zeros(trips)
-        self.home = np.zeros(trips, dtype=int)
+        self.grams: np.ndarray = np.zeros((clusters, width, width))
+        self.levels: np.ndarray = np.zeros((trips, width))
+        self.squares: np.ndarray = np.zeros(trips)
+        self.home: np.ndarray = np.zeros(trips, dtype=int)
 
     def add(self, rows: Float[np.ndarray, "row k"], clusters: Int[np.ndarray, " row"]) -> None:
         """Add rows, `clusters` being the cluster of each."""

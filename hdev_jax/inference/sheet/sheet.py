@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.maps.read import read_map
-from hdev_jax.inference.sheet.schema import parse
+from hdev_jax.inference.sheet.schema import Declared, parse
 from hdev_jax.physics import LIBRARY, Driveline, Effect, EfficiencyMap, most_group
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.vehicle import Entry
@@ -33,7 +33,7 @@ class Sheet:
 
     **Arguments:** `sections`, the keys of a sheet; a number is known, `(value, sd)` or `{"value": …, "sd": …}` a
     tabular prior: it is estimated. `library`, the effects that `effects` may name; `path`, the file that it stands in,
-    beside which an efficiency map is sought.
+    beside which an efficiency map is looked for.
 
     **Fields:** `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`); `gear_ratios` count
     from the first gear; `map_path` is where `efficiency_map` came from. **Raises:** `InputError`, one line with key,
@@ -43,16 +43,17 @@ class Sheet:
     def __init__(
         self, *, library: Mapping[str, type[Effect]] = LIBRARY, path: str | Path | None = None, **sections: Any
     ) -> None:
-        self.path = Path("sheet" if path is None else path)
+        self.path: Path = Path("sheet" if path is None else path)
         where = "sheet" if path is None else f"sheet {path}"
-        self.declared, others = parse(where, _as_toml(sections), library)
+        declared, others = parse(where, _as_toml(sections), library)
+        self.declared: dict[str, Declared] = declared
         self.library = library
         self.name: str = others.get("name", self.path.stem)
         self.gear_ratios: tuple[float, ...] | None = others.get("driveline.gear_ratios")
         self.final_drive: float | None = others.get("driveline.final_drive")
         self.wheel_radius_m: float | None = others.get("driveline.wheel_radius_m")
         self.nominal_voltage_v: float | None = others.get("battery.nominal_voltage_v")
-        self.map_path = self.path.parent / others["driveline.map"] if "driveline.map" in others else None
+        self.map_path: Path | None = self.path.parent / others["driveline.map"] if "driveline.map" in others else None
         self.efficiency_map: EfficiencyMap | None = None if self.map_path is None else read_map(self.map_path)
         self.source: str = others.get("source", "")
         self.notes: str = others.get("notes", "")

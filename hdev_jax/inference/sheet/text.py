@@ -20,7 +20,7 @@ def augmented_sheet(
 
     What was estimated carries its sd (a prior for whoever reads the sheet next) and `estimated = true`: it may have
     absorbed what the model lacks and lie outside a table's range. A vehicle built from the text predicts what the
-    calibrated one did, but for what was sought for each trip (a cycle's phase, the trips of a mode): a sheet is for any
+    calibrated one did, but for what was searched for by trip (a cycle's phase, the trips of a mode): a sheet is for any
     log, and every trip gets the mean.
 
     **Arguments:** `calibration_values`: (value, sd) by coefficient name (`road.c_rr`, `road.c_rr[B183]`,

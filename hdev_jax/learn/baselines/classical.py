@@ -197,7 +197,9 @@ def search_classical(
 
     def fitted(trial: Any, rows: np.ndarray) -> Any:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # settings that do not converge score badly; that is what they are told by
+            warnings.simplefilter(
+                "ignore"
+            )  # settings that do not converge score badly; that is how they are recognised
             return CLASSICAL[kind](trial, seed).fit(x[rows][::thin], y[rows][::thin])
 
     def objective(trial: Any) -> float:

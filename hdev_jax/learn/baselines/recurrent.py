@@ -17,7 +17,7 @@ from hdev_jax.learn.train import DivergedError, Plan, train
 __all__ = ["Recurrent", "RecurrentModel", "train_recurrent"]
 
 GAIN = 5.0
-CELLS = {"lstm": eqx.nn.LSTMCell, "gru": eqx.nn.GRUCell}
+CELLS: dict[str, type[eqx.nn.LSTMCell] | type[eqx.nn.GRUCell]] = {"lstm": eqx.nn.LSTMCell, "gru": eqx.nn.GRUCell}
 
 
 class Recurrent(eqx.Module):

@@ -17,7 +17,7 @@ from hdev_jax.learn.trees.trees import Trees
 __all__ = ["CLASSIFIERS", "Classifier", "alike", "balanced_accuracy", "route_folds", "scored", "search_classifier"]
 
 Fit = Callable[[np.ndarray, np.ndarray], Any]  # features, classes from 0
-LEAST_ROWS = 30  # of a gear, for its share of rows told rightly to say something: 1 sd of at most 9 points
+LEAST_ROWS = 30  # of a gear, for its share of correct rows to say something: 1 sd of at most 9 points
 COMMON = (0.0, 0.001, 0.003, 0.01, 0.03)  # shares that rarer gears are taken to have
 
 
@@ -141,7 +141,7 @@ CLASSIFIERS: dict[str, Callable[[Any, int], Fit]] = {
 
 
 def balanced_accuracy(gear: Int[np.ndarray, " row"], told: Int[np.ndarray, " row"]) -> float:
-    """Mean over the gears of the share of their rows that are told rightly.
+    """Mean over the gears of the share of their rows that are predicted correctly.
 
     Gears of fewer than `LEAST_ROWS` rows are left out (`scored` says which rows are not), unless there are no others.
     """
@@ -166,8 +166,8 @@ def alike(
     """The place of the gear that is likeliest where each gear is as common as any other: what balanced accuracy asks.
 
     Weights of classes in the decision, not in the fit, whose probabilities stay those of the road. `share` is how
-    common each gear was in training. One of a few rows cannot be told as well as that would have it: rarer ones than
-    `common` count as that common, one that training never showed is not told.
+    common each gear was in training. One of a few rows cannot be predicted that well: rarer ones than
+    `common` count as that common, one that training never showed is not predicted.
     """
     return np.argmax(np.where(share > 0, p / np.maximum(share, max(common, 1e-12)), 0.0), axis=1)
 
@@ -195,10 +195,10 @@ def search_classifier(
 ) -> Classifier:
     """A search of `trials` settings by routes left out, then a fit of the best on all rows.
 
-    **Arguments:** `gear`, what is told, 1 and up; `by`: what rows are balanced by where that is another thing (the
-    gear, where its distance from another is told).
+    **Arguments:** `gear`, what is predicted, 1 and up; `by`: what rows are balanced by where that is another thing (the
+    gear, where its distance from another is predicted).
 
-    The score is the mean of the accuracy of the likeliest gear and the balanced accuracy of what `alike` tells, at the
+    The score is the mean of the accuracy of the likeliest gear and the balanced accuracy of `alike` at the
     best of a few values of its `common`. Of more than `search_rows` rows the search sees whole routes, as many as make
     up so many.
 

@@ -1,8 +1,8 @@
-"""The gear as a surrogate: features of a row, trees that tell the gear, and the channel that the kernel reads.
+"""The gear as a surrogate: features of a row, trees that predict the gear, and the channel that the kernel reads.
 
 Paper 1, section 3.1: speed, requested torque and mass. What the sheet knows makes rows of different vehicles alike: the
 motor speed that each gear would give and the power that is requested, over rated, and how many gears there are. Two
-ways: the trees tell the gear's number; or they tell by how many gears it is away from the one in which the motor would
+ways: the trees predict the gear's number; or by how many gears it is away from the one in which the motor would
 turn at its rated speed (`relative`), so that what is learned of one gear holds for all, in gearboxes never seen too.
 """
 
@@ -37,9 +37,9 @@ _SHEET = ("gears", "power_over_rated", *(f"motor_speed_over_rated_{g}" for g in 
 PLACE = "place_after_reference"
 _RELATIVE = (PLACE, "step_below", "step_above", "reference_gear", "gears", "power_over_rated", "grade_rad")
 # By what is known: the paper's three; with the vehicle's sheet; with the sheet and the slope of the road, where the
-# trees tell the distance from the reference gear.
-FEATURES = {"paper": _PAPER, "sheet": (*_PAPER, *_SHEET), "relative": (*_PAPER, *_RELATIVE)}
-EVERY = tuple(dict.fromkeys(n for names in FEATURES.values() for n in names))
+# trees predict the distance from the reference gear.
+FEATURES: dict[str, tuple[str, ...]] = {"paper": _PAPER, "sheet": (*_PAPER, *_SHEET), "relative": (*_PAPER, *_RELATIVE)}
+EVERY: tuple[str, ...] = tuple(dict.fromkeys(n for names in FEATURES.values() for n in names))
 
 
 class Gearbox(eqx.Module):
@@ -120,9 +120,9 @@ def features(names: tuple[str, ...], box: Gearbox, segments: Segments, torque_nm
 
 
 class Surrogate(eqx.Module):
-    """Trees that tell the gear of a row of one vehicle. `of` a model that was trained on several gearboxes.
+    """Trees that predict the gear of a row of one vehicle. `of` a model that was trained on several gearboxes.
 
-    Trees with the feature `PLACE` tell the distance from the reference gear, others the gear.
+    Trees with the feature `PLACE` predict the distance from the reference gear, others the gear.
     """
 
     trees: Trees

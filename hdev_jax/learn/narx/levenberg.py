@@ -21,7 +21,7 @@ class _Damped(eqx.Module):
     info: Any
 
 
-class MarquardtDescent(optx.AbstractDescent):
+class MarquardtDescent(optx.AbstractDescent[Any, Any, Any]):
     """(H + λ·diag H)·d = −g by Cholesky: Marquardt's scaling, λ = 1/step size; Optimistix's own damps by λ·1."""
 
     def init(self, y: Any, f_info_struct: Any) -> _Damped:
@@ -49,7 +49,7 @@ class _State(eqx.Module):
     terminate: Bool[Array, ""]
 
 
-class NormalLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+class NormalLevenbergMarquardt(optx.AbstractLeastSquaresSolver[Any, Any, Any, _State]):
     """A least-squares solver that never holds the Jacobian: `equations(θ, args)` gives loss, gradient and Hessian.
 
     **Arguments:** `equations`, ½Σρ(r), its gradient and its Gauss-Newton Hessian; `rtol`, the solver stops when an
@@ -62,7 +62,7 @@ class NormalLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     norm: Callable[[Any], Any] = optx.max_norm
     damping: float = 1e-3
     descent: MarquardtDescent = MarquardtDescent()
-    search: optx.ClassicalTrustRegion = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=1e-4)
+    search: optx.ClassicalTrustRegion[Any] = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=1e-4)
 
     def _info(self, y: Any, args: Any) -> Any:
         loss, gradient, hessian = self.equations(y, args)

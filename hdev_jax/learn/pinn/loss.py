@@ -79,7 +79,7 @@ def _between_vehicles(own: Array, usual: float) -> Array:
     Each column is normal about the mean, with a variance that has the scaled inverse χ² distribution about `usual`²,
     of so few degrees of freedom that the data say what it is: integrated out, a multivariate Student t (Gelman et al.,
     Bayesian Data Analysis, 3.2) of one dimension less than there are vehicles, the mean being taken out. So a
-    coefficient that is alike in all vehicles is told by all of their rows together.
+    coefficient that is alike in all vehicles is estimated from all of their rows together.
     """
     squares = jnp.sum(centred(own) ** 2, axis=0)
     power = 0.5 * (_SPREAD_DOF + own.shape[0] - 1)

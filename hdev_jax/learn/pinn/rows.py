@@ -40,7 +40,7 @@ _PADDED = 4096
 
 # The paper's three; with what the physics needs besides; with everything that has no unit; and for black boxes without
 # any kernel the log's own columns and the sheet's numbers, hardly anything being worked out of them (angles have a sine
-# and a cosine, and the way since the start is what warmth is told by).
+# and a cosine, and the way since the start stands for warmth).
 _PRINTED = ("speed_mps", "mass_kg", "grade_rad")
 _CHANNELS = (*_PRINTED, "accel_mps2", "c_rr_table", "cda_table")
 _UNITLESS = (
@@ -54,7 +54,7 @@ _RAW = (
     "gear", DISTANCE_SINCE_START,
 )  # fmt: skip
 _COLUMNS = ("grade_rad", "ambient_temp_c", "wind_speed_mps", "wet_road", "curvature_1pm", "gear", DISTANCE_SINCE_START)
-FEATURES = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
+FEATURES: dict[str, tuple[str, ...]] = {"printed": _PRINTED, "channels": _CHANNELS, "unitless": _UNITLESS, "raw": _RAW}
 # Those that a coefficient may depend on: not the power that is asked for, nor how steep it is.
 PHYSICAL = ("froude", "temperature", "wind_along", "wind_across", "wet", "surface_1", "surface_2", "surface_3",
             "warmth", "cornering")  # fmt: skip
@@ -65,8 +65,8 @@ class Rows(eqx.Module):
 
     `vehicle` counts the vehicles that a model was trained on; one that it was not has the number after the last.
     `weight` is 0 for a row that only fills an array; `across_wh` is energy that effects across rows add to it;
-    `loose_wh` what one standard deviation of something that its whole trip shares and the log does not tell (a mass
-    that is off) adds to it, with its sign. `unit` is what an energy is told in: where no feature is the mass, the row's
+    `loose_wh` what one standard deviation of something that its whole trip shares and the log does not show (a mass
+    that is off) adds to it, with its sign. `unit` is the unit of an energy: where no feature is the mass, the row's
     over 20 t, as an energy without units is one over a weight; otherwise 1.
     """
 
@@ -138,8 +138,8 @@ def rows_of(
     **Arguments:** `vehicle`, as it is declared, entered at the road; `number`, its place among the vehicles;
     `features`, names of `FEATURES`; `effects`, those whose channels are to be worked out by trip; `calibrated`, the
     vehicle at whose force the efficiency is read and whose energy is a feature, in the place of the declared one;
-    `across_wh` [row], what effects across rows add to each row's energy, which its own channels cannot tell (none: 0);
-    `loose_wh` [row], what one standard deviation of what a trip's rows share and the log does not tell adds (none: 0).
+    `across_wh` [row], what effects across rows add to each row's energy, which its own channels do not show (none: 0);
+    `loose_wh` [row], what one standard deviation of what a trip's rows share and the log does not show adds (none: 0).
 
     **Raises:** `InputError` for a vehicle that is not entered at the road or lacks rolling or aero, for an effect that
     acts across rows, for an unknown feature and for a channel that a feature needs and the log lacks.

@@ -62,7 +62,7 @@ class Oblivious(eqx.Module):
     column: Int[Array, "tree level"]
     threshold: Int[Array, "tree level"]
     leaves: Float[Array, "tree leaf class"]
-    block: ClassVar = 65_536  # rows in one go: their scores stay in the cache, and there are enough for every core
+    block: ClassVar[int] = 65_536  # rows in one go: their scores stay in the cache, and there are enough for every core
 
     def _leaf(self, column: Array, threshold: Array, z: Array) -> Array:
         at = jnp.zeros(z.shape[1], jnp.int32)
@@ -103,7 +103,7 @@ class Branching(eqx.Module):
     leaves: Float[Array, "tree leaf"]
     adds_to: Int[Array, " tree"]
     classes: int = eqx.field(static=True)
-    block: ClassVar = 8192  # rows in one go: their sets stay in the cache
+    block: ClassVar[int] = 8192  # rows in one go: their sets stay in the cache
 
     def __call__(self, z: Int[Array, "column row"]) -> Float[Array, "row class"]:
         """The sum of the leaves."""

@@ -1,4 +1,4 @@
-"""What the loop concluded without a known channel and with it, in a table and in sentences, from diagnosis.json alone.
+"""What the diagnosis concludes without a known channel and with it: a table and sentences from diagnosis.json.
 
 Every sentence follows from numbers and names in the two results; where they are the same, it says so.
 """
@@ -86,10 +86,10 @@ def held_table(without: Result, full: Result, unit: str) -> list[str]:
         ("energy error of all test trips", lambda r: words.percent(r["after"]["test"]["pe_percent"])),
         ("parameters fitted", lambda r: str(r["parameters_fitted"])),
         ("verdict", lambda r: r["verdict"].replace("_", " ")),
-        ("a flexible learner still predicts", _share),
-        ("what is left depends on", lambda r: ", ".join(f"`{c}`" for c in r["unexplained"]["depends_on"]) or "–"),
-        ("what it looks like", lambda r: signature(r["unexplained"])),
-        ("nearest candidate turned down", nearest),
+        ("share of the rest that a flexible learner predicts", _share),
+        ("the rest depends on", lambda r: ", ".join(f"`{c}`" for c in r["unexplained"]["depends_on"]) or "–"),
+        ("signature of the rest", lambda r: signature(r["unexplained"])),
+        ("best rejected candidate", nearest),
     ):
         rows.append([words_, say(without), say(full)])
     return table(["", "without", "with"], rows)
@@ -103,11 +103,11 @@ def sentences(words_: str, without: Result, full: Result, others: Runs) -> list[
     if change.lost or change.gained:
         parts = [f"no longer finds {named(change.lost)}"] * bool(change.lost)
         parts += [f"finds {named(change.gained)} besides"] * bool(change.gained)
-        out.append(f"Without the {words_} the loop {' and '.join(parts)}.")
+        out.append(f"Without the {words_} the diagnosis {' and '.join(parts)}.")
     else:
         out.append(f"It finds the same effects without the {words_} as with it.")
     out += [
-        f"{_first(a)} is called `{b}` with it: one class, which the log cannot tell apart." for a, b in change.renamed
+        f"{_first(a)} is called `{b}` with it: one class, which the log cannot distinguish." for a, b in change.renamed
     ]
     out += _stand_ins(change, needing, without, full, others)
     return [*out, *_moves(words_, without, full), _error(words_, without, full), _rest(without, full)]
@@ -157,7 +157,7 @@ def moved_sizes(without: Result, full: Result) -> list[tuple[str, float, float, 
 
 
 def _untried(without: Result, full: Result) -> list[str]:
-    """The effects that the channel alone makes possible, as the loop said."""
+    """The effects that the channel alone makes possible, as the diagnosis said."""
 
     def lacking(r: Result) -> set[str]:
         return {c["id"] for c in r["candidates"] if c["why_not"].startswith("not tried: needs a channel")}
@@ -167,15 +167,15 @@ def _untried(without: Result, full: Result) -> list[str]:
 
 def _reads(words_: str, needing: Sequence[str]) -> str:
     if needing:
-        return f"Without the {words_} the loop cannot try {named(needing)}."
+        return f"Without the {words_} the diagnosis cannot try {named(needing)}."
     return (
-        f"No effect that the loop tries on this target reads the {words_}: only the search for a formula and the "
+        f"No effect that the diagnosis tries on this target reads the {words_}: only the search for a formula and the "
         "flexible learner do. The run is a control."
     )
 
 
 def _stand_ins(change: Change, needing: Sequence[str], without: Result, full: Result, others: Runs) -> list[str]:
-    """Whether a name that the log does not bear out with every channel stands where the withheld cause was."""
+    """Whether the withheld cause is replaced by a name that the full log does not confirm."""
     new = new_names(without, full, others)
     out = []
     for i in change.gained:
@@ -196,7 +196,7 @@ def _stand_ins(change: Change, needing: Sequence[str], without: Result, full: Re
     if new:
         return [
             *out,
-            f"So the place of {named(cause)} is taken by what the full log does not bear out: {named(new)}.",
+            f"In place of {named(cause)} it names what the full log does not confirm: {named(new)}.",
         ]
     return [*out, f"No false name takes the place of {named(cause)}."]
 
@@ -234,16 +234,16 @@ def _share(r: Result) -> str:
 
 
 def _rest(without: Result, full: Result) -> str:
-    """What the loop says of the rest, where that differs."""
+    """What stays unexplained, where that differs."""
     a, b = without["unexplained"], full["unexplained"]
     if a["significant"] and not b["significant"]:
-        text = f"Without it the loop says that something is missing ({signature(a)}), with it that nothing is."
+        text = f"Without it the diagnosis reports unexplained structure ({signature(a)}), with it none."
     elif b["significant"] and not a["significant"]:
-        text = f"With it the loop says that something is missing ({signature(b)}), without it that nothing is."
+        text = f"With it the diagnosis reports unexplained structure ({signature(b)}), without it none."
     elif signature(a) == signature(b) and a["depends_on"] == b["depends_on"]:
-        text = "What the loop says of the rest is the same with and without."
+        text = "What stays unexplained is the same with and without."
     else:
-        text = f"Of the rest it says, without: {signature(a)}; with: {signature(b)}."
+        text = f"Unexplained, without: {signature(a)}; with: {signature(b)}."
     if _share(without) != _share(full):
-        text += f" A flexible learner still predicts {_share(without)} of it without, {_share(full)} with."
+        text += f" A flexible learner predicts {_share(without)} of the rest without, {_share(full)} with."
     return text
