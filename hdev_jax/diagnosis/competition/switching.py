@@ -6,7 +6,6 @@ the same colour and size (a parametric bootstrap whose innovations are the resid
 of Statistics 14, 1986), and the power between its levels has to be the same in all trips, standing and moving.
 """
 
-import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +43,7 @@ COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and 
 FIRST_ROUNDS = 3  # of expectation-maximisation
 ROUNDS = 6
 MOST_ROWS = 30_000  # that the test looks at
-LEVELS, MOST_MEANS = 24, 2000  # of the grid for two loads, and the means that it is laid over
+BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
 LEAST_SPREAD = 2.0  # of the surrogates' gains, in log-likelihood
 LEAST_S = 60.0  # on, and off, for a power of its own (of a trip, at standstill)
 LEAST_SWITCHES = 8.0
@@ -115,11 +114,11 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         if tested is None or tested.p * len(training.library) > settings.fdr:
             break
         starts = [tested.model] if model is None else [model.plus(tested.model)]
-        if model is not None and not held and len(tests) == 1:  # the first may have been fitted to the levels of both
-            starts.append(_four_levels(rows.coarse(COARSE_S[1]), model))
+        if model is not None and not held and len(tests) == 1:
+            starts += _besides(model)
         tests.append(tested)
-        tried = [fit_switching(m, rows, FIRST_ROUNDS) for m in starts]
-        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
+        tried = [fit_switching(m, _some_trips(rows), FIRST_ROUNDS) for m in starts]
+        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, ROUNDS)
         left = replace(rows, residual_w=rows.residual_w - model.predicted_w(decoded.on))
     if not tests or model is None or decoded is None:
         if tested is None:
@@ -281,21 +280,10 @@ def _two_levels(coarse: StateRows, memory: float) -> Switching:
     )  # fmt: skip
 
 
-def _four_levels(coarse: StateRows, one: Switching) -> Switching:
-    """Two loads whose four levels are nearest to means over some seconds (least absolute deviations, on a grid)."""
-    x = coarse.residual_w[:: max(1, len(coarse.trip) // MOST_MEANS)]
-    grid = np.linspace(*np.quantile(x, (0.01, 0.99)), LEVELS)
-    best, at = np.inf, (0, 1, 2)
-    for i, j, k in itertools.combinations(range(LEVELS), 3):
-        levels = np.array([grid[i], grid[j], grid[k], grid[j] + grid[k] - grid[i]])
-        levels.sort()
-        right = np.searchsorted(levels, x).clip(1, 3)
-        off = float(np.mean(np.minimum(np.abs(x - levels[right]), np.abs(x - levels[right - 1]))))
-        if off < best:
-            best, at = off, (i, j, k)
-    power = np.array([grid[at[1]] - grid[at[0]], grid[at[2]] - grid[at[0]]])
-    share, memory = np.full((2, len(KNOTS_C)), 0.3), np.repeat(one.memory_s[:1], 2)
-    return replace(one, power_w=power, base_w=float(grid[at[0]]), share=share, memory_s=memory)
+def _besides(one: Switching) -> list[Switching]:
+    """Two loads, the second of other powers than the first: that may have been fitted to the levels of both."""
+    two = one.plus(replace(one, memory_s=one.memory_s.copy()))
+    return [replace(two, power_w=one.power_w[0] * np.array([1.0, r])) for r in BESIDES]
 
 
 def _surrogate(rows: StateRows, noise: Noise, rng: np.random.Generator) -> np.ndarray:
