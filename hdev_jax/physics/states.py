@@ -4,7 +4,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from hdev_jax.physics.effect import Effect
+from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
 from hdev_jax.physics.parameter import Choice, Size
 
 __all__ = ["KNOTS_C", "SecondSwitchingLoad", "SwitchingLoad", "expected_share", "state_channel"]
@@ -32,12 +32,12 @@ class SwitchingLoad(Effect):
     (1 − share)/memory, so that it stays on for memory/(1 − share) on average.
     """
 
-    id: ClassVar = "switching_load"
-    label: ClassVar = "load that switches"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "P·s, s on or off (hidden)"
-    source: ClassVar = "two-state Markov chain in continuous time, decoded as in Rabiner, Proc. IEEE 77 (1989)"
-    parameters: ClassVar = (
+    id: ClassVar[str] = "switching_load"
+    label: ClassVar[str] = "load that switches"
+    stage: ClassVar[Stage] = "battery"
+    equation: ClassVar[str] = "P·s, s on or off (hidden)"
+    source: ClassVar[str] = "two-state Markov chain in continuous time, decoded as in Rabiner, Proc. IEEE 77 (1989)"
+    parameters: ClassVar[Parameters] = (
         # electric heaters of articulated buses have 40 to 60 kW
         Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=50.0),
         Choice("share_0c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 0 °C"),
@@ -46,9 +46,15 @@ class SwitchingLoad(Effect):
         Choice("share_30c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 30 °C"),
         Choice("memory_s", "s", 60.0, 30.0, 1.0, 7200.0, label="memory"),
     )
-    searched: ClassVar = "states"
-    mistaken_for: ClassVar = ("auxiliary_power", "hvac_power", "cabin_warmup", "passenger_heat", "standstill_load")
-    separated_by: ClassVar = "an hour at standstill: the power stands at two levels"
+    searched: ClassVar[str] = "states"
+    mistaken_for: ClassVar[Names] = (
+        "auxiliary_power",
+        "hvac_power",
+        "cabin_warmup",
+        "passenger_heat",
+        "standstill_load",
+    )
+    separated_by: ClassVar[str] = "an hour at standstill: the power stands at two levels"
     power_w: Any
     share_0c: Any
     share_10c: Any
@@ -56,11 +62,11 @@ class SwitchingLoad(Effect):
     share_30c: Any
     memory_s: Any
 
-    def shares(self) -> Any:
+    def shares(self) -> Real:
         """Share of time on at each of `KNOTS_C`."""
         return jnp.stack([jnp.asarray(x) for x in (self.share_0c, self.share_10c, self.share_20c, self.share_30c)])
 
-    def power(self, row, car, point):
+    def power(self, row: Row, car: Car, point: Point) -> Real:
         channel = state_channel(self.id)
         if row.has(channel):
             return self.power_w * row.channels[channel]
@@ -70,5 +76,5 @@ class SwitchingLoad(Effect):
 class SecondSwitchingLoad(SwitchingLoad):
     """Another load that is on or off, independent of the first."""
 
-    id: ClassVar = "second_switching_load"
-    label: ClassVar = "second load that switches"
+    id: ClassVar[str] = "second_switching_load"
+    label: ClassVar[str] = "second load that switches"

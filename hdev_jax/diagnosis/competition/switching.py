@@ -117,8 +117,8 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         if model is not None and not held and len(tests) == 1:
             starts += _besides(model)
         tests.append(tested)
-        tried = [fit_switching(m, _some_trips(rows), FIRST_ROUNDS) for m in starts]
-        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, ROUNDS)
+        tried = [fit_switching(m, rows, FIRST_ROUNDS) for m in starts]
+        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
         left = replace(rows, residual_w=rows.residual_w - model.predicted_w(decoded.on))
     if not tests or model is None or decoded is None:
         if tested is None:
