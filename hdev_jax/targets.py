@@ -1,9 +1,9 @@
 """What a log is compared with: each target's unit, how its rows sum, where the chain to it begins and ends."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-__all__ = ["TARGETS", "Target", "TargetName", "target_of"]
+__all__ = ["TARGETS", "Target", "TargetName", "as_watts", "target_of"]
 
 TargetName = Literal["energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n"]
 
@@ -72,3 +72,8 @@ def target_of(target: str | Target) -> Target:
     if target not in TARGETS:
         raise ValueError(f"unknown target {target!r}; one of {', '.join(TARGETS)} is expected")
     return TARGETS[target]
+
+
+def as_watts(target: str | Target, values: Any, duration_s: Any) -> Any:
+    """Values of a battery's target, by row, as powers [W]; `duration_s` of each row [s]."""
+    return values * 1e3 if target_of(target).weight != "row" else values * 3600.0 / duration_s

@@ -34,9 +34,9 @@ from hdev_jax.inference.states import (
 from hdev_jax.physics import SecondSwitchingLoad, SwitchingLoad, Vehicle
 from hdev_jax.physics.states import KNOTS_C, state_channel
 from hdev_jax.segments import trip_slices
-from hdev_jax.targets import TARGETS
+from hdev_jax.targets import TARGETS, as_watts
 
-__all__ = ["LOADS", "add_switching", "decoded_again", "mistaken", "residual_w", "with_states"]
+__all__ = ["LOADS", "add_switching", "decoded_again", "mistaken", "with_states"]
 
 LOADS = (SwitchingLoad, SecondSwitchingLoad)
 COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
@@ -70,11 +70,6 @@ def with_states(training: Training, state: State) -> Training:
 def _states(state: State) -> list[tuple[str, Float[np.ndarray, " row"]]]:
     """Id and decoded state of each load that the state holds."""
     return [] if state.hidden is None else [(id_, state.hidden.on[:, k]) for k, id_ in enumerate(state.hidden.ids)]
-
-
-def residual_w(target: str, residual: Float[np.ndarray, " row"], seconds: Float[np.ndarray, " row"]) -> np.ndarray:
-    """A residual of a battery's target as a power [W]."""
-    return residual * 1e3 if TARGETS[target].weight != "row" else residual * 3600.0 / seconds
 
 
 def mistaken(state: State, new: State) -> bool:
@@ -205,12 +200,12 @@ def _without_slow_loads(training: Training, state: State) -> tuple[list[str], np
         return [], np.zeros(len(training.trip))
     car = state.fit.vehicle.minus(*ids)
     each = [np.asarray(predict(car, c.segments, training.target))[: c.rows] for c in training.chunks]
-    return ids, residual_w(training.target, state.fit.predicted - np.concatenate(each), training.seconds)
+    return ids, as_watts(training.target, state.fit.predicted - np.concatenate(each), training.seconds)
 
 
 def _rows(training: Training, residual: Float[np.ndarray, " row"]) -> StateRows:
     """The training rows with a residual of the target."""
-    watts = residual_w(training.target, residual, training.seconds)
+    watts = as_watts(training.target, residual, training.seconds)
     return rows_of(training.rows.segments, watts, samples=TARGETS[training.target].weight != "row")
 
 

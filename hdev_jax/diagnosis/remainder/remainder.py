@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
+from hdev_jax.diagnosis.remainder.drift import Drift, drift_of
 from hdev_jax.diagnosis.remainder.learner import curve, learn, share_of
 from hdev_jax.diagnosis.remainder.rows import features, side
 from hdev_jax.diagnosis.remainder.structure import (
@@ -22,6 +23,7 @@ from hdev_jax.diagnosis.remainder.structure import (
 )
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.problem import Problem, Split
+from hdev_jax.targets import TARGETS, as_watts
 
 __all__ = ["Formula", "Remainder", "remainder"]
 
@@ -45,6 +47,9 @@ class Remainder:
     scales_with: str | None = None
     correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
     expression: str | None = None
+    behaves_like: str = "none"  # what is slow in it: a load, a force, a gain
+    sd: float | None = None  # of that: W, N, share of the power
+    memory_s: float | None = None
     confirmed: bool = False  # whether cross-validation over training clusters confirms the learner's share
 
 
@@ -136,10 +141,28 @@ def remainder(
     grows = scales_with(train, settings) if parts else None
     if grows is not None:
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
-    signature = "What is left looks like noise: " + colour(noise) if not parts else "What is left: " + "; ".join(parts)
+    drift = _drift(problem, problem.rows(split.train), given)
+    if drift.words:
+        parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
+        signature = "What is left: " + "; ".join(parts_of_signature)
+    elif parts:
+        signature = "What is left: " + "; ".join(parts)
+    else:
+        signature = "What is left looks like noise: " + colour(noise)
     return Remainder(
         bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", max(sizes), differing is not None,
         scales_with=grows,
         correction=curve(correction, test, list(names), order[0], problem.unit) if learned and order else None,
+        behaves_like=drift.like, sd=drift.sd if np.isfinite(drift.sd) else None, memory_s=drift.memory_s or None,
         expression=formula.words if formula is not None else None, confirmed=learned,
     )  # fmt: skip
+
+
+def _drift(problem: Problem, rows: np.ndarray, given: np.ndarray) -> Drift:
+    """What is slow in the residual of some rows of a battery's target; nothing of another target."""
+    if not TARGETS[problem.target].of_battery:
+        return Drift("none", float("nan"), 0.0)
+    s = problem.segments
+    seconds = np.asarray(s.duration_s)[rows]
+    residual, predicted = (as_watts(problem.target, x[rows], seconds) for x in (problem.measured - given, given))
+    return drift_of(residual, predicted, np.asarray(s.speed_mps)[rows], seconds, np.asarray(s.trip)[rows])

@@ -13,13 +13,12 @@ import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.competition.state import State
-from hdev_jax.diagnosis.competition.switching import residual_w
 from hdev_jax.inference import Calibration
 from hdev_jax.inference.states import Switching, decode, energy_draws, fit_switching, rows_of, shares_of
 from hdev_jax.physics.states import KNOTS_C, state_channel
 from hdev_jax.problem import Problem, Split, metrics
 from hdev_jax.segments import Segments, trip_slices
-from hdev_jax.targets import TARGETS
+from hdev_jax.targets import TARGETS, as_watts
 
 __all__ = ["Given", "errors_by_knowledge", "given_states", "state_block"]
 
@@ -51,13 +50,13 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
         return problem.segments.with_channels(**{state_channel(i): on[:, k] for k, i in enumerate(ids)})
 
     off = told(np.zeros((len(seconds), len(ids))))
-    left = residual_w(problem.target, problem.measured - problem.predict(fit.vehicle, off), seconds)
+    left = as_watts(problem.target, problem.measured - problem.predict(fit.vehicle, off), seconds)
     rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
     power = np.array([float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids])
     model, _ = fit_switching(state.hidden.model, rows.take(problem.rows(split.train)), 1)
     decoded = decode(model, rows)
     where = told(decoded.on)
-    error = decoded.error_w / residual_w(problem.target, np.ones(len(seconds)), seconds)
+    error = decoded.error_w / as_watts(problem.target, np.ones(len(seconds)), seconds)
     kwh: dict[str, dict[str, list[float]]] = {i: {} for i in ids}
     drawn = energy_draws(replace(model, power_w=power), rows, key=jax.random.key(seed), draws=DRAWS) / 1e3
     errors = {c.path: float(e) for c, e in zip(fit.table.free, fit.errors, strict=True)}
