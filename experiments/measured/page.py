@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.measured import figures
 from experiments.measured.compared import changes, fold_and_what, new_names, withheld
+from experiments.measured.switching import loads_section
 from experiments.measured.tables import (
     Runs,
     by_chance,
@@ -262,8 +263,8 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     lines += table(
         ["fold", "missions to train / test", "before, RMSE [kW]", "after", "parameters", "effects found", "cost"], rows
     )
-    lines += ["", *_pooled(before, after, warm)]
-    lines += ["", "### Stability over folds", "", *found_table(runs, "fold")]
+    lines += ["", *_pooled(before, after, warm), "", *loads_section(runs, "fold", "kW")]
+    lines += ["### Stability over folds", "", *found_table(runs, "fold")]
     lines += _picture("ztbus_sizes.png", "ZTBus: sizes by fold with 90 % bars")
     caution = "Folds share training missions, so differences in sd are larger than given."
     lines += _details(runs, "fold", caution)
