@@ -12,11 +12,13 @@ from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.limits import MAX_GRADE_RAD
 from hdev_jax.logs.log import MEASURED, Log
 from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
-from hdev_jax.logs.rows import MAX_GRADE_RAD, Rows, check_rows, concatenate
-from hdev_jax.logs.trips import split_trips
+from hdev_jax.logs.rows.checked import check_rows
+from hdev_jax.logs.rows.gathered import Rows, concatenate
+from hdev_jax.logs.rows.trips import split_trips
 from hdev_jax.segments import Segments
 from hdev_jax.units import accepted
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter
-from hdev_jax.logs.matlab import numeric_variables
-from hdev_jax.logs.names import stem
-from hdev_jax.logs.readers import read_bytes, read_raw
+from hdev_jax.logs.readers import read_raw
+from hdev_jax.logs.readers.files import read_bytes
+from hdev_jax.logs.readers.matlab import numeric_variables
+from hdev_jax.logs.readers.names import stem
 from hdev_jax.units import COLUMNS, NEEDED_STEMS, accepted, parse_column
 
 __all__ = ["write_adapter_skeleton"]
