@@ -23,6 +23,7 @@ __all__ = [
     "GRAVITY_MPS2",
     "J_PER_WH",
     "NEEDED_STEMS",
+    "UNITS_IN_USE",
     "ZERO_CELSIUS_K",
     "Conversion",
     "Parsed",
@@ -115,6 +116,13 @@ _STEMS = {
     "halt_brake": "number",
     "energy": "energy",
     "battery_power": "power",
+}
+# units that people log a quantity in: what a column may have been in whose unit is told wrongly
+UNITS_IN_USE = {
+    "speed_mps": ("m/s", "km/h", "mph", "knot"),
+    "grade_rad": ("rad", "tan", "%", "permille", "deg"),
+    "battery_power_w": ("W", "kW"),
+    "energy_wh": ("Wh", "kWh", "J", "kJ", "MJ"),
 }
 NEEDED_STEMS = ("time", "duration", "distance", "speed_start", "speed_end", "speed")
 

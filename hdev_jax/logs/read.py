@@ -16,6 +16,7 @@ from hdev_jax.logs.limits import MAX_GRADE_RAD
 from hdev_jax.logs.log import MEASURED, Log
 from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
+from hdev_jax.logs.rows.charging import without_charging
 from hdev_jax.logs.rows.checked import check_rows
 from hdev_jax.logs.rows.gathered import Rows, concatenate
 from hdev_jax.logs.rows.trips import split_trips
@@ -84,7 +85,8 @@ def _assembled(raws: Sequence[Raw], rules: Adapter, ledger: Ledger, files: tuple
             measured.remove(c)
             left = {k: v for k, v in rows.data.items() if k != c}
             rows = replace(rows, data=left, ledger=rows.ledger.add("noted", "no value in any row, absent", column=c))
-    rows = split_trips(check_rows(rows, sampled, measured), rules.edge_trim_s, sampled)
+    rows = without_charging(check_rows(rows, sampled, measured), sampled, rules.charging == "keep")
+    rows = split_trips(rows, rules.edge_trim_s, sampled)
     columns = _columns(pieces)
     return _log(rows, sampled, measured, columns, files)
 
