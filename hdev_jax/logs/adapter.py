@@ -142,7 +142,7 @@ class Adapter:
             "columns": _columns,
         }
         made = Adapter(where=where, **checked(values, known, where))
-        if (made.long is None) == (made.layout == "long"):
+        if made.preset is None and (made.long is None) == (made.layout == "long"):
             raise InputError(f'{where}: layout = "long" and a table [long] with time, name and value go together')
         return made
 

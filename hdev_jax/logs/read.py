@@ -14,6 +14,7 @@ from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.limits import MAX_GRADE_RAD
 from hdev_jax.logs.log import MEASURED, Log
+from hdev_jax.logs.presets import PRESETS, preset
 from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
 from hdev_jax.logs.rows.charging import without_charging
@@ -39,7 +40,7 @@ def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Ada
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     if not given:
         raise InputError("no log given; name one or more files")
-    rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
+    rules = adapter_of(adapter)
     files, left = find_files([Path(p) for p in given], rules)
     ledger = Ledger()
     for name, why in left.items():
@@ -60,7 +61,7 @@ def log_from_frame(frame: Any, *, name: str = "frame", adapter: str | Path | Ada
     import narwhals as nw
     import pandas as pd
 
-    rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
+    rules = adapter_of(adapter)
     if isinstance(frame, Mapping):
         lengths = {k: len(np.atleast_1d(np.asarray(v))) for k, v in frame.items()}
         if len(set(lengths.values())) > 1:
@@ -72,6 +73,19 @@ def log_from_frame(frame: Any, *, name: str = "frame", adapter: str | Path | Ada
     if table.empty:
         raise InputError(f"{name}: no rows")
     return _assembled([Raw(name, table, name)], rules, Ledger(), (name,))
+
+
+def adapter_of(adapter: str | Path | Adapter | None) -> Adapter:
+    """The adapter in a file, by the name of a preset, or as it is; what it leaves open is its preset's."""
+    if adapter is None:
+        return Adapter()
+    if isinstance(adapter, str | Path):
+        if str(adapter) in PRESETS and not Path(adapter).exists():
+            return preset(str(adapter))
+        adapter = Adapter.load(adapter)
+    if adapter.preset is not None and not adapter.where.startswith("preset "):
+        return adapter.over(preset(adapter.preset, adapter.where))
+    return adapter
 
 
 def _assembled(raws: Sequence[Raw], rules: Adapter, ledger: Ledger, files: tuple[str, ...]) -> Log:

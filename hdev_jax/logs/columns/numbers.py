@@ -39,6 +39,8 @@ def numbers(raw: Raw, header: str, known: bool, note: Callable[[str, int], None]
     text = series.astype("str").str.strip()
     lower = text.str.lower()
     missing = series.isna() | lower.isin(MISSING)
+    if raw.thousands is not None and (named := _named(raw, header, text, missing)) is not None:
+        return named
     number: Any = pd.to_numeric(text.where(~missing), errors="coerce")
     number = number.astype(np.float64)
     boolean = lower.isin(list(_BOOLEANS))
@@ -69,6 +71,31 @@ def numbers(raw: Raw, header: str, known: bool, note: Callable[[str, int], None]
     return number.to_numpy(dtype=np.float64, na_value=np.nan)
 
 
+def _named(raw: Raw, header: str, text: Any, missing: Any) -> np.ndarray | None:
+    """The column where the adapter names the separator of thousands; None where the column is none of numbers.
+
+    Raises `InputError` for numbers that are not grouped by it, since one of the two would be read wrongly.
+    """
+    told = text[~missing]
+    grouped = _grouped(told, raw.thousands)
+    if grouped is None:
+        if (odd := told.str.contains(str(raw.thousands), regex=False)).any() and _all_numbers(told):
+            i = int(text.index.get_loc(odd.idxmax()))
+            raise InputError(
+                f"{raw.file}: {raw.where(i)}, column '{header}': found '{text.iloc[i]}', but thousands = "
+                f'"{raw.thousands}" in the adapter; write the file in one notation'
+            )
+        return None
+    out = np.full(len(text), np.nan)
+    out[(~missing).to_numpy()] = grouped[0].astype(np.float64)
+    return out
+
+
+def _all_numbers(text: Any) -> bool:
+    found: Any = pd.to_numeric(text, errors="coerce")
+    return bool(found.notna().all())
+
+
 def _grouped(text: Any, separator: str | None) -> tuple[Any, str] | None:
     """The numbers without their separators of thousands, and the separator; None where the text leaves a doubt.
 
@@ -82,8 +109,8 @@ def _grouped(text: Any, separator: str | None) -> tuple[Any, str] | None:
         if not text.str.fullmatch(rf"[-+]?(?:\d{{1,3}}(?:{m}\d{{3}})+|\d+)(?:{d}\d+)?").all():
             continue
         grouped = text.str.contains(mark, regex=False)
-        proof = grouped if separator or mark not in ".," else grouped & text.str.contains(decimal, regex=False)
-        if proof.any():
+        proof = grouped if mark not in ".," else grouped & text.str.contains(decimal, regex=False)
+        if separator or proof.any():
             return text.str.replace(mark, "", regex=False).str.replace(decimal, ".", regex=False), mark
     return None
 

@@ -7,9 +7,12 @@ import numpy as np
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
+from hdev_jax.logs.columns.headers import Header, parse_header
 from hdev_jax.logs.columns.labels import id_columns, labels, within_vehicles
+from hdev_jax.logs.columns.long import pivoted
 from hdev_jax.logs.columns.work import MEASURED_COLUMNS, ColumnInfo, Work
 from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.presets import recognised
 from hdev_jax.logs.readers.raw import Raw, place
 
 __all__ = ["ColumnInfo", "Piece", "translate"]
@@ -38,6 +41,9 @@ class Piece:
 
 def translate(raw: Raw, adapter: Adapter) -> Piece:
     """Columns of a raw table under the contract's names in SI. Raises `InputError` (file, row, column, what to do)."""
+    raw, adapter = _of_its_tool(raw, adapter)
+    if adapter.long is not None:
+        raw = pivoted(raw, adapter, MEASURED_COLUMNS)
     headers = [str(c) for c in raw.table.columns]
     raw = replace(raw, table=raw.table.set_axis(headers, axis=1))
     ids = {name: id_columns(raw, adapter, name, headers) for name in ("trip_id", "vehicle_id")}
@@ -73,6 +79,26 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
     return _measured_rows(piece, work, adapter)
 
 
+def _of_its_tool(raw: Raw, adapter: Adapter) -> tuple[Raw, Adapter]:
+    """Without an adapter, and where the file names no speed as the contract does: the preset of the tool that writes
+    such headers, noted."""
+    headers = [str(c) for c in raw.table.columns]
+    if adapter.columns or adapter.preset or any(_is_speed(Header.of(h, raw.units.get(h))) for h in headers):
+        return raw, adapter
+    found = recognised(headers)
+    if found is None:
+        return raw, adapter
+    why = f"its header is that of {found.preset}: read by the preset of that name"
+    return replace(raw, ledger=raw.ledger.add("noted", why, file=raw.file)), adapter.over(found)
+
+
+def _is_speed(header: Header) -> bool:
+    try:
+        return parse_header(header).name in ("speed_mps", "speed_start_mps")
+    except InputError:  # told where columns are translated
+        return True
+
+
 def _measured_rows(piece: Piece, work: Work, adapter: Adapter) -> Piece:
     """The rows where what the adapter names was measured; without a name those where a target was filled are left out:
     what was filled is no measurement."""
@@ -85,6 +111,8 @@ def _measured_rows(piece: Piece, work: Work, adapter: Adapter) -> Piece:
         keep = np.isfinite(x) if x is not None else work.raw.table[header].notna().to_numpy()
         why = f"rows = '{header}' of the adapter: it was not measured there"
     else:
+        if adapter.long is not None:  # put on another channel's clock, a target is there at its own times alone
+            work.unfilled |= {c: piece.data[c] for c in MEASURED_COLUMNS if c in piece.data}
         filled = [c for c in MEASURED_COLUMNS if c in work.unfilled and c in piece.data]
         if not filled:
             return piece

@@ -11,6 +11,7 @@ _PLAIN = {
     ".csv": "csv",
     ".txt": "csv",
     ".tsv": "csv",
+    ".vmod": "csv",
     ".parquet": "parquet",
     ".pq": "parquet",
     ".feather": "feather",

@@ -15,11 +15,12 @@ from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.limits import BAD_SHARE
-from hdev_jax.logs.readers.layout import COMMENT, Layout, layout_of
+from hdev_jax.logs.readers.layout import COMMENT, Layout, layout_of, split
 
 __all__ = ["Text", "check_header", "read_text"]
 
 _TEXT_IDS = ("trip_id", "vehicle_id")
+_ENOUGH, _ASKED = 10, 2000  # decimals without trailing zeros: one in ten has fewer than three digits
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,11 @@ def read_text(path: Path, data: bytes, adapter: Adapter) -> Text:
     comma = adapter.decimal == "," if adapter.decimal else _has_decimal_commas(body, layout.separator)
     if comma and adapter.thousands is None:
         _check_thousands(path, body, layout, records.start)
-    table = _frame(path, body, layout, comma)
+    table = _frame(path, body, layout, comma, as_text=adapter.thousands is not None)
     if len(table) != len(records.start):  # pandas and csv disagree about quotes: no line could be named rightly
         raise InputError(f"{path}: not a regular table: quotes that do not close, or a quote inside a field")
+    if adapter.decimal is None and not comma:
+        _ask_about_groups(path, table, lines, layout, records.start)
     named = [n or f"unnamed column {i + 1}" for i, n in enumerate(layout.names)]
     table.columns = pd.Index(named)
     units = {n: u for n, u in zip(named, layout.units or (), strict=False) if u not in ("", "-")}
@@ -214,7 +217,32 @@ def _check_thousands(path: Path, body: str, layout: Layout, at: np.ndarray) -> N
     )
 
 
-def _frame(path: Path, body: str, layout: Layout, comma: bool) -> pd.DataFrame:
+def _ask_about_groups(path: Path, table: pd.DataFrame, lines: list[str], layout: Layout, at: np.ndarray) -> None:
+    """Refuse a column of `600` and `14.288` whose every point stands before three digits: points between thousands?
+
+    A column of decimals has one of other length, or a 0 before the point, among a few.
+    """
+    for k in table.columns:
+        if table[k].dtype.kind != "f":
+            continue
+        x = table[k].to_numpy()
+        broken = np.flatnonzero(np.isfinite(x) & (x != np.round(x)))
+        if (
+            len(broken) < _ENOUGH
+            or np.nanmax(np.abs(x)) >= 1000.0
+            or not np.any((np.abs(x) >= 100) & (x == np.round(x)))
+        ):
+            continue
+        cells = (split(lines[at[i] - 1], layout.separator)[k] for i in broken[:_ASKED])
+        if all(re.fullmatch(r"[-+]?[1-9]\d{0,2}\.\d{3}", c) for c in cells):
+            i = int(broken[0])
+            raise InputError(
+                f"{path}: line {at[i]}, column '{layout.names[k]}': {x[i]:.3f} beside whole numbers, and each point before "
+                'three digits: is it between thousands? Say thousands = "." or decimal = "." in an adapter'
+            )
+
+
+def _frame(path: Path, body: str, layout: Layout, comma: bool, *, as_text: bool) -> pd.DataFrame:
     names = layout.names
     text_ids: dict[Any, Any] = {i: str for i, n in enumerate(names) if n in _TEXT_IDS}
     try:
@@ -226,7 +254,7 @@ def _frame(path: Path, body: str, layout: Layout, comma: bool) -> pd.DataFrame:
             index_col=False,
             usecols=range(len(names)),
             decimal="," if comma else ".",
-            dtype=text_ids or None,
+            dtype=str if as_text else text_ids or None,
             low_memory=False,
             skipinitialspace=True,
         )
