@@ -237,8 +237,8 @@ def _ask_about_groups(path: Path, table: pd.DataFrame, lines: list[str], layout:
         if all(re.fullmatch(r"[-+]?[1-9]\d{0,2}\.\d{3}", c) for c in cells):
             i = int(broken[0])
             raise InputError(
-                f"{path}: line {at[i]}, column '{layout.names[k]}': {x[i]:.3f} beside whole numbers, and each point before "
-                'three digits: is it between thousands? Say thousands = "." or decimal = "." in an adapter'
+                f"{path}: line {at[i]}, column '{layout.names[k]}': {x[i]:.3f} beside whole numbers, and each point "
+                'before three digits: is it between thousands? Say thousands = "." or decimal = "." in an adapter'
             )
 
 
