@@ -85,7 +85,8 @@ def _distance(log: Log) -> Suspicion | None:
     s = log.segments
     trip = np.asarray(s.trip)
     way = np.bincount(trip, np.asarray(s.distance_m))
-    made = np.bincount(trip, np.asarray(s.speed_mps) * np.asarray(s.duration_s))
+    speed = 0.5 * (np.asarray(s.speed_start_mps) + np.asarray(s.speed_end_mps))
+    made = np.bincount(trip, speed * np.asarray(s.duration_s))
     long = made > ENOUGH_M / 10
     if not long.any():
         return None

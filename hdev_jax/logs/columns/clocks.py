@@ -272,6 +272,6 @@ def _spread(x: np.ndarray, trip: np.ndarray, note: Note) -> np.ndarray:
     out = stamp[group] + index * width[group]
     # a trip's first stamp began before the log did: its rows end where the next stamp begins
     ending = np.r_[stamp[1:], np.nan][group] - (size[group] - index) * nextwidth[group]
-    out = np.where(opening[group] & np.isfinite(ending) & (size[group] > 1), ending, out)
+    out = np.where(opening[group] & np.isfinite(ending), ending, out)
     note("rows of one time stamp spread over the time to the next", int((~opens).sum()))
     return out
