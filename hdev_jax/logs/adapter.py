@@ -150,7 +150,7 @@ class Adapter:
         """This adapter with what it leaves open taken from a preset; its rules go before the preset's."""
         usual = Adapter()
         own = {k: v for k in vars(usual) if (v := getattr(self, k)) != getattr(usual, k)}
-        return replace(preset, **own, columns={**preset.columns, **self.columns})
+        return replace(preset, **own | {"columns": {**preset.columns, **self.columns}})
 
     def match(self, pattern: str, name: str) -> str | None:
         """First group of the pattern in `name` (the whole match where it has none), None without a match."""

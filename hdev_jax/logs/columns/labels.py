@@ -18,6 +18,8 @@ def id_columns(raw: Raw, adapter: Adapter, name: str, headers: list[str]) -> tup
     if rule is None:
         return (name,) if name in headers else ()
     for source in rule.sources:
+        if source not in headers and adapter.preset is not None:
+            return ()
         if source not in headers:
             raise InputError(f"{raw.file}: no column '{source}' for {name}{near(source, headers)}")
     return rule.sources
