@@ -33,7 +33,7 @@ def text(frame: pd.DataFrame, **options) -> str:
 
 
 def same(log: Log, frame: pd.DataFrame = FRAME) -> None:
-    np.testing.assert_allclose(log.segments.time_s, frame["time_s"] - frame["time_s"].iloc[0], atol=1e-6)
+    np.testing.assert_allclose(log.segments.time_s, FRAME["time_s"], atol=1e-6)
     np.testing.assert_allclose(log.segments.distance_m, frame["speed_mps"] * log.segments.duration_s, rtol=1e-9)
     np.testing.assert_allclose(log.measured["battery_power_w"], frame["battery_power_w"], rtol=1e-9)
 
@@ -151,6 +151,15 @@ def test_local_time_over_the_end_of_summer_time(row, zone):
     local = utc.dt.tz_convert("Europe/Zurich").dt.strftime("%Y-%m-%d %H:%M:%S")
     frame = FRAME.drop(columns="time_s").assign(timestamp=local)
     same(read(text(frame).encode(), {"time_zone": "Europe/Zurich"} if zone else None))
+
+
+@FIFTY
+@given(st.integers(1, 118))
+def test_seconds_of_the_day_over_midnight(row):
+    frame = FRAME.assign(time_s=(86400.0 - row + FRAME["time_s"]) % 86400.0)
+    log = read(text(frame).encode())
+    same(log)
+    assert any("midnight" in e.reason and e.count == 120 - row for e in log.ledger)
 
 
 @FIFTY

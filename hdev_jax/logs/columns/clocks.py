@@ -76,6 +76,7 @@ def read_clock(raw: Raw, headers: tuple[str, ...], trip: np.ndarray, how: Clock,
     elif len(headers) == 1 and how.format is None and _numeric(series):
         x, naive = numbers(raw, headers[0], True, note), False
         assert x is not None
+        x = _past_midnight(x, trip, note)
     else:
         text = series.astype("str").str.strip()
         text = text.where(series.notna() & ~text.str.lower().isin(MISSING))
@@ -240,6 +241,18 @@ def _local(x: np.ndarray, trip: np.ndarray, how: Clock, note: Note) -> np.ndarra
             note("goes back by one hour at a full hour, read as the end of summer time", int((shift > 0).sum()))
         x = x + shift
     return x
+
+
+def _past_midnight(x: np.ndarray, trip: np.ndarray, note: Note) -> np.ndarray:
+    """Seconds of the day, counted on over midnight: from the last minute of a day to the first of the next."""
+    with np.errstate(invalid="ignore"):
+        passes = (x[:-1] >= DAY_S - 60.0) & (x[1:] <= 60.0) & (trip[1:] == trip[:-1])
+    if not passes.any() or np.nanmax(x) >= DAY_S or np.nanmin(x) < 0.0:
+        return x
+    days = np.r_[0.0, np.cumsum(passes)]
+    days -= days[np.unique(trip, return_index=True)[1]][np.unique(trip, return_inverse=True)[1]]
+    note("passes midnight: a day later from there", int((days > 0).sum()))
+    return x + DAY_S * days
 
 
 def _in_zone(x: np.ndarray, zone: str, note: Note) -> np.ndarray:
