@@ -60,6 +60,13 @@ def test_one_drive_in_every_way_to_write_it(name, adapter, noted):
     assert noted in said(log)
 
 
+def test_a_power_that_no_name_says_is_of_the_battery_is_asked_about():
+    log = read("text/units_row.csv")
+    assert float(np.sum(log.segments.distance_m)) == pytest.approx(1e3 * DRIVE[0], rel=2e-4)
+    with pytest.raises(InputError, match="whether 'power' is battery_power_w"):
+        _ = log.default_target
+
+
 def test_decimals_that_begin_late():
     """Of this file the first minute is zeros: its own sums, by hand."""
     rows = [line.replace(",", ".").split(";") for line in (CASES / "text" / "semi_late.csv").read_text().split()[1:]]

@@ -207,7 +207,8 @@ class Work:
             came_from[parsed.name] = header
             x = np.asarray(parsed.conversion.call(np.where(np.isinf(x), np.nan, x)), dtype=np.float64)
             self.data[parsed.name] = x
-            self.columns.append(ColumnInfo(header, parsed.conversion.unit, parsed.name))
+            told = parsed.conversion.unit if parsed.known else self.parsed[header].unit
+            self.columns.append(ColumnInfo(header, told or "", parsed.name))
             if not parsed.known:
                 hint = near(header, [c for c in COLUMNS if c not in self.headers], 0.85)
                 if header in COLUMNS.values():
