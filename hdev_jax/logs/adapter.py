@@ -44,7 +44,8 @@ class Rule:
     `nearest`, `linear` over time; before the first value `initial`), then `a + b·x`, then the unit is brought to SI.
     A source that is itself a column made here is taken in SI, after its own fill. Of `alternatives` (in TOML `or`) the
     first that the file has stands in for a source that it lacks. An id, and a clock of date and time, may have several
-    sources; `format` is a clock's, in the letters of strptime.
+    sources; `format` is a clock's, in the letters of strptime. Of a `counter`, an odometer or the energy since some
+    start, each sample has what was added around it.
     """
 
     source: str | tuple[str, ...]
@@ -56,6 +57,7 @@ class Rule:
     expr: str | None = None
     format: str | None = None
     alternatives: tuple[str, ...] = ()
+    counter: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -198,6 +200,7 @@ def _columns(where: str, value: Any) -> dict[str, Rule]:
         "affine": pair,
         "valid": span,
         "format": text,
+        "counter": flag,
     }
     for name, entry in table(where, value, ()).items():
         here = f"{where}.{name}"
@@ -218,6 +221,8 @@ def _columns(where: str, value: Any) -> dict[str, Rule]:
             raise InputError(f"{here}: several sources are for trip_id, vehicle_id and time_s; use expr to calculate")
         if rule.format is not None and target != "time_s":
             raise InputError(f"{here}: format is for time_s")
+        if rule.counter and target not in ("energy_wh", "distance_m"):
+            raise InputError(f"{here}: counter is for energy_wh and distance_m, which are sums")
         if target in rules:
             raise InputError(f"{here}: a second rule for {target}")
         if target != name and rule.unit is None and name not in _TEXT_COLUMNS:

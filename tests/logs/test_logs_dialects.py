@@ -97,6 +97,16 @@ def test_thousands_are_taken_out_where_they_are_certain_and_asked_about_where_no
 
 
 @FIFTY
+@given(st.integers(100, 900), st.integers(0, 2**16), st.sampled_from([",", ";"]))
+def test_decimals_of_one_length_are_no_groups_of_thousands(volts, seed, separator):
+    """A voltage as `%.3f` has 380.000 beside 379.512."""
+    voltage = np.round(volts + np.random.default_rng(seed).normal(0.0, 3.0, 120), 3)
+    voltage[5] = volts
+    log = read(text(FRAME.assign(voltage_v=voltage), sep=separator, float_format="%.3f").encode())
+    np.testing.assert_allclose(log.segments.channels["voltage_v"], voltage)
+
+
+@FIFTY
 @given(st.lists(st.integers(2, 119), min_size=1, max_size=30, unique=True), st.sampled_from(",;"))
 def test_lines_with_a_field_too_few_are_left_out_or_refused_and_never_shifted(lines, separator):
     rows = text(FRAME, sep=separator).splitlines()

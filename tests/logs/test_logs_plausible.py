@@ -115,6 +115,19 @@ def test_a_distance_in_another_unit_than_the_speed(factor, what):
     assert what in one.evidence
 
 
+def test_a_counter_of_energy_is_suspected_and_its_key_reads_it():
+    frame = drive(CAR, 3)
+    added = frame.pop("battery_power_w") / 3600.0
+    frame["energy_wh"] = 5000.0 + np.cumsum(added)
+    (one,) = suspicions(log_from_frame(frame))
+    assert one.what == "energy_wh"
+    assert "counter = true" in one.mend
+    rules = {"energy_wh": {"source": "energy_wh", "counter": True}}
+    log = log_from_frame(frame, adapter=Adapter.from_dict({"columns": rules}))
+    assert suspicions(log) == ()
+    np.testing.assert_allclose(np.sum(log.measured["energy_wh"]), added.sum(), rtol=0.01)
+
+
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_a_power_in_another_unit(factor):
     frame = drive(CAR, 1)

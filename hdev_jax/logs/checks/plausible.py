@@ -15,6 +15,8 @@ TURNED = -0.3
 LEAST_KWHPKM, MOST_KWHPKM = 0.005, 30.0
 # of the sums: odometer and speedometer differ by up to a tenth (UN R39 lets a speedometer show 10 % and 4 km/h more)
 SAME = 0.12
+# A counter: of its value a row adds little, and recuperation takes little back. Energy by row changes by its own size.
+MANY, SMOOTH, RETURNED = 50, 0.02, 0.35
 _FACTORS = {
     1.609344: "miles and kilometres",
     1.852: "nautical miles and kilometres",
@@ -26,6 +28,8 @@ _FACTORS = {
 
 def suspicions(log: Log) -> tuple[Suspicion, ...]:
     """What about the log cannot be right, whatever the vehicle."""
+    if (counter := _counter(log)) is not None:  # of the others' evidence the energy is a part
+        return (counter,)
     found = (_sign(log), _consumption(log), _distance(log))
     return tuple(s for s in found if s is not None)
 
@@ -35,6 +39,25 @@ def _measured(log: Log) -> tuple[str, np.ndarray] | None:
     if not log.measured:
         return None
     return next(iter(log.measured)), 1e3 * log.target("battery_power_kw")
+
+
+def _counter(log: Log) -> Suspicion | None:
+    """Energy that is large beside its change from row to row, and hardly ever turns: a counter."""
+    x = log.measured.get("energy_wh")
+    if x is None:
+        return None
+    trip = np.asarray(log.segments.trip)
+    step = np.diff(x)[trip[1:] == trip[:-1]]
+    if len(step) < MANY or not np.any(step) or np.median(np.abs(step)) > SMOOTH * np.median(np.abs(x)):
+        return None
+    turns = min(float(np.mean(step > 0)), float(np.mean(step < 0)))
+    if turns > RETURNED:
+        return None
+    evidence = (
+        f"{np.median(np.abs(x)):.4g} Wh in the median row, changing by {np.median(np.abs(step)):.2g} Wh: a counter?"
+    )
+    mend = mended(log, "energy_wh").replace(" }", ", counter = true }")
+    return Suspicion("energy_wh", evidence, mend)
 
 
 def _sign(log: Log) -> Suspicion | None:

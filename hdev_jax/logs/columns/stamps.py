@@ -45,8 +45,9 @@ def stamps(
 ) -> tuple[np.ndarray, bool]:
     """Seconds `[row]` of texts, and whether they are local times.
 
-    **Arguments:** `where`, the column for messages; `form`, the adapter's strptime format; `note(reason, count)` is told
-    what was assumed. **Raises:** `InputError` for the first text that is no time, or whose day and month may be either.
+    **Arguments:** `where`, the column for messages; `form`, the adapter's strptime format; `note(reason, count)` is
+    told what was assumed. **Raises:** `InputError` for the first text that is no time, or where day and month cannot be
+    told apart.
     """
     told = text[text.notna()]
     if form is not None:

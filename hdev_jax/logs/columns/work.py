@@ -12,7 +12,7 @@ from hdev_jax.logs.columns.numbers import numbers
 from hdev_jax.logs.columns.timing import CLOCKS, find_clock
 from hdev_jax.logs.expression import Quantity, evaluate
 from hdev_jax.logs.readers.raw import Raw
-from hdev_jax.logs.repair import fill_forward, fill_linear, fill_nearest
+from hdev_jax.logs.repair import fill_forward, fill_linear, fill_nearest, increments
 from hdev_jax.units import COLUMNS, NEEDED_STEMS, conversion, registry, unit_of
 
 __all__ = ["MEASURED_COLUMNS", "ColumnInfo", "Work"]
@@ -174,6 +174,9 @@ class Work:
             x = rule.affine[0] + rule.affine[1] * x
         if rule.unit is not None:
             x = np.asarray(conversion(name, rule.unit, where=f"{self.adapter.where}: columns.{name}.unit").call(x))
+        if rule.counter:
+            x = increments(x, self.trip)
+            self.note(name, "what a counter added around each sample", kind="derived")
         return x
 
     def keep_others(self, taken: set[str]) -> None:

@@ -213,7 +213,8 @@ def _check_thousands(path: Path, body: str, layout: Layout, at: np.ndarray) -> N
     column = min(before[before.rfind("\n") + 1 :].count(layout.separator), len(layout.names) - 1)
     raise InputError(
         f"{path}: line {at[min(row, len(at) - 1)]}, column '{layout.names[column]}': {found.group(1)} in a file with "
-        'decimal commas: a thousands separator? Say thousands = "." in an adapter, or write the file without'
+        'decimal commas: a thousands separator? Say thousands = "." (or decimal = ".") in an adapter, or write the file '
+        "without"
     )
 
 
@@ -227,14 +228,15 @@ def _ask_about_groups(path: Path, table: pd.DataFrame, lines: list[str], layout:
             continue
         x = table[k].to_numpy()
         broken = np.flatnonzero(np.isfinite(x) & (x != np.round(x)))
-        if (
-            len(broken) < _ENOUGH
-            or np.nanmax(np.abs(x)) >= 1000.0
-            or not np.any((np.abs(x) >= 100) & (x == np.round(x)))
-        ):
+        large = np.flatnonzero((np.abs(x) >= 100) & (x == np.round(x)))
+        if len(broken) < _ENOUGH or not len(large) or np.nanmax(np.abs(x)) >= 1000.0:
             continue
-        cells = (split(lines[at[i] - 1], layout.separator)[k] for i in broken[:_ASKED])
-        if all(re.fullmatch(r"[-+]?[1-9]\d{0,2}\.\d{3}", c) for c in cells):
+
+        def fit(rows: np.ndarray, pattern: str, k: int = k) -> bool:
+            cells = (split(lines[at[i] - 1], layout.separator)[k] for i in rows[:_ASKED])
+            return all(re.fullmatch(pattern, c) for c in cells)
+
+        if fit(large, r"[-+]?\d{3}") and fit(broken, r"[-+]?[1-9]\d{0,2}\.\d{3}"):
             i = int(broken[0])
             raise InputError(
                 f"{path}: line {at[i]}, column '{layout.names[k]}': {x[i]:.3f} beside whole numbers, and each point "
