@@ -118,7 +118,7 @@ def test_a_distance_in_another_unit_than_the_speed(factor, what):
 def test_a_counter_of_energy_is_suspected_and_its_key_reads_it():
     frame = drive(CAR, 3)
     added = frame.pop("battery_power_w") / 3600.0
-    frame["energy_wh"] = 5000.0 + np.cumsum(added)
+    frame["energy_wh"] = 500.0 + np.cumsum(added)
     (one,) = suspicions(log_from_frame(frame))
     assert one.what == "energy_wh"
     assert "counter = true" in one.mend

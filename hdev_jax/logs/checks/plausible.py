@@ -53,9 +53,8 @@ def _counter(log: Log) -> Suspicion | None:
     turns = min(float(np.mean(step > 0)), float(np.mean(step < 0)))
     if turns > RETURNED:
         return None
-    evidence = (
-        f"{np.median(np.abs(x)):.4g} Wh in the median row, changing by {np.median(np.abs(step)):.2g} Wh: a counter?"
-    )
+    value, change = float(np.median(np.abs(x))), float(np.median(np.abs(step)))
+    evidence = f"{value:.4g} Wh in the median row, changing by {change:.2g} Wh: a counter?"
     mend = mended(log, "energy_wh").replace(" }", ", counter = true }")
     return Suspicion("energy_wh", evidence, mend)
 

@@ -213,8 +213,8 @@ def _check_thousands(path: Path, body: str, layout: Layout, at: np.ndarray) -> N
     column = min(before[before.rfind("\n") + 1 :].count(layout.separator), len(layout.names) - 1)
     raise InputError(
         f"{path}: line {at[min(row, len(at) - 1)]}, column '{layout.names[column]}': {found.group(1)} in a file with "
-        'decimal commas: a thousands separator? Say thousands = "." (or decimal = ".") in an adapter, or write the file '
-        "without"
+        'decimal commas: a thousands separator? Say thousands = "." (or decimal = ".") in an adapter, or write the '
+        "file without"
     )
 
 

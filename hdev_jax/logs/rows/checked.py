@@ -159,7 +159,8 @@ def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarra
     if "battery_power_w" in rows.data:
         rule(np.abs(rows.data["battery_power_w"]) > MAX_POWER_W, f"a battery power of {most}")
     if "energy_wh" in rows.data and length is not None:
-        rule(np.abs(rows.data["energy_wh"]) * 3600.0 > MAX_POWER_W * length, f"an energy_wh that means {most}")
+        counts = most.replace("(is it", "(is it a counter, for which an adapter says counter = true,")
+        rule(np.abs(rows.data["energy_wh"]) * 3600.0 > MAX_POWER_W * length, f"an energy_wh that means {counts}")
     return bad, reasons
 
 
