@@ -32,6 +32,15 @@ def text(frame: pd.DataFrame, **options) -> str:
     return frame.to_csv(index=False, **options)
 
 
+def said(data: bytes, adapter: dict | None = None) -> str:
+    """The line with which a file is refused; an empty text where it is read."""
+    try:
+        read(data, adapter)
+    except InputError as e:
+        return str(e)
+    return ""
+
+
 def same(log: Log, frame: pd.DataFrame = FRAME) -> None:
     np.testing.assert_allclose(log.segments.time_s, FRAME["time_s"], atol=1e-6)
     np.testing.assert_allclose(log.segments.distance_m, frame["speed_mps"] * log.segments.duration_s, rtol=1e-9)
@@ -88,11 +97,11 @@ def test_thousands_are_taken_out_where_they_are_certain_and_asked_about_where_no
     for c in ("time_s", "speed_mps", "ambient_temp_c"):
         shown[c] = shown[c].str.replace(".", decimal, regex=False)
     data = text(shown, sep=separator).encode()
-    try:
-        same(read(data), frame)
-    except InputError as e:
-        assert "thousands" in str(e)
+    if line := said(data):
+        assert "thousands" in line
         assert not fraction
+    else:
+        same(read(data), frame)
     same(read(data, {"thousands": mark, "decimal": decimal}), frame)
 
 
@@ -112,11 +121,11 @@ def test_lines_with_a_field_too_few_are_left_out_or_refused_and_never_shifted(li
     rows = text(FRAME, sep=separator).splitlines()
     for k in lines:
         rows[k] = separator.join(rows[k].split(separator)[1:])
-    try:
-        log = read("\n".join(rows).encode())
-    except InputError as e:
-        assert "fields" in str(e)
+    data = "\n".join(rows).encode()
+    if line := said(data):
+        assert "fields" in line
         return
+    log = read(data)
     assert len(lines) <= 6
     keep = np.setdiff1d(np.arange(120), np.array(lines) - 1)
     np.testing.assert_allclose(log.measured["battery_power_w"], FRAME["battery_power_w"].iloc[keep])
@@ -142,11 +151,11 @@ def test_every_clock_is_the_same_drive_also_over_midnight(form, start):
     stamp = pd.Timestamp(start).floor("s") + pd.to_timedelta(FRAME["time_s"], unit="s")
     frame = FRAME.drop(columns="time_s").assign(timestamp=stamp.dt.strftime(form))
     data = text(frame).encode()
-    try:
-        same(read(data))
-    except InputError as e:
+    if line := said(data):
         assert not STAMPS[form]
-        assert "format" in str(e)
+        assert "format" in line
+    else:
+        same(read(data))
     same(read(data, {"columns": {"time_s": {"source": "timestamp", "format": form}}}))
     if form.startswith("%H"):
         two = frame.rename(columns={"timestamp": "Time"}).assign(Date=stamp.dt.strftime("%Y-%m-%d"))

@@ -155,7 +155,7 @@ def test_expressions_whose_units_do_not_fit(expr, part):
     )
 )
 def test_expressions_are_never_run_as_code(text):
-    with pytest.raises(InputError, match="a.toml"):
+    with pytest.raises(InputError, match=r"a\.toml"):
         check_expression("a.toml", text)
 
 
