@@ -138,7 +138,7 @@ def test_a_power_in_another_unit(factor):
 
 
 @settings(max_examples=50)
-@given(st.integers(0, 10**6), st.integers(70, 600), st.floats(2.0, 150.0), st.booleans())
+@given(st.integers(0, 10**6), st.integers(70, 600), st.floats(11.0, 150.0), st.booleans())
 def test_charging_at_standstill_is_cut_and_counted_wherever_it_stands(seed, seconds, kilowatts, keep):
     frame = drive(CAR, seed, minutes=10)
     frame.loc[len(frame) - 20 :, ["speed_mps", "battery_power_w"]] = [0.0, 600.0]
@@ -152,6 +152,16 @@ def test_charging_at_standstill_is_cut_and_counted_wherever_it_stands(seed, seco
     assert entry.count == seconds
     assert len(log) == len(both) - (0 if keep else seconds)
     assert entry.kind == ("noted" if keep else "dropped")
+
+
+def test_noise_while_standing_is_no_charging():
+    frame = pd.DataFrame(
+        {"duration_s": 70.0, "distance_m": 0.0, "speed_start_mps": 0.0, "speed_end_mps": 0.0, "energy_wh": -40.0},
+        index=range(3),
+    )
+    drives = frame.assign(distance_m=900.0, speed_start_mps=12.0, speed_end_mps=13.0, energy_wh=200.0)
+    both = pd.concat([part for _ in range(9) for part in (drives, frame.iloc[:1])], ignore_index=True)
+    assert len(log_from_frame(both)) == len(both)
 
 
 def test_an_interval_that_stands_at_both_ends_and_drives_between_them_is_no_charging():

@@ -14,6 +14,7 @@ STANDS_MPS = 0.1  # instruments at rest show a little
 # Into the battery: the slowest charger (6 A, one phase, IEC 61851-1) gives 1.4 kW; a sensor's zero is off by less.
 CHARGES_W = -1000.0
 LASTS_S = 60.0  # regeneration is over within a sample or two after a stop; the shortest charge at a stop lasts minutes
+CHARGED_WH = 200.0  # of one stand; less is also what the noise of a log of intervals gives while standing
 _DRIVES = 20  # rows that accelerate, for a judgement on the sign
 
 
@@ -47,6 +48,7 @@ def without_charging(rows: Rows, sampled: bool, keep: bool) -> Rows:
     edges = np.flatnonzero(opens)
     run = np.cumsum(opens) - 1
     long = np.add.reduceat(np.where(charges, duration, 0.0), edges) >= LASTS_S
+    long &= np.add.reduceat(np.where(charges, -power * duration, 0.0), edges) >= CHARGED_WH * J_PER_WH
     index = np.arange(len(run))
     first = np.minimum.reduceat(np.where(charges, index, len(run)), edges)
     last = np.maximum.reduceat(np.where(charges, index, -1), edges)
