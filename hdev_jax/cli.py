@@ -120,6 +120,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="Q",
         help="highest FDR-adjusted p-value of an added effect (default: 0.05)",
     )
+    diagnose.add_argument("--trust", action="store_true", help="search even where a unit or a sign is suspected")
     _out(diagnose)
 
     calibrate = verbs.add_parser(

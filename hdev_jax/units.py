@@ -23,12 +23,15 @@ __all__ = [
     "GRAVITY_MPS2",
     "J_PER_WH",
     "NEEDED_STEMS",
+    "UNITS_IN_USE",
     "ZERO_CELSIUS_K",
     "Conversion",
     "Parsed",
     "accepted",
     "canonical_name",
     "conversion",
+    "is_unit",
+    "known_stem",
     "parse_column",
     "registry",
     "to_si",
@@ -48,21 +51,14 @@ _SUFFIXES: dict[str, dict[str, str]] = {
     "time": {"s": "second", "ms": "millisecond", "min": "minute", "h": "hour"},
     "length": {"m": "meter", "km": "kilometer", "cm": "centimeter", "mi": "mile", "ft": "foot"},
     "speed": {
-        "mps": "meter/second",
-        "kmh": "kilometer/hour",
-        "kph": "kilometer/hour",
-        "mph": "mile/hour",
-        "knots": "knot",
+        "mps": "meter/second", "kmh": "kilometer/hour", "kph": "kilometer/hour", "mph": "mile/hour", "knots": "knot",
     },
     "accel": {"mps2": "meter/second**2", "g": "standard_gravity"},
     "slope": {"rad": "radian", "pct": "%", "permille": "permille", "deg": "degree", "tan": "tan"},
     "mass": {"kg": "kilogram", "t": "metric_ton", "lb": "pound"},
     "torque": {"nm": "newton*meter", "knm": "kilonewton*meter", "lbft": "foot*force_pound"},
     "rotation": {
-        "radps": "radian/second",
-        "rpm": "revolution/minute",
-        "degps": "degree/second",
-        "rps": "revolution/second",
+        "radps": "radian/second", "rpm": "revolution/minute", "degps": "degree/second", "rps": "revolution/second",
     },
     "force": {"n": "newton", "kn": "kilonewton", "lbf": "force_pound"},
     "temperature": {"c": "degree_Celsius", "k": "kelvin", "f": "degree_Fahrenheit", "degc": "degree_Celsius"},
@@ -74,18 +70,13 @@ _SUFFIXES: dict[str, dict[str, str]] = {
     "voltage": {"v": "volt", "mv": "millivolt", "kv": "kilovolt"},
     "current": {"a": "ampere", "ma": "milliampere", "ka": "kiloampere"},
     "pressure": {
-        "pa": "pascal",
-        "hpa": "hectopascal",
-        "kpa": "kilopascal",
-        "mpa": "megapascal",
-        "bar": "bar",
-        "mbar": "millibar",
-        "psi": "psi",
+        "pa": "pascal", "hpa": "hectopascal", "kpa": "kilopascal", "mpa": "megapascal", "bar": "bar", "mbar":
+        "millibar", "psi": "psi",
     },
     "percent": {"pct": "percent"},
     "fraction": {"": "dimensionless", "pct": "percent"},
     "number": {"": "dimensionless"},
-}
+}  # fmt: skip
 
 _STEMS = {
     "time": "time",
@@ -126,29 +117,27 @@ _STEMS = {
     "energy": "energy",
     "battery_power": "power",
 }
+# units that people log a quantity in: what a column may have been in whose unit is told wrongly
+UNITS_IN_USE = {
+    "speed_mps": ("m/s", "km/h", "mph", "knot"),
+    "grade_rad": ("rad", "tan", "%", "permille", "deg"),
+    "battery_power_w": ("W", "kW"),
+    "energy_wh": ("Wh", "kWh", "J", "kJ", "MJ"),
+}
 NEEDED_STEMS = ("time", "duration", "distance", "speed_start", "speed_end", "speed")
 
 # words that follow a stem in other people's headers and are no unit, though pint may know one of that name
 _NOT_UNITS = {"min", "max", "mean", "avg", "std", "var", "count", "limit", "target", "set", "point", "id", "flag"}
 _NOT_UNITS |= {"dc", "ac", "ref"}
 _ALIASES = {
-    "C": "degree_Celsius",
-    "°C": "degree_Celsius",
-    "F": "degree_Fahrenheit",
-    "°F": "degree_Fahrenheit",
-    "Nm": "newton*meter",
-    "kNm": "kilonewton*meter",
-    "t": "metric_ton",
-    "1/min": "revolution/minute",
-    "min-1": "revolution/minute",
-    "m/s^2": "meter/second**2",
-    "m/s²": "meter/second**2",
-    "g0": "standard_gravity",
-    "°": "degree",
-    "": "dimensionless",
-    "-": "dimensionless",
-    "1": "dimensionless",
-}
+    "C": "degree_Celsius", "°C": "degree_Celsius", "F": "degree_Fahrenheit", "°F": "degree_Fahrenheit",
+    "Nm": "newton*meter", "kNm": "kilonewton*meter", "t": "metric_ton", "1/min": "revolution/minute",
+    "min-1": "revolution/minute", "m/s^2": "meter/second**2", "m/s²": "meter/second**2", "g0": "standard_gravity",
+    "°": "degree", "℃": "degree_Celsius", "℉": "degree_Fahrenheit", "DegC": "degree_Celsius",
+    "deg C": "degree_Celsius", "RPM": "revolution/minute", "KMH": "kilometer/hour", "km/hr": "kilometer/hour",
+    "KM/H": "kilometer/hour", "MPH": "mile/hour", "mph": "mile/hour", "Ah": "ampere*hour", "‰": "permille",
+    "": "dimensionless", "-": "dimensionless", "1": "dimensionless",
+}  # fmt: skip
 _SLOPE: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tan": np.arctan,
     "%": lambda x: np.arctan(x / 100.0),
@@ -289,12 +278,8 @@ def conversion(name: str, unit: str, *, where: str) -> Conversion:
     slope = stem is not None and _STEMS[stem] == "slope"
     if slope and unit in (*_SLOPE, "pct"):
         return Conversion(unit, _SLOPE[kind.get(unit, unit)])
-    spelt = unit if unit in _ALIASES else kind.get(unit, unit)
-    spelt = _ALIASES.get(spelt, spelt).replace("°C", "degree_Celsius")
-    if spelt == "%":
-        spelt = "percent"
     try:
-        call = _linear(spelt, to)
+        call = _linear(_spelt(unit, kind), to)
     except Exception:  # pint raises a dozen kinds of error for a wrong unit; all mean the same to the user
         choices = [*(s for s in kind if s), *(("m/s", "km/h") if to == "meter/second" else ())]
         choices += _SLOPE if slope else ()
@@ -302,6 +287,39 @@ def conversion(name: str, unit: str, *, where: str) -> Conversion:
             f"{where}: '{unit}' is not a unit of {name}; accepted: {', '.join(dict.fromkeys(choices)) or to}"
         ) from None
     return Conversion(unit, call)
+
+
+def _spelt(unit: str, kind: dict[str, str]) -> str:
+    """A unit as pint writes it, from a header's suffix or from the words that people use."""
+    spelt = unit if unit in _ALIASES else kind.get(unit, unit)
+    spelt = _ALIASES.get(spelt, spelt).replace("°C", "degree_Celsius")
+    if spelt == "%":
+        return "percent"
+    return spelt if spelt == "permille" or _parses(spelt) or not _parses(spelt.lower()) else spelt.lower()
+
+
+@cache
+def _parses(unit: str) -> bool:
+    try:
+        registry().parse_units(unit)
+    except Exception:  # pint raises a dozen kinds of error for what is no unit
+        return False
+    return True
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit, with or without brackets: `km/h`, `[kW]`, `(°C)`, `%`."""
+    plain = text.strip().strip("[]()").strip()
+    if not plain or plain in _NOT_UNITS:
+        return False
+    spelt = _spelt(plain, {})
+    return spelt in _SLOPE or _parses(spelt)
+
+
+def known_stem(words: str) -> str | None:
+    """The contract's column of a name without a unit, however it is written: `Motor Torque` → `motor_torque_nm`."""
+    stem = "_".join(words.replace("_", " ").lower().split())
+    return _canonical(stem) if stem in _STEMS else None
 
 
 def to_si(values: np.ndarray | float, header: str) -> np.ndarray:

@@ -260,11 +260,13 @@ def _rows(s, v, mass, road, stops, dwell, mode, sample_s, count) -> tuple[Column
         start = np.arange(count) * sample_s
         speed = np.interp(start, t2, v2)
         speed = np.where(speed < 1e-6, 0.0, speed)
-        near = np.r_[speed[:1], speed, speed[-1:]]  # contract: the ends of a sample are the means with its neighbours
+        # contract: the ends of a sample are the means with its neighbours; at both ends of a trip a parabola leads on
+        inner = 0.5 * (speed[:-1] + speed[1:])
+        head, tail = (np.polyfit(np.arange(len(x)), x, min(len(x) - 1, 2)) for x in (speed[:5], speed[:-6:-1]))
         ends = {
             "speed_mps": speed,
-            "speed_start_mps": 0.5 * (near[:-2] + speed),
-            "speed_end_mps": 0.5 * (speed + near[2:]),
+            "speed_start_mps": np.r_[max(inner[0] - head[-2], 0.0), inner],
+            "speed_end_mps": np.r_[inner, max(inner[-1] - tail[-2], 0.0)],
         }
         duration, distance = np.full(count, sample_s), speed * sample_s
         mid_s = np.interp(start, t2, s2)

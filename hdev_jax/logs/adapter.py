@@ -1,46 +1,68 @@
 """Adapters: a TOML file that says which columns of a foreign log are which of the contract's."""
 
-import difflib
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 from hdev_jax.errors import InputError
+from hdev_jax.logs.expression import check_expression, names_in
+from hdev_jax.logs.schema import (
+    checked,
+    flag,
+    near,
+    not_negative,
+    number,
+    one_of,
+    pair,
+    regex,
+    span,
+    table,
+    text,
+    texts,
+    whole,
+)  # fmt: skip
 from hdev_jax.textfiles import read_toml
 from hdev_jax.units import COLUMNS, conversion, parse_column, unit_of
 
-__all__ = ["FILLS", "FORMATS", "LAYOUTS", "Adapter", "Companion", "Rule", "near"]
+__all__ = ["FILLS", "FORMATS", "LAYOUTS", "Adapter", "Companion", "Long", "Rule", "near"]
 
-FORMATS = ("csv", "parquet", "mat")
-LAYOUTS = ("table", "time_value")
+FORMATS = ("csv", "parquet", "feather", "jsonl", "xlsx", "mat")
+LAYOUTS = ("table", "time_value", "long")
 FILLS = ("forward", "nearest", "linear")
 _TEXT_COLUMNS = ("trip_id", "vehicle_id")
-
-
-def near(name: str, choices: "list[str] | tuple[str, ...]", cutoff: float = 0.6) -> str:
-    """`, did you mean 'x'?` for the choice nearest to `name`, or nothing."""
-    lower = {c.lower(): c for c in reversed(choices)}
-    found = difflib.get_close_matches(name.lower(), list(lower), 1, cutoff)
-    return f", did you mean '{lower[found[0]]}'?" if found else ""
+_THOUSANDS = (".", ",", "'", "’", " ", "\u00a0", "\u202f")
 
 
 @dataclass(frozen=True)
 class Rule:
-    """How one column comes about: source → `valid` → `fill` → `affine` → `unit`.
+    """How one column comes about: source or `expr` → `valid` → `fill` → `affine` → `unit`.
 
     `valid` is in the source's numbers: a value outside is missing. Missing values are filled inside a trip (`forward`,
-    `nearest`, `linear`; before the first value `initial`), then `a + b·x`, then the unit is brought to SI.
-    A source that is itself a column made here is taken in SI, after its own fill.
+    `nearest`, `linear` over time; before the first value `initial`), then `a + b·x`, then the unit is brought to SI.
+    A source that is itself a column made here is taken in SI, after its own fill. Of `alternatives` (in TOML `or`) the
+    first that the file has stands in for a source that it lacks. An id, and a clock of date and time, may have several
+    sources; `format` is a clock's, in the letters of strptime. Of a `counter`, an odometer or the energy since some
+    start, each sample has what was added around it.
     """
 
-    source: str
+    source: str | tuple[str, ...]
     unit: str | None = None
     fill: str | None = None
     initial: float | None = None
     affine: tuple[float, float] | None = None
     valid: tuple[float, float] | None = None
+    expr: str | None = None
+    format: str | None = None
+    alternatives: tuple[str, ...] = ()
+    counter: bool = False
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The columns that it names."""
+        return (self.source,) if isinstance(self.source, str) else self.source
 
 
 @dataclass(frozen=True)
@@ -53,17 +75,42 @@ class Companion:
 
 
 @dataclass(frozen=True)
+class Long:
+    """The columns of a table with a row for each value: when, of which channel, how much, in which unit; `clock` is the
+    channel at whose times rows are made, of several the first that the file has."""
+
+    time: str
+    name: str
+    value: str
+    unit: str | None = None
+    clock: str | tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
 class Adapter:
-    """What a file of this kind means. `where` names it in messages; without arguments it changes nothing."""
+    """What a file of this kind means. `where` names it in messages; without arguments it changes nothing.
+
+    `rows` keeps the rows where that column was measured; `charging` says whether charging at standstill is cut;
+    `repeated_stamps = "spread"` spreads rows of one time stamp over the time to the next.
+    """
 
     where: str = "adapter"
+    preset: str | None = None
     format: str | None = None
     layout: str = "table"
+    long: Long | None = None
+    header_line: int | None = None
+    decimal: str | None = None
+    thousands: str | None = None
     trip_id: str | None = None
     vehicle_id: str | None = None
     variable: str | None = None
     companion: Companion | None = None
     edge_trim_s: float = 0.0
+    time_zone: str | None = None
+    repeated_stamps: str = "drop"
+    rows: str | None = None
+    charging: str = "cut"
     others: str = "keep"
     columns: Mapping[str, Rule] = field(default_factory=dict)
 
@@ -71,28 +118,45 @@ class Adapter:
     def load(path: str | Path) -> "Adapter":
         """Read a TOML file. Raises `InputError` for whatever is wrong in it."""
         path = Path(path)
-        table, _ = read_toml(path, "adapter")
-        return Adapter.from_dict(table, where=path.name)
+        return Adapter.from_dict(read_toml(path, "adapter")[0], where=path.name)
 
     @staticmethod
-    def from_dict(table: Mapping[str, Any], where: str = "adapter") -> "Adapter":
+    def from_dict(values: Mapping[str, Any], where: str = "adapter") -> "Adapter":
         """Check a table read from TOML. Raises `InputError` naming key, value and what is accepted."""
-        known: dict[str, Callable[[str, Any], Any]] = {
-            "format": _one_of(FORMATS),
-            "layout": _one_of(LAYOUTS),
-            "trip_id": _regex,
-            "vehicle_id": _regex,
-            "variable": _regex,
+        known = {
+            "preset": text,
+            "format": one_of(FORMATS),
+            "layout": one_of(LAYOUTS),
+            "long": _long,
+            "header_line": whole,
+            "decimal": one_of((".", ",")),
+            "thousands": one_of(_THOUSANDS),
+            "trip_id": regex,
+            "vehicle_id": regex,
+            "variable": regex,
             "companion": _companion,
-            "edge_trim_s": _not_negative,
-            "others": _one_of(("keep", "drop")),
+            "edge_trim_s": not_negative,
+            "time_zone": _zone,
+            "repeated_stamps": one_of(("drop", "spread")),
+            "rows": text,
+            "charging": one_of(("cut", "keep")),
+            "others": one_of(("keep", "drop")),
             "columns": _columns,
         }
-        return Adapter(where=where, **_checked(table, known, where, ""))
+        made = Adapter(where=where, **checked(values, known, where))
+        if made.preset is None and (made.long is None) == (made.layout == "long"):
+            raise InputError(f'{where}: layout = "long" and a table [long] with time, name and value go together')
+        return made
 
-    def match(self, pattern: str, text: str) -> str | None:
-        """First group of the pattern in `text` (the whole match where it has none), None without a match."""
-        found = re.search(pattern, text)
+    def over(self, preset: "Adapter") -> "Adapter":
+        """This adapter with what it leaves open taken from a preset; its rules go before the preset's."""
+        usual = Adapter()
+        own = {k: v for k in vars(usual) if (v := getattr(self, k)) != getattr(usual, k)}
+        return replace(preset, **own | {"columns": {**preset.columns, **self.columns}})
+
+    def match(self, pattern: str, name: str) -> str | None:
+        """First group of the pattern in `name` (the whole match where it has none), None without a match."""
+        found = re.search(pattern, name)
         if found is None:
             return None
         return next((g for g in found.groups() if g is not None), found.group(0))
@@ -102,113 +166,67 @@ class Adapter:
         return self.companion is not None and name.endswith(self.companion.suffix)
 
 
-def _checked(
-    table: Mapping[str, Any], known: Mapping[str, Callable[[str, Any], Any]], where: str, prefix: str
-) -> dict[str, Any]:
-    out = {}
-    for key, value in table.items():
-        if key not in known:
-            hint = near(key, list(known))
-            raise InputError(f"{where}: unknown key '{prefix}{key}'{hint} accepted: {', '.join(known)}")
-        out[key] = known[key](f"{where}: {prefix}{key}", value)
-    return out
-
-
-def _one_of(choices: tuple[str, ...]) -> Callable[[str, Any], str]:
-    def check(where: str, value: Any) -> str:
-        if value not in choices:
-            raise InputError(f"{where} = {value!r}: accepted: {', '.join(choices)}")
-        return value
-
-    return check
-
-
-def _text(where: str, value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise InputError(f"{where} = {value!r}: a text is expected")
-    return value
-
-
-def _regex(where: str, value: Any) -> str:
+def _zone(where: str, value: Any) -> str:
     try:
-        re.compile(_text(where, value))
-    except re.error as e:
-        raise InputError(f"{where} = {value!r}: not a regular expression ({e})") from None
-    return value
-
-
-def _number(where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != value or abs(value) == float("inf"):
-        raise InputError(f"{where} = {value!r}: a finite number is expected")
-    return float(value)
-
-
-def _not_negative(where: str, value: Any) -> float:
-    if (x := _number(where, value)) < 0:
-        raise InputError(f"{where} = {value!r}: must not be negative")
-    return x
-
-
-def _pair(where: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f"{where} = {value!r}: two numbers [a, b] are expected")
-    return _number(where, value[0]), _number(where, value[1])
-
-
-def _range(where: str, value: Any) -> tuple[float, float]:
-    lo, hi = _pair(where, value)
-    if lo >= hi:
-        raise InputError(f"{where} = {value!r}: [low, high] with low < high is expected")
-    return lo, hi
-
-
-def _flag(where: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise InputError(f"{where} = {value!r}: true or false is expected")
-    return value
-
-
-def _table(where: str, value: Any, keys: tuple[str, ...]) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise InputError(f"{where} = {value!r}: a table is expected")
-    for key in keys:
-        if key not in value:
-            raise InputError(f"{where}: the key '{key}' is missing{near(key, list(value))}")
+        ZoneInfo(text(where, value))
+    except (ValueError, OSError, ModuleNotFoundError, KeyError):
+        raise InputError(f"{where} = {value!r}: a place such as 'Europe/Zurich' is expected") from None
     return value
 
 
 def _companion(where: str, value: Any) -> Companion:
-    table = _table(where, value, ())
-    got = _checked(table, {"suffix": _text, "on": _text, "optional": _flag}, where, "")
-    _table(where, value, ("suffix", "on"))
+    values = table(where, value, ())
+    got = checked(values, {"suffix": text, "on": text, "optional": flag}, where)
+    table(where, value, ("suffix", "on"))
     return Companion(**got)
+
+
+def _long(where: str, value: Any) -> Long:
+    values = table(where, value, ())
+    got = checked(values, {"time": text, "name": text, "value": text, "unit": text, "clock": texts}, where)
+    table(where, value, ("time", "name", "value"))
+    return Long(**got)
 
 
 def _columns(where: str, value: Any) -> dict[str, Rule]:
     rules: dict[str, Rule] = {}
     known = {
-        "source": _text,
-        "unit": lambda w, v: v if v == "" else _text(w, v),
-        "fill": _one_of(FILLS),
-        "initial": _number,
-        "affine": _pair,
-        "valid": _range,
+        "source": texts,
+        "or": texts,
+        "expr": lambda w, v: check_expression(w, text(w, v)),
+        "unit": lambda w, v: v if v == "" else text(w, v),
+        "fill": one_of(FILLS),
+        "initial": number,
+        "affine": pair,
+        "valid": span,
+        "format": text,
+        "counter": flag,
     }
-    for name, entry in _table(where, value, ()).items():
+    for name, entry in table(where, value, ()).items():
         here = f"{where}.{name}"
-        if isinstance(entry, str):  # speed_mps = "v": short for { source = "v" }
+        if isinstance(entry, str | list):  # speed_mps = "v": short for { source = "v" }
             entry = {"source": entry}
-        table = _table(here, entry, ())
-        got = _checked(table, known, here, "")
-        _table(here, entry, ("source",))
-        rule = Rule(**got)
+        got = checked(table(here, entry, ()), known, here)
+        if "expr" in got:
+            if "source" in got:
+                raise InputError(f"{here}: source or expr, one of the two")
+            got["source"] = names_in(got["expr"], f"{here}.expr")
+        table(here, {**entry, **got}, ("source",))
+        alternatives = got.pop("or", ())
+        rule = Rule(**got, alternatives=(alternatives,) if isinstance(alternatives, str) else alternatives)
         if rule.initial is not None and rule.fill is None:
             raise InputError(f"{here}: initial needs a fill (one of {', '.join(FILLS)})")
         target = _target(here, name)
+        if len(rule.sources) > 1 and rule.expr is None and target not in (*_TEXT_COLUMNS, "time_s"):
+            raise InputError(f"{here}: several sources are for trip_id, vehicle_id and time_s; use expr to calculate")
+        if rule.format is not None and target != "time_s":
+            raise InputError(f"{here}: format is for time_s")
+        if rule.counter and target not in ("energy_wh", "distance_m"):
+            raise InputError(f"{here}: counter is for energy_wh and distance_m, which are sums")
         if target in rules:
             raise InputError(f"{here}: a second rule for {target}")
         if target != name and rule.unit is None and name not in _TEXT_COLUMNS:
-            rule = Rule(rule.source, name.rpartition("_")[2], rule.fill, rule.initial, rule.affine, rule.valid)
+            rule = replace(rule, unit=name.rpartition("_")[2])
         if rule.unit is not None:
             conversion(target, rule.unit, where=f"{here}.unit")
         rules[target] = rule
@@ -232,12 +250,15 @@ def _target(where: str, name: str) -> str:
 
 
 def _no_cycles(where: str, rules: Mapping[str, Rule]) -> None:
+    """No rule draws on itself by way of others; the file's own column of that name is another thing."""
+
+    def visit(name: str, above: tuple[str, ...]) -> None:
+        for source in rules[name].sources:
+            if source == name or source not in rules:
+                continue
+            if source in above:
+                raise InputError(f"{where}.{source}: its source leads back to itself: {' → '.join(sorted(above))}")
+            visit(source, (*above, source))
+
     for start in rules:
-        seen, name = {start}, rules[start].source
-        while name in rules and name != start and name not in seen:
-            seen.add(name)
-            if rules[name].source == name:
-                break
-            name = rules[name].source
-        if name == start and len(seen) > 1:
-            raise InputError(f"{where}.{start}: its source leads back to itself: {' → '.join(sorted(seen))}")
+        visit(start, (start,))

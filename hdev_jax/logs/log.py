@@ -114,6 +114,9 @@ class Log:
             for column in self.segments.channels:
                 if column not in TARGETS and (hint := near(column, [wanted], 0.8)):
                     return f"; column '{column}'{hint}"
+        powers = [c.source for c in self.columns if c.unit.lower() in ("w", "kw", "watts") and c.name == c.source]
+        if powers:
+            return f"; say in an adapter (hdev check --skeleton) whether '{powers[0]}' is battery_power_w"
         return ""
 
     def select(self, trips: Sequence[int]) -> "Log":

@@ -12,11 +12,15 @@ from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.limits import MAX_GRADE_RAD
 from hdev_jax.logs.log import MEASURED, Log
+from hdev_jax.logs.presets import PRESETS, preset
 from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
-from hdev_jax.logs.rows import MAX_GRADE_RAD, Rows, check_rows, concatenate
-from hdev_jax.logs.trips import split_trips
+from hdev_jax.logs.rows.charging import without_charging
+from hdev_jax.logs.rows.checked import check_rows
+from hdev_jax.logs.rows.gathered import Rows, concatenate
+from hdev_jax.logs.rows.trips import split_trips
 from hdev_jax.segments import Segments
 from hdev_jax.units import accepted
 
@@ -36,7 +40,7 @@ def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Ada
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     if not given:
         raise InputError("no log given; name one or more files")
-    rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
+    rules = adapter_of(adapter)
     files, left = find_files([Path(p) for p in given], rules)
     ledger = Ledger()
     for name, why in left.items():
@@ -57,7 +61,7 @@ def log_from_frame(frame: Any, *, name: str = "frame", adapter: str | Path | Ada
     import narwhals as nw
     import pandas as pd
 
-    rules = Adapter() if adapter is None else adapter if isinstance(adapter, Adapter) else Adapter.load(adapter)
+    rules = adapter_of(adapter)
     if isinstance(frame, Mapping):
         lengths = {k: len(np.atleast_1d(np.asarray(v))) for k, v in frame.items()}
         if len(set(lengths.values())) > 1:
@@ -71,6 +75,19 @@ def log_from_frame(frame: Any, *, name: str = "frame", adapter: str | Path | Ada
     return _assembled([Raw(name, table, name)], rules, Ledger(), (name,))
 
 
+def adapter_of(adapter: str | Path | Adapter | None) -> Adapter:
+    """The adapter in a file, by the name of a preset, or as it is; what it leaves open is its preset's."""
+    if adapter is None:
+        return Adapter()
+    if isinstance(adapter, str | Path):
+        if str(adapter) in PRESETS and not Path(adapter).exists():
+            return preset(str(adapter))
+        adapter = Adapter.load(adapter)
+    if adapter.preset is not None and not adapter.where.startswith("preset "):
+        return adapter.over(preset(adapter.preset, adapter.where))
+    return adapter
+
+
 def _assembled(raws: Sequence[Raw], rules: Adapter, ledger: Ledger, files: tuple[str, ...]) -> Log:
     """One log from raw tables: columns in SI, rows checked, trips by name."""
     pieces = [translate(raw, rules) for raw in raws]
@@ -82,7 +99,8 @@ def _assembled(raws: Sequence[Raw], rules: Adapter, ledger: Ledger, files: tuple
             measured.remove(c)
             left = {k: v for k, v in rows.data.items() if k != c}
             rows = replace(rows, data=left, ledger=rows.ledger.add("noted", "no value in any row, absent", column=c))
-    rows = split_trips(check_rows(rows, sampled, measured), rules.edge_trim_s, sampled)
+    rows = without_charging(check_rows(rows, sampled, measured), sampled, rules.charging == "keep")
+    rows = split_trips(rows, rules.edge_trim_s, sampled)
     columns = _columns(pieces)
     return _log(rows, sampled, measured, columns, files)
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from hdev_jax.logs.ledger import Ledger
 
-__all__ = ["fill_forward", "fill_linear", "fill_nearest", "repair"]
+__all__ = ["fill_forward", "fill_linear", "fill_nearest", "increments", "repair"]
 
 CIRCULAR = ("heading_rad", "wind_from_rad")  # a mean of 1° and 359° is 180°: no interpolation
 COUNTED = ("gear", "road_surface")  # ids, each of which may have a coefficient of its own
@@ -52,6 +52,17 @@ def fill_linear(x: np.ndarray, trip: np.ndarray, clock: np.ndarray | None = None
     share = np.divide(t - t[last], gap, out=np.zeros_like(t), where=gap > 0)
     inside = np.where(ok, x, (1.0 - share) * x[last] + share * x[following])
     return np.where(both, inside, np.where(last >= 0, x[last], np.where(following >= 0, x[following], np.nan)))
+
+
+def increments(x: np.ndarray, trip: np.ndarray) -> np.ndarray:
+    """What a counter added around each sample: half of what lies between its neighbours, at the ends of a trip all of
+    what lies to the one neighbour, as far as a sample reaches there. Values missing in between are linear."""
+    x = np.where(np.isfinite(x), x, fill_linear(x, trip))
+    same = trip[1:] == trip[:-1]
+    step = np.where(same, np.diff(x), np.nan)
+    before, after = np.r_[np.nan, step], np.r_[step, np.nan]
+    before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
+    return 0.5 * (before + after)
 
 
 def repair(

@@ -1,6 +1,7 @@
 """A problem: a log, a sheet and a target brought together, its split into training and test trips, its errors."""
 
 from hdev_jax.problem.metrics import metrics, sum_weight
+from hdev_jax.problem.plausible import implausible
 from hdev_jax.problem.problem import Problem, derivable, prepare
 from hdev_jax.problem.split import LAST_THIRD, Split, split_trips
 
@@ -9,6 +10,7 @@ __all__ = [
     "Problem",
     "Split",
     "derivable",
+    "implausible",
     "metrics",
     "prepare",
     "split_trips",

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from hdev_jax.logs import write_adapter_skeleton
-from hdev_jax.problem import prepare
+from hdev_jax.logs.checks import suspicions
+from hdev_jax.problem import implausible, prepare
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of
 
@@ -43,10 +44,14 @@ def check(
         lines.append(f"{name:{wide}s} {int(m.sum()):7d} {minutes:7.1f} {km:8.2f} {total} {per}")
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
+    found = suspicions(log)
     if vehicle is not None:
         sheet = sheet_of(vehicle, known_effects(effects))
         problem = prepare(log, sheet, None, need_measured=bool(log.targets))
         free = ", ".join(c.name for c in problem.table.free) or "none"
         lines += ["", f"vehicle: {sheet.name}; chain entered at the {problem.vehicle.entry}; estimated: {free}"]
         lines += [f"  {note}" for note in problem.notes]
+        found = implausible(problem)
+    if found:
+        lines += ["", "suspected", *(f"  {s.line()}" for s in found)]
     return "\n".join(lines)

@@ -13,7 +13,9 @@ from hdev_jax.diagnosis.result.stages import add_stages
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
+from hdev_jax.logs.checks import Suspicion
 from hdev_jax.physics import Effect
+from hdev_jax.problem import implausible
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.rundir import Run, open_run
 from hdev_jax.verbs.arguments import names_of
@@ -45,6 +47,7 @@ def diagnose(
     exclude: Sequence[str] | None = None,
     fdr: float = 0.05,
     *,
+    trust: bool = False,
     out: str | Path | None = None,
     seed: int = 0,
 ) -> Diagnosis:
@@ -59,8 +62,8 @@ def diagnose(
 
     **Arguments:** as the options of `hdev diagnose`. `logs`: a path or several, a `Log`, or a table in memory;
     `vehicle`: a sheet's path, a `Sheet` or a mapping of its sections; `effects`: a Python file or classes of your own
-    effects; `out`: a folder for `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`, from which an
-    interrupted run resumes.
+    effects; `trust`: search although a unit or a sign is suspected of being wrong; `out`: a folder for
+    `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`, from which an interrupted run resumes.
 
     **Returns:** a `Diagnosis`; `str()` is the answer as text. **Raises:** `InputError` for faults of the input.
     """
@@ -86,40 +89,51 @@ def diagnose(
     )
     why = {k: "--exclude" if k in (exclude or ()) else "not in --only" for k in known if k not in candidates}
     excluded = [{"id": k, "why": w} for k, w in why.items() if not start.problem.vehicle.has(k)]
+    found = () if trust else implausible(start.problem, start.split.train)
+    candidates = {} if found else candidates
     if out is None:
         progress.step(start.read)
-        return _diagnosed(start, candidates, excluded, fdr, seed, started)
+        return _diagnosed(start, candidates, excluded, fdr, seed, started, suspected=found)
     config = {
         **start.config,
         "only": None if only is None else list(only),
         "exclude": None if exclude is None else list(exclude),
         "fdr": fdr,
+        **({"trust": True} if trust else {}),
     }
     with open_run(out, config, seed=seed) as run:
         if run.done:
             return Diagnosis.of_folder(run.work)
         progress.step(start.read)
-        result = _diagnosed(start, candidates, excluded, fdr, seed, started, run)
+        result = _diagnosed(start, candidates, excluded, fdr, seed, started, run, suspected=found)
         result.write(run, out)
     return result
 
 
 def _diagnosed(
     start: Opening, candidates: dict[str, type[Effect]], excluded: list[dict[str, str]], fdr: float, seed: int,
-    started: float, run: Run | None = None,
+    started: float, run: Run | None = None, *, suspected: tuple[Suspicion, ...] = (),
 ) -> Diagnosis:  # fmt: skip
-    """The diagnosis in memory; with a run, each stage is kept in its folder."""
+    """The diagnosis in memory; with a run, each stage is kept in its folder. What is `suspected` ends it at the
+    calibration: no effect is named on a log whose unit or sign is in doubt."""
     checkpoint: Callable[[str, Callable[[], Any]], Any] = (lambda _, c: c()) if run is None else run.checkpoint
     how = {"settings": Settings(fdr=fdr), "seed": seed, "tell": progress.step, "checkpoint": checkpoint}
     outcome = run_method(start.problem, start.split, candidates, **how)
     add_stages(outcome, candidates, **how)
     outcome.summary["excluded"] += excluded
+    text = ""
+    if suspected:
+        suspect = {"verdict": "suspect_log", "suspicions": [s.to_dict() for s in suspected]}
+        outcome.summary.update(suspect)
+        told = [s.line() for s in suspected]
+        outcome.summary["notes"] = [f"suspected: {line}" for line in told] + outcome.summary["notes"]
+        text = "\n".join(["The log is suspect; no effect was searched (--trust searches all the same):", *told])
     sheet = _augmented(outcome, start.sheet)
     predictive, notes = predictive_of(start.problem, start.split, outcome.fit, "normal", sheet_digest(sheet))
     outcome.summary["notes"] += notes
     progress.step("writing the report")
     data = of_diagnosis(outcome, command_line("diagnose", run), started)
-    return Diagnosis(answer_text(data), outcome.summary, sheet, predictive, data)
+    return Diagnosis(text or answer_text(data), outcome.summary, sheet, predictive, data)
 
 
 def _augmented(outcome: Outcome, sheet: Sheet) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.inference.sheet import Sheet, choose_entry
 from hdev_jax.logs import Log, read_log, write_adapter_skeleton
-from hdev_jax.logs.names import stem
+from hdev_jax.logs.readers.names import stem
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.problem import prepare

@@ -330,4 +330,5 @@ def command_line(verb: str, run: Run | None) -> str:
     for option, key in single.items():
         if c.get(key) is not None and c[key] != usual.get(key):
             parts += [f"--{option}", str(c[key])]
+    parts += ["--trust"] if c.get("trust") else []
     return shlex.join([*parts, "--seed", str(c["seed"]), "--out", str(run.out)])

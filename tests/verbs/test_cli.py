@@ -56,7 +56,7 @@ def usage_error(capsys, *argv: str) -> str:
 def test_every_option_reaches_the_function(api, capsys):
     argv = ["diagnose", "a.csv", "b.mat", "--vehicle", "v.toml", "--adapter", "a.toml", "--target", "energy_wh"]
     argv += ["--train-trips", "1,2", "--test-trips", "3, 4", "--effects", "mine.py", "--only", "headwind,pto"]
-    argv += ["--exclude", "drafting", "--fdr", "0.1", "--out", "res", "--seed", "7"]
+    argv += ["--exclude", "drafting", "--fdr", "0.1", "--trust", "--out", "res", "--seed", "7"]
     assert cli.main(argv) == 0
     assert api.calls == [
         (
@@ -72,6 +72,7 @@ def test_every_option_reaches_the_function(api, capsys):
                 "only": ("headwind", "pto"),
                 "exclude": ("drafting",),
                 "fdr": 0.1,
+                "trust": True,
                 "out": Path("res"),
                 "seed": 7,
             },

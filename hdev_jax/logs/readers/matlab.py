@@ -13,7 +13,7 @@ import pandas as pd
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter
-from hdev_jax.logs.names import stem, trip_of
+from hdev_jax.logs.readers.names import stem, trip_of
 
 __all__ = ["numeric_variables", "read_mat"]
 

@@ -1,105 +1,20 @@
-"""Rows checked and repaired: which are dropped, which end the reading, and the trips that remain."""
+"""Rows checked and repaired: which are dropped, which end the reading."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from hdev_jax.errors import InputError
-from hdev_jax.logs.columns import Piece
 from hdev_jax.logs.intervals import starts
-from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.limits import BAD_SHARE, MANY_STEEP, MAX_GRADE_RAD, MAX_POWER_W, MAX_SPEED_MPS, REVERSE_MPS
+from hdev_jax.logs.rows.gathered import Rows, regrouped, split_restarts
 
-__all__ = [
-    "BAD_SHARE",
-    "MAX_GRADE_RAD",
-    "MAX_POWER_W",
-    "MAX_SPEED_MPS",
-    "REVERSE_MPS",
-    "Rows",
-    "check_rows",
-    "concatenate",
-]
+__all__ = ["check_rows"]
 
-MAX_SPEED_MPS = 60.0  # contract §1: above, the column is in km/h or broken
-REVERSE_MPS = 0.5  # contract §1: down to −0.5 m/s a sensor's undershoot, set to 0
-MAX_GRADE_RAD = 0.8  # beyond 45°, which is more than tyres hold; the steepest street has 35 %, test tracks 60 %
-MANY_STEEP = 0.1  # of the slopes driven: no instrument's faults, but another unit
-MAX_POWER_W = 2e7  # no road vehicle draws it: the largest mining trucks have under 4 MW
-BAD_SHARE = 0.01  # contract §1: bad rows in needed columns, at most
 SLOPE_COUNTS_MPS = 1.0  # below, a slope from altitude over distance is noise, and costs little
+_SAME = "the same time_s as the row before, other values"
 _SPEEDS = ("speed_mps", "speed_start_mps", "speed_end_mps")
-
-
-@dataclass(frozen=True)
-class Rows:
-    """All files as one table; `piece` and `row` say where a row came from."""
-
-    pieces: tuple[Piece, ...]
-    data: dict[str, np.ndarray]
-    trip: np.ndarray
-    vehicle: np.ndarray
-    piece: np.ndarray
-    row: np.ndarray
-    origin_s: np.ndarray
-    trip_names: tuple[str, ...]
-    vehicle_names: tuple[str, ...]
-    ledger: Ledger
-
-    def take(self, keep: np.ndarray) -> "Rows":
-        """Rows by mask."""
-        per_row = ("trip", "vehicle", "piece", "row", "origin_s")
-        picked = {k: getattr(self, k)[keep] for k in per_row}
-        return replace(self, data={k: v[keep] for k, v in self.data.items()}, **picked)
-
-    def where(self, i: int) -> str:
-        """`a.csv: row 12 (line 13)`."""
-        piece = self.pieces[int(self.piece[i])]
-        line = f" (line {int(self.row[i]) + piece.first_line})" if piece.first_line else ""
-        return f"{piece.file}: row {int(self.row[i]) + 1}{line}"
-
-    @property
-    def name(self) -> str:
-        """The file, or how many."""
-        files = list(dict.fromkeys(p.file for p in self.pieces))
-        return files[0] if len(files) == 1 else f"log of {len(files)} files"
-
-
-def concatenate(pieces: list[Piece], ledger: Ledger) -> Rows:
-    """Files to one table. A channel that some files lack is left out, with a note; one trip in two files is refused."""
-    names: dict[str, int] = {}
-    vehicles: dict[str, int] = {}
-    trip, vehicle = [], []
-    for p in pieces:
-        for n in p.trip_names:
-            if n in names:
-                other = next(q.file for q in pieces if n in q.trip_names)
-                again = f"{other} and {p.file}" if other != p.file else p.file
-                raise InputError(f"trip '{n}' is in {again} twice; rename one, or give trip_id in an adapter")
-            names[n] = len(names)
-        code = np.array([names[n] for n in p.trip_names] + [-1], np.int64)
-        trip.append(code[p.trip])
-        code = np.array([vehicles.setdefault(n, len(vehicles)) for n in p.vehicle_names] + [-1], np.int64)
-        vehicle.append(code[p.vehicle])
-        ledger = ledger + p.ledger
-    everywhere = [c for c in pieces[0].data if all(c in p.data for p in pieces)]
-    for c in dict.fromkeys(c for p in pieces for c in p.data if c not in everywhere):
-        lacking = [p for p in pieces if c not in p.data]
-        where = lacking[0].file if len({p.file for p in lacking}) == 1 else f"{len(lacking)} files or trips"
-        ledger = ledger.add("noted", f"lacking in {where}, left out of the log", column=c)
-    sizes = [len(p.row) for p in pieces]
-    return Rows(
-        pieces=tuple(pieces),
-        data={c: np.concatenate([p.data[c] for p in pieces]) for c in everywhere},
-        trip=np.concatenate(trip),
-        vehicle=np.concatenate(vehicle),
-        piece=np.repeat(np.arange(len(pieces)), sizes),
-        row=np.concatenate([p.row for p in pieces]),
-        origin_s=np.zeros(sum(sizes)),
-        trip_names=tuple(names),
-        vehicle_names=tuple(vehicles),
-        ledger=ledger,
-    )
 
 
 def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
@@ -112,6 +27,7 @@ def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
                 f"{rows.where(i)}, column {c}: {rows.data[c][i]:.6g} m/s is above {MAX_SPEED_MPS:g} m/s; "
                 f"if the file has km/h, name the column {c.replace('_mps', '_kmh')} or give its unit in an adapter"
             )
+    rows = _with_targets(split_restarts(regrouped(rows)), measured)
     rows = _fill_durations(_without_cliffs(rows), sampled)
     bad, reasons = _bad_rows(rows, sampled, measured)
     rows = _one_vehicle(_check_order(rows, bad))
@@ -122,12 +38,26 @@ def check_rows(rows: Rows, sampled: bool, measured: list[str]) -> Rows:
             raise InputError(
                 f"{rows.name}: {count} of {total} rows ({count / total:.1%}) cannot be used: {told}; the first is "
                 f"{rows.where(int(np.argmax(bad)))}; at most {BAD_SHARE:.0%} are dropped, so repair the log"
+                f"{_mend(reasons)}"
             )
         ledger = rows.ledger
         for why, (n, first) in reasons.items():
             ledger = ledger.add("dropped", f"{why}; first in {rows.where(first)}", count=n)
         rows = replace(rows, ledger=ledger).take(~bad)
     return _clip_speeds(rows)
+
+
+def _with_targets(rows: Rows, measured: list[str]) -> Rows:
+    """Trips that never measure what others do are left out: a combustion car among electric ones."""
+    for c in measured:
+        there = np.bincount(rows.trip[rows.trip >= 0], np.isfinite(rows.data[c])[rows.trip >= 0], len(rows.trip_names))
+        lacking = (there == 0)[rows.trip] & (rows.trip >= 0)
+        if lacking.any() and not lacking.all():
+            trips = len(np.unique(rows.trip[lacking]))
+            why = f"not measured in any row of {trips} trip{'s' if trips > 1 else ''}: left out"
+            ledger = rows.ledger.add("dropped", why, count=int(lacking.sum()), column=c)
+            rows = replace(rows, ledger=ledger).take(~lacking)
+    return rows
 
 
 def _without_cliffs(rows: Rows) -> Rows:
@@ -214,7 +144,7 @@ def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarra
         rule(duration <= 0, "duration_s not positive")
     if "time_s" in rows.data:
         same = np.r_[False, (np.diff(rows.data["time_s"]) == 0) & (np.diff(rows.trip) == 0)]
-        rule(same, "the same time_s as the row before, other values")
+        rule(same, _SAME)
     length = duration
     if length is None and "time_s" in rows.data:
         length = np.r_[np.where(np.diff(rows.trip) == 0, np.diff(rows.data["time_s"]), np.nan), np.nan]
@@ -229,8 +159,14 @@ def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarra
     if "battery_power_w" in rows.data:
         rule(np.abs(rows.data["battery_power_w"]) > MAX_POWER_W, f"a battery power of {most}")
     if "energy_wh" in rows.data and length is not None:
-        rule(np.abs(rows.data["energy_wh"]) * 3600.0 > MAX_POWER_W * length, f"an energy_wh that means {most}")
+        counts = most.replace("(is it", "(is it a counter, for which an adapter says counter = true,")
+        rule(np.abs(rows.data["energy_wh"]) * 3600.0 > MAX_POWER_W * length, f"an energy_wh that means {counts}")
     return bad, reasons
+
+
+def _mend(reasons: dict[str, tuple[int, int]]) -> str:
+    """The key of an adapter that helps against the most frequent reason."""
+    return ', or spread them: repeated_stamps = "spread" in an adapter' if _SAME in reasons else ""
 
 
 def _check_order(rows: Rows, bad: np.ndarray) -> Rows:

@@ -6,7 +6,7 @@ import numpy as np
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.intervals import gaps, starts, trip_median
-from hdev_jax.logs.rows import Rows
+from hdev_jax.logs.rows.gathered import Rows
 
 __all__ = ["split_trips"]
 

@@ -1,0 +1,38 @@
+"""`Raw`: one table as it stands in a file, with what the file says about units and lines."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import pandas as pd
+
+from hdev_jax.logs.ledger import Ledger
+
+__all__ = ["Raw", "place"]
+
+
+def place(row: int, lines: Sequence[int] | None) -> str:
+    """`row 3 (line 4)` of a row counted from 0."""
+    return f"row {row + 1}" + (f" (line {lines[row]})" if lines is not None else "")
+
+
+@dataclass(frozen=True)
+class Raw:
+    """One table as it stands in a file: columns of equal length, text where the file has text.
+
+    `trip` is the name the file or the variables give it; a `trip_id` column goes before it. `lines` has the line of
+    each row in a text file, None elsewhere; `units` what a row of units or a column of them says of a column;
+    `thousands` the separator that the adapter names; `ledger` what reading changed.
+    """
+
+    file: str
+    table: pd.DataFrame
+    trip: str
+    vehicle: str | None = None
+    lines: Sequence[int] | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
+    thousands: str | None = None
+    ledger: Ledger = field(default_factory=Ledger)
+
+    def where(self, row: int) -> str:
+        """`row 3 (line 4)` of a row counted from 0."""
+        return place(row, self.lines)

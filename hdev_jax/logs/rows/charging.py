@@ -1,0 +1,74 @@
+"""Charging at standstill: no drive, cut out and counted; the vehicle stands, and power flows into the battery."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hdev_jax.logs.intervals import starts
+from hdev_jax.logs.rows.gathered import Rows
+from hdev_jax.units import J_PER_WH
+
+__all__ = ["without_charging"]
+
+STANDS_MPS = 0.1  # instruments at rest show a little
+# Into the battery: the slowest charger (6 A, one phase, IEC 61851-1) gives 1.4 kW; a sensor's zero is off by less.
+CHARGES_W = -1000.0
+LASTS_S = 60.0  # regeneration is over within a sample or two after a stop; the shortest charge at a stop lasts minutes
+CHARGED_WH = 200.0  # of one stand; less is also what the noise of a log of intervals gives while standing
+_DRIVES = 20  # rows that accelerate, for a judgement on the sign
+
+
+def without_charging(rows: Rows, sampled: bool, keep: bool) -> Rows:
+    """Rows without those of charging; with `keep` they stay and are counted.
+
+    Where power is negative while the vehicle accelerates, its sign is turned, and nothing is cut.
+    """
+    data = rows.data
+    if not len(rows.trip) or not ({"battery_power_w", "energy_wh"} & data.keys()):
+        return rows
+    duration = _durations(rows)
+    power = data["battery_power_w"] if "battery_power_w" in data else data["energy_wh"] * J_PER_WH / duration
+    if sampled:
+        v0 = v1 = data["speed_mps"]
+        change = np.r_[np.diff(v0), 0.0]
+    else:
+        v0, v1 = data["speed_start_mps"], data["speed_end_mps"]
+        change = v1 - v0
+    stands = np.maximum(np.abs(v0), np.abs(v1)) < STANDS_MPS
+    if "distance_m" in data:  # an interval may stand at both ends and drive between them
+        stands &= ~(data["distance_m"] > STANDS_MPS * duration)
+    pulls = ~stands & (change > 0) & (v0 > 1.0)
+    if pulls.sum() >= _DRIVES and np.median(power[pulls]) < 0:
+        return rows
+    charges = stands & (power < CHARGES_W)
+    if not charges.any():
+        return rows
+    opens = starts(rows.trip)
+    opens[1:] |= stands[1:] != stands[:-1]
+    edges = np.flatnonzero(opens)
+    run = np.cumsum(opens) - 1
+    long = np.add.reduceat(np.where(charges, duration, 0.0), edges) >= LASTS_S
+    long &= np.add.reduceat(np.where(charges, -power * duration, 0.0), edges) >= CHARGED_WH * J_PER_WH
+    index = np.arange(len(run))
+    first = np.minimum.reduceat(np.where(charges, index, len(run)), edges)
+    last = np.maximum.reduceat(np.where(charges, index, -1), edges)
+    cut = long[run] & (index >= first[run]) & (index <= last[run])
+    if not cut.any():
+        return rows
+    kwh = -float(np.sum(power[cut] * duration[cut])) / 3.6e6
+    trips = len(np.unique(rows.trip[cut]))
+    what = f"charging at standstill, {np.sum(duration[cut]) / 60.0:.0f} min and {kwh:.3g} kWh in {trips} trip"
+    what += "s" if trips > 1 else ""
+    if keep:
+        why = f"{what}; kept, as the adapter says"
+        return replace(rows, ledger=rows.ledger.add("noted", why, count=int(cut.sum())))
+    why = f'{what}; charging = "keep" in an adapter keeps it'
+    return replace(rows, ledger=rows.ledger.add("dropped", why, count=int(cut.sum()))).take(~cut)
+
+
+def _durations(rows: Rows) -> np.ndarray:
+    if "duration_s" in rows.data:
+        return rows.data["duration_s"]
+    step = np.diff(rows.data["time_s"], append=np.nan)
+    step[np.r_[rows.trip[1:] != rows.trip[:-1], True]] = np.nan
+    return np.where(np.isfinite(step), step, float(np.nanmedian(step)) if np.isfinite(step).any() else 1.0)
