@@ -1,6 +1,6 @@
 """Histograms of a published drive cycle for the fleet's page: slopes and accelerations of the ZTBus missions.
 
-python benchmarks/fleet_references.py     # prints what hdev_jax/report/fleet_sources.py holds
+python benchmarks/fleet_references.py     # prints what hdev_jax/report/fleet/sources.py holds
 """
 
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hdev_jax.logs import read_log
-from hdev_jax.report.fleet_sources import ACCEL_EDGES, GRADE_EDGES
+from hdev_jax.report.fleet.sources import ACCEL_EDGES, GRADE_EDGES
 
 __all__ = ["main"]
 

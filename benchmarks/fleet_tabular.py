@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from hdev_jax.fleet import FleetConfig, FleetVehicle, simulate
-from hdev_jax.report.fleet_sources import PAPER_FLEET_PE, PAPER_MODEL_PE
+from hdev_jax.report.fleet.sources import PAPER_FLEET_PE, PAPER_MODEL_PE
 
 __all__ = ["main"]
 

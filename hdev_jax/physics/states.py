@@ -20,7 +20,8 @@ def state_channel(effect_id: str) -> str:
 
 def expected_share(temp_c: Any, shares: Any) -> Any:
     """Share of time on at an ambient temperature [°C], linear between `KNOTS_C` and constant beyond; any shape."""
-    return jnp.interp(jnp.asarray(temp_c), jnp.asarray(KNOTS_C), jnp.asarray(shares))
+    shares = jnp.asarray(shares)
+    return jnp.interp(jnp.asarray(temp_c, shares.dtype), jnp.asarray(KNOTS_C, shares.dtype), shares)
 
 
 class SwitchingLoad(Effect):

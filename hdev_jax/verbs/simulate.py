@@ -36,7 +36,7 @@ def simulate(config: str | Path | Mapping[str, Any], *, out: str | Path | None =
         raise InputError(f"config: the path of a TOML file{other} is expected, found {type(config).__name__}")
     from hdev_jax.fleet.config import load_config
     from hdev_jax.fleet.files import write_fleet
-    from hdev_jax.report.fleet_page import fleet_summary, fleet_text, write_fleet_report
+    from hdev_jax.report.fleet import fleet_summary, fleet_text, write_fleet_report
 
     started = time.time()
     wanted = load_config(config)

@@ -277,7 +277,7 @@ def log(tmp_path_factory) -> tuple[Problem, Split]:
 def left_of(log: tuple[Problem, Split], residual: np.ndarray, formula: Formula | None = None) -> Remainder:
     problem, split = log
     predicted = problem.measured - residual
-    return remainder(problem, split, predicted, predicted, formula, SETTINGS, seed=0)
+    return remainder(problem, split, predicted, predicted, formula, SETTINGS, given=predicted, seed=0)
 
 
 def white(log) -> np.ndarray:

@@ -22,7 +22,7 @@ ELSEWHERE: dict[str, set[str]] = {
     "learn/sources.py": {"copper_loss", "inverter_loss"},
     # parts of a name that say what a column holds; bins and words of a figure
     "units.py": {"grade", "air_density", "hvac_power"},
-    "report/fleet_figures.py": {"grade", "rolling"},
+    "report/fleet/figures.py": {"grade", "rolling"},
 }
 
 

@@ -6,18 +6,17 @@ the same colour and size (a parametric bootstrap whose innovations are the resid
 of Statistics 14, 1986), and the power between its levels has to be the same in all trips, standing and moving.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy import signal, stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.cycle import barred
+from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, Tested, besides, tested
 from hdev_jax.diagnosis.competition.refit import fitted, joined, without
 from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
-from hdev_jax.diagnosis.noise.noise import Noise, estimate_noise
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
@@ -27,7 +26,6 @@ from hdev_jax.inference.states import (
     StateRows,
     Switching,
     decode,
-    errors_alone,
     fit_switching,
     rows_of,
 )
@@ -39,25 +37,9 @@ from hdev_jax.targets import TARGETS, as_watts
 __all__ = ["LOADS", "add_switching", "decoded_again", "mistaken", "with_states"]
 
 LOADS = (SwitchingLoad, SecondSwitchingLoad)
-COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
-FIRST_ROUNDS = 3  # of expectation-maximisation
-ROUNDS = 6
-MOST_ROWS = 30_000  # that the test looks at
-BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
-LEAST_SPREAD = 2.0  # of the surrogates' gains, in log-likelihood
+ROUNDS = 6  # of expectation-maximisation, at the last
 LEAST_S = 60.0  # on, and off, for a power of its own (of a trip, at standstill)
 LEAST_SWITCHES = 8.0
-LEAST_ROWS = 100
-EARLY = 3  # surrogates, one of which does as well: no load
-
-
-@dataclass(frozen=True)
-class _Tested:
-    """The test of a load: its gain in log-likelihood over errors alone, and p."""
-
-    model: Switching
-    gain: float
-    p: float
 
 
 def with_states(training: Training, state: State) -> Training:
@@ -100,55 +82,63 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
     settings = training.settings
     beside, slow_w = _without_slow_loads(training, state)
     left = _rows(training, training.residual(state.fit))
-    rows = replace(left, residual_w=left.residual_w + slow_w + _loads_w(training, state))
     left = replace(left, residual_w=left.residual_w + slow_w)
-    model, decoded = (state.hidden.model, None) if state.hidden else (None, None)
-    tests: list[_Tested] = []
-    for _ in able:
-        tested = _tested(left, training, rng)
-        if tested is None or tested.p * len(training.library) > settings.fdr:
-            break
-        starts = [tested.model] if model is None else [model.plus(tested.model)]
-        if model is not None and not held and len(tests) == 1:
-            starts += _besides(model)
-        tests.append(tested)
-        tried = [fit_switching(m, rows, FIRST_ROUNDS) for m in starts]
-        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
-        left = replace(rows, residual_w=rows.residual_w - model.predicted_w(decoded.on))
-    if not tests or model is None or decoded is None:
-        if tested is None:
-            return no(Kind.NO_EFFECT, "nothing is left that could have levels")
-        q = min(1.0, tested.p * len(training.library))
+    rows = replace(left, residual_w=left.residual_w + _loads_w(training, state))
+    model, tests = _sought(training, state.hidden.model if state.hidden else None, left, rows, len(able), rng)
+    if not tests:
+        return no(Kind.NO_EFFECT, "nothing is left that could have levels")
+    q = min(1.0, max(t.p for t in tests) * len(training.library))
+    if model is None or q > settings.fdr:
         return no(Kind.NOT_SIGNIFICANT, f"no more levels than noise of this colour has (FDR-adjusted p = {q:.2g})", q)
-    if not held:  # the largest first
-        model = model.only(np.argsort(-model.power_w).tolist())
-        decoded = decode(model, rows)
-    places = range(len(held), len(held) + len(tests))
+    decoded = decode(model, rows)
+    places = range(len(held), len(model.power_w))
     why = {k: x for k in places if (x := _unlike(rows, model, decoded, k, settings))}
     kept = [*range(len(held)), *(k for k in places if k not in why)]
-    ids = (*held, *(e.id for e in able))[: len(kept)]
     if len(kept) == len(held):
         k = next(iter(why))
-        return no(Kind.IMPLAUSIBLE, f"a load of {model.power_w[k] / 1e3:.3g} kW, but {why[k]}", tests[0].p)
+        return no(Kind.IMPLAUSIBLE, f"a load of {model.power_w[k] / 1e3:.3g} kW, but {why[k]}", q)
     if why:
         model, decoded = fit_switching(model.only(kept), rows, ROUNDS)
+    ids = (*held, *(e.id for e in able))[: len(kept)]
     new = replace(without(training, state, *beside) if beside else state, hidden=Hidden(ids, model, decoded.on))
     there = with_states(training, new)
     for k in range(len(held), len(kept)):
-        tested, before = tests[kept[k] - len(held)], new.fit
         c = Candidate(able[k - len(held)], ("power_w",), (None,), _shapes(model, k), "size", ())
-        score = Score(c, model.power_w[k : k + 1], tested.gain, tested.p, tested.p, tested.gain, 1.0)
+        score = Score(c, model.power_w[k : k + 1], tests[0].gain, tests[0].p, tests[0].p, tests[0].gain, 1.0)
         if (fit := joined(there, new, score)) is None:
-            return None, Verdict(c.id, None, tested.p, Rejection(Kind.REFIT))
-        gain = there.noise(fit).log_likelihood - there.noise(before).log_likelihood
-        square = float(np.mean(there.residual(before) ** 2))
+            return None, Verdict(c.id, None, q, Rejection(Kind.REFIT))
+        gain = there.noise(fit).log_likelihood - there.noise(new.fit).log_likelihood
+        square = float(np.mean(there.residual(new.fit) ** 2))
         if gain < settings.size_cost or square - np.mean(there.residual(fit) ** 2) < settings.least_share * square:
-            return no(Kind.OUTSCORED, f"a load of {model.power_w[k] / 1e3:.3g} kW that explains too little", tested.p)
-        q = min(1.0, tested.p * len(training.library))
+            return no(Kind.OUTSCORED, f"a load of {model.power_w[k] / 1e3:.3g} kW that explains too little", q)
         stability = _stability(rows, model, decoded, k, rng, settings)
         found = Found(c.id, replace(score, gain=gain, left_out_gain=gain), q, stability, (), gain)
         new = replace(new, fit=fit, found=(*new.found, found))
     return new, None
+
+
+def _sought(
+    training: Training, held: Switching | None, left: StateRows, rows: StateRows, most: int, rng: np.random.Generator
+) -> tuple[Switching | None, list[Tested]]:
+    """The model with as many more loads as are significant, `most` of them, the largest first; and their tests, or that
+    of the first where it is not. `left`: rows without the loads that are held already."""
+    model, tests, settings = held, list[Tested](), training.settings
+    for _ in range(most):
+        last = tested(left, training, rng)
+        significant = last is not None and last.p * len(training.library) <= settings.fdr
+        if last is None or not significant:
+            tests += [last] if last is not None and not tests else []
+            break
+        starts = [last.model] if model is None else [model.plus(last.model)]
+        if model is not None and held is None and len(tests) == 1:
+            starts += besides(model)
+        tests.append(last)
+        tried = [fit_switching(m, rows, FIRST_ROUNDS) for m in starts]
+        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
+        left = replace(rows, residual_w=rows.residual_w - model.predicted_w(decoded.on))
+    if model is None or held is not None:
+        return (None if model is held else model), tests
+    return model.only(np.argsort(-model.power_w).tolist()), tests
 
 
 def _shapes(model: Switching, k: int) -> tuple[tuple[str, float], ...]:
@@ -216,83 +206,6 @@ def _loads_w(training: Training, state: State) -> np.ndarray:
         if state.fit.vehicle.has(id_):
             total += float(np.asarray(state.fit.vehicle.effect(id_).power_w)) * on
     return total
-
-
-def _tested(rows: StateRows, training: Training, rng: np.random.Generator) -> _Tested | None:
-    """The load that explains most of these rows, and whether noise of their colour would give as good a one."""
-    rows = _some_trips(rows)
-    if len(rows.trip) < LEAST_ROWS or np.ptp(rows.residual_w) <= 0 or not np.all(np.isfinite(rows.residual_w)):
-        return None
-    model, gain = _best(rows)
-    noise = estimate_noise(rows.residual_w, rows.trip, rows.duration_s, levels=training.clusters.kind == "trip")
-    others = []
-    for _ in range(training.settings.shifts):
-        others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
-        if len(others) == EARLY and gain <= max(others):
-            return _Tested(model, gain, 1.0)
-    spread = max(float(np.std(others, ddof=1)), LEAST_SPREAD) * np.sqrt(1.0 + 1.0 / len(others))
-    p = float(stats.t.sf((gain - np.mean(others)) / spread, len(others) - 1))
-    return _Tested(model, gain, p)
-
-
-def _some_trips(rows: StateRows) -> StateRows:
-    """Whole trips, evenly spread over the log, of at most `MOST_ROWS` rows in all; one trip at least."""
-    slices = [s for _, s in trip_slices(rows.trip)]
-    every = int(np.ceil(len(rows.trip) / MOST_ROWS))
-    return rows if every < 2 else rows.take(np.concatenate([np.arange(s.start, s.stop) for s in slices[::every]]))
-
-
-def _best(rows: StateRows) -> tuple[Switching, float]:
-    """The load that gains most over errors alone, and its gain in log-likelihood; from several starts."""
-    alone, memory = errors_alone(rows)
-    tried: list[tuple[Switching, Decoded]] = []
-    for seconds in COARSE_S:
-        coarse = rows.coarse(seconds)
-        if len(coarse.trip) >= LEAST_ROWS and (not tried or len(coarse.trip) < len(rows.trip)):
-            tried.append(fit_switching(_two_levels(coarse, memory), rows, 1))
-    first = max(tried, key=lambda t: t[1].log_likelihood)[0]
-    model, decoded = fit_switching(first, rows, FIRST_ROUNDS + 1)
-    return model if model.power_w[0] > 0 else model.turned(), decoded.log_likelihood - alone
-
-
-def _two_levels(coarse: StateRows, memory: float) -> Switching:
-    """Two levels of means over some seconds by their 2-means, and how often they change."""
-    x = coarse.residual_w
-    low, high = np.quantile(x, (0.1, 0.9))
-    for _ in range(20):
-        on = x > 0.5 * (low + high)
-        if not 0 < np.count_nonzero(on) < len(on):
-            break
-        low, high = float(np.mean(x[~on])), float(np.mean(x[on]))
-    on = (x > 0.5 * (low + high)).astype(float)
-    share = float(np.clip(np.mean(on), 0.05, 0.95))
-    switches = float(np.sum(np.abs(np.diff(on))[np.diff(coarse.trip) == 0]))
-    stays = 2.0 * share * (1.0 - share) * float(np.sum(coarse.duration_s)) / max(switches, 1.0)
-    scale = np.full(2, float(np.mean(np.abs(x - np.where(on > 0, high, low)))) + 1e-9)
-    return Switching(
-        np.array([max(high - low, 1e-6)]), low, scale, np.full((1, len(KNOTS_C)), share), np.array([max(stays, 30.0)]),
-        0.5 * memory,
-    )  # fmt: skip
-
-
-def _besides(one: Switching) -> list[Switching]:
-    """Two loads, the second of other powers than the first: that may have been fitted to the levels of both."""
-    two = one.plus(replace(one, memory_s=one.memory_s.copy()))
-    return [replace(two, power_w=one.power_w[0] * np.array([1.0, r])) for r in BESIDES]
-
-
-def _surrogate(rows: StateRows, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Noise of the residual's own colour: its innovations with random signs, coloured again; the trips' means with
-    random signs, too."""
-    out = np.empty(len(rows.trip))
-    filter_ = np.r_[1.0, -noise.coefficients[-1]]
-    for _, s in trip_slices(rows.trip):
-        mean = float(np.mean(rows.residual_w[s]))
-        innovations = np.asarray(signal.lfilter(filter_, [1.0], rows.residual_w[s] - mean))
-        drawn = innovations * rng.choice((-1.0, 1.0), len(innovations))
-        coloured = np.asarray(signal.lfilter([1.0], filter_, drawn))
-        out[s] = coloured - np.mean(coloured) + mean * rng.choice((-1.0, 1.0))
-    return out
 
 
 def _alone(rows: StateRows, model: Switching, decoded: Decoded, k: int) -> StateRows:

@@ -8,7 +8,7 @@ import numpy as np
 from hdev_jax.fleet.tally import ACCEL_EDGES, GRADE_EDGES, Tally
 from hdev_jax.physics import LIBRARY, Aero, Auxiliary, Grade, Inertia, Rolling, Switch
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, figure, tidy
-from hdev_jax.report.fleet_sources import (
+from hdev_jax.report.fleet.sources import (
     CONSUMPTION,
     CYCLE_LIMITS,
     CYCLE_SPEEDS_KMH,

@@ -8,9 +8,9 @@ import numpy as np
 
 from hdev_jax.fleet.config import FleetConfig
 from hdev_jax.fleet.tally import Tally
-from hdev_jax.report import fleet_figures
 from hdev_jax.report.canvas import png, style
-from hdev_jax.report.fleet_sources import CONSUMPTION, PAPER_FLEET_PE, PAPER_MODEL_PE
+from hdev_jax.report.fleet import figures as fleet_figures
+from hdev_jax.report.fleet.sources import CONSUMPTION, PAPER_FLEET_PE, PAPER_MODEL_PE
 from hdev_jax.report.page import write_page
 
 __all__ = ["fleet_summary", "fleet_text", "write_fleet_report"]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hdev_jax.inference.chain import draw, smooth
+from hdev_jax.inference.states.chain import draw, smooth
 
 ROWS, CHAINS = 6, 2
 

@@ -1,0 +1,108 @@
+"""Has a residual levels? The likelihood that a load which switches gains, against its gain on noise of that colour."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import signal, stats
+
+from hdev_jax.diagnosis.noise.noise import Noise, estimate_noise
+from hdev_jax.diagnosis.training import Training
+from hdev_jax.inference.states import Decoded, StateRows, Switching, errors_alone, fit_switching
+from hdev_jax.physics.states import KNOTS_C
+from hdev_jax.segments import trip_slices
+
+__all__ = ["FIRST_ROUNDS", "Tested", "besides", "tested"]
+
+COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
+FIRST_ROUNDS = 3  # of expectation-maximisation
+MOST_ROWS = 30_000  # that the test looks at
+LEAST_ROWS = 100
+BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
+LEAST_SPREAD = 2.0  # of the surrogates' gains, in log-likelihood
+EARLY = 3  # surrogates, one of which does as well: no load
+
+
+@dataclass(frozen=True)
+class Tested:
+    """The test of a load: its gain in log-likelihood over errors alone, and p."""
+
+    model: Switching
+    gain: float
+    p: float
+
+
+def tested(rows: StateRows, training: Training, rng: np.random.Generator) -> Tested | None:
+    """The load that explains most of these rows, and whether noise of their colour would give as good a one."""
+    rows = _some_trips(rows)
+    if len(rows.trip) < LEAST_ROWS or np.ptp(rows.residual_w) <= 0 or not np.all(np.isfinite(rows.residual_w)):
+        return None
+    model, gain = _best(rows)
+    noise = estimate_noise(rows.residual_w, rows.trip, rows.duration_s, levels=training.clusters.kind == "trip")
+    others = []
+    for _ in range(training.settings.shifts):
+        others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
+        if len(others) == EARLY and gain <= max(others):
+            return Tested(model, gain, 1.0)
+    spread = max(float(np.std(others, ddof=1)), LEAST_SPREAD) * np.sqrt(1.0 + 1.0 / len(others))
+    p = float(stats.t.sf((gain - np.mean(others)) / spread, len(others) - 1))
+    return Tested(model, gain, p)
+
+
+def _some_trips(rows: StateRows) -> StateRows:
+    """Whole trips, evenly spread over the log, of at most `MOST_ROWS` rows in all; one trip at least."""
+    slices = [s for _, s in trip_slices(rows.trip)]
+    every = int(np.ceil(len(rows.trip) / MOST_ROWS))
+    return rows if every < 2 else rows.take(np.concatenate([np.arange(s.start, s.stop) for s in slices[::every]]))
+
+
+def _best(rows: StateRows) -> tuple[Switching, float]:
+    """The load that gains most over errors alone, and its gain in log-likelihood; from several starts."""
+    alone, memory = errors_alone(rows)
+    tried: list[tuple[Switching, Decoded]] = []
+    for seconds in COARSE_S:
+        coarse = rows.coarse(seconds)
+        if len(coarse.trip) >= LEAST_ROWS and (not tried or len(coarse.trip) < len(rows.trip)):
+            tried.append(fit_switching(_two_levels(coarse, memory), rows, 1))
+    first = max(tried, key=lambda t: t[1].log_likelihood)[0]
+    model, decoded = fit_switching(first, rows, FIRST_ROUNDS + 1)
+    return model if model.power_w[0] > 0 else model.turned(), decoded.log_likelihood - alone
+
+
+def _two_levels(coarse: StateRows, memory: float) -> Switching:
+    """Two levels of means over some seconds by their 2-means, and how often they change."""
+    x = coarse.residual_w
+    low, high = np.quantile(x, (0.1, 0.9))
+    for _ in range(20):
+        on = x > 0.5 * (low + high)
+        if not 0 < np.count_nonzero(on) < len(on):
+            break
+        low, high = float(np.mean(x[~on])), float(np.mean(x[on]))
+    on = (x > 0.5 * (low + high)).astype(float)
+    share = float(np.clip(np.mean(on), 0.05, 0.95))
+    switches = float(np.sum(np.abs(np.diff(on))[np.diff(coarse.trip) == 0]))
+    stays = 2.0 * share * (1.0 - share) * float(np.sum(coarse.duration_s)) / max(switches, 1.0)
+    scale = np.full(2, float(np.mean(np.abs(x - np.where(on > 0, high, low)))) + 1e-9)
+    return Switching(
+        np.array([max(high - low, 1e-6)]), low, scale, np.full((1, len(KNOTS_C)), share), np.array([max(stays, 30.0)]),
+        0.5 * memory,
+    )  # fmt: skip
+
+
+def besides(one: Switching) -> list[Switching]:
+    """Two loads, the second of other powers than the first: that may have been fitted to the levels of both."""
+    two = one.plus(replace(one, memory_s=one.memory_s.copy()))
+    return [replace(two, power_w=one.power_w[0] * np.array([1.0, r])) for r in BESIDES]
+
+
+def _surrogate(rows: StateRows, noise: Noise, rng: np.random.Generator) -> np.ndarray:
+    """Noise of the residual's own colour: its innovations with random signs, coloured again; the trips' means with
+    random signs, too."""
+    out = np.empty(len(rows.trip))
+    filter_ = np.r_[1.0, -noise.coefficients[-1]]
+    for _, s in trip_slices(rows.trip):
+        mean = float(np.mean(rows.residual_w[s]))
+        innovations = np.asarray(signal.lfilter(filter_, [1.0], rows.residual_w[s] - mean))
+        drawn = innovations * rng.choice((-1.0, 1.0), len(innovations))
+        coloured = np.asarray(signal.lfilter([1.0], filter_, drawn))
+        out[s] = coloured - np.mean(coloured) + mean * rng.choice((-1.0, 1.0))
+    return out

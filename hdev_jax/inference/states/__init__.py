@@ -1,0 +1,26 @@
+"""Loads with a hidden state: a hidden Markov model of on/off loads over what a vehicle's prediction leaves.
+
+Each load is a two-state chain in continuous time, so rows may have any length: over a row of Δt it keeps its state
+with the weight e^(−Δt/memory) and otherwise takes one by its share of time on. A row in which it switches holds some
+share of its power. About the levels the residual is an autoregression of first order with Student-t innovations, whose
+degrees of freedom are estimated and whose scale differs between standstill and motion. Parameters by
+expectation-maximisation (Rabiner, Proc. IEEE 77, 1989; Hamilton, Econometrica 57, 1989; Lange, Little and Taylor, JASA
+84, 1989), trips as separate sequences.
+"""
+
+from hdev_jax.inference.states.decode import Decoded, decode, energy_draws
+from hdev_jax.inference.states.fit import errors_alone, fit_switching, shares_of
+from hdev_jax.inference.states.model import Switching
+from hdev_jax.inference.states.rows import StateRows, rows_of
+
+__all__ = [
+    "Decoded",
+    "StateRows",
+    "Switching",
+    "decode",
+    "energy_draws",
+    "errors_alone",
+    "fit_switching",
+    "rows_of",
+    "shares_of",
+]

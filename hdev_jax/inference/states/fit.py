@@ -1,0 +1,130 @@
+"""The parameters that suit rows, by expectation-maximisation."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from hdev_jax.inference.states.decode import Decoded, decode
+from hdev_jax.inference.states.model import Switching, kept_errors, log_t
+from hdev_jax.inference.states.rows import StateRows
+from hdev_jax.physics.states import KNOTS_C
+from hdev_jax.segments import trip_slices
+
+__all__ = ["errors_alone", "fit_switching", "shares_of"]
+
+FREEDOMS = (2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 60.0)  # degrees of freedom of the errors
+LEAST_SHARE, MOST_SHARE = 0.005, 0.995  # of time on: a state that is never taken has no dwell time
+SHRINK_S = 300.0  # of time at a temperature, worth as much as the mean over all temperatures
+FEW_ROWS = 100.0  # of the errors of all rows, mixed with those at standstill and in motion
+MOST_ERROR = 0.2  # of a load's memory: errors that last longer are not told from its levels
+LEAST_MEMORY_S = 30.0  # contactors and compressors are not switched faster; what is faster counts as an error
+SWEEPS = 4  # of reweighted least squares for the levels
+
+
+def fit_switching(
+    model: Switching, rows: StateRows, rounds: int, *, coloured: bool = True
+) -> tuple[Switching, Decoded]:
+    """Parameters by so many rounds of expectation-maximisation from `model`, and the states in the last round;
+    `coloured`: the errors have a memory."""
+    decoded = decode(model, rows)
+    for _ in range(rounds):
+        model = _updated(model, rows, decoded, coloured)
+        decoded = decode(model, rows)
+    return model, decoded
+
+
+def _updated(model: Switching, rows: StateRows, decoded: Decoded, coloured: bool) -> Switching:
+    """The parameters that suit these states. Levels and errors are of the rows that begin and end in the same state:
+    in the others the share of time on is not known."""
+    starts = np.array([s.start for _, s in trip_slices(rows.trip)])
+    before, same = np.r_[0.0, rows.residual_w[:-1]], decoded.same
+    kept = kept_errors(model, rows, starts)
+    y, z = rows.residual_w - kept * before, np.column_stack([np.ones(len(model.on)), model.on])
+    beta, scale = np.r_[model.base_w, model.power_w], model.scale_w[rows.standing][:, None]
+    for _ in range(SWEEPS):
+        off = y[:, None] - (1.0 - kept)[:, None] * (z @ beta)
+        weight = same * (model.freedom + 1.0) / (model.freedom + (off / scale) ** 2) / scale**2
+        gram = (z.T * ((1.0 - kept) ** 2 @ weight)) @ z
+        gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
+        beta = np.linalg.solve(gram, z.T @ (((1.0 - kept) * y) @ weight))
+    share = np.stack([shares_of(rows, decoded.on[:, k]) for k in range(len(model.power_w))])
+    new = replace(model, power_w=beta[1:], base_w=float(beta[0]), share=share)
+    new = replace(new, memory_s=_memories(new, rows, decoded.on))
+    error, last = (x[:, None] - z @ beta for x in (rows.residual_w, before))
+    if coloured:
+        weight[starts] = 0.0
+        share_kept = float(np.sum(weight * error * last) / (np.sum(weight * last**2) + 1e-12))
+        memory = -float(np.median(rows.duration_s)) / np.log(share_kept) if 0.01 < share_kept < 1.0 else 0.0
+        new = replace(new, error_s=min(memory, MOST_ERROR * float(np.min(new.memory_s))))
+    innovation = error - kept_errors(new, rows, starts)[:, None] * last
+    return _with_errors(new, innovation, same, rows.standing)
+
+
+def _with_errors(
+    model: Switching,
+    innovation: Float[np.ndarray, "row state"],
+    weight: Float[np.ndarray, "row state"],
+    kind: np.ndarray,
+) -> Switching:
+    """The model with the scales that suit innovations [W] of these weights, and the degrees of freedom that suit them
+    best of the present ones and their neighbours."""
+    best: tuple[float, float, np.ndarray] | None = None
+    some = slice(None, None, max(1, len(innovation) // 50_000))
+    at = FREEDOMS.index(model.freedom)
+    for freedom in FREEDOMS[max(at - 1, 0) : at + 2]:
+        scale = _scales(innovation[some], weight[some], kind[some], freedom, model.scale_w)
+        each = scale[kind[some]][:, None]
+        fits = float(np.sum(weight[some] * (log_t(innovation[some] / each, freedom) - np.log(each))))
+        if best is None or fits > best[0]:
+            best = fits, freedom, scale
+    assert best is not None
+    return replace(model, freedom=best[1], scale_w=best[2])
+
+
+def _scales(off: np.ndarray, weight: np.ndarray, kind: np.ndarray, freedom: float, start: np.ndarray) -> np.ndarray:
+    """Scale of Student's errors in motion and at standstill, of few rows mixed with that of all."""
+    scale = float(np.mean(start)) + 1e-9
+    for _ in range(SWEEPS):
+        square = weight * (freedom + 1.0) / (freedom + (off / scale) ** 2) * off**2
+        scale = float(np.sqrt(np.sum(square) / np.sum(weight))) + 1e-9
+    few = FEW_ROWS * scale**2
+    return np.sqrt([(np.sum(square[kind == k]) + few) / (np.sum(weight[kind == k]) + FEW_ROWS) for k in (0, 1)])
+
+
+def errors_alone(rows: StateRows) -> tuple[float, float]:
+    """Log-likelihood of rows without any load, about their median, and the memory of their errors [s]."""
+    middle = float(np.median(rows.residual_w))
+    error = rows.residual_w - middle
+    starts = np.array([s.start for _, s in trip_slices(rows.trip)])
+    inside = np.diff(rows.trip) == 0
+    kept = float(np.sum((error[1:] * error[:-1])[inside]) / (np.sum((error[:-1] ** 2)[inside]) + 1e-12))
+    memory = -float(np.median(rows.duration_s)) / np.log(kept) if 0.01 < kept < 1.0 else 0.0
+    model = Switching(
+        np.zeros(1), middle, np.full(2, float(np.std(error)) + 1e-9), np.full((1, len(KNOTS_C)), 0.5),
+        np.full(1, 7200.0), memory,
+    )  # fmt: skip
+    innovation = error - np.r_[0.0, error[:-1]] * kept_errors(model, rows, starts)
+    model = _with_errors(model, innovation[:, None], np.ones((len(error), 1)), rows.standing)
+    return decode(model, rows).log_likelihood, memory
+
+
+def shares_of(rows: StateRows, on: Float[np.ndarray, " row"]) -> Float[np.ndarray, " knot"]:
+    """Share of time on at each of `KNOTS_C`, shrunk to the mean where there is little time at that temperature."""
+    weight = rows.duration_s
+    mean = float(np.sum(weight * on) / np.sum(weight))
+    if not rows.has_temperature:
+        return np.full(len(KNOTS_C), np.clip(mean, LEAST_SHARE, MOST_SHARE))
+    hats = np.stack([np.interp(rows.temp_c, KNOTS_C, e) for e in np.eye(len(KNOTS_C))], axis=1)
+    gram = (hats * weight[:, None]).T @ hats + SHRINK_S * np.eye(len(KNOTS_C))
+    found = np.linalg.solve(gram, (hats * weight[:, None]).T @ on + SHRINK_S * mean)
+    return np.clip(found, LEAST_SHARE, MOST_SHARE)
+
+
+def _memories(model: Switching, rows: StateRows, on: np.ndarray) -> np.ndarray:
+    """The memory that makes as many switches as there are: they come at a rate of 2·share·(1 − share)/memory."""
+    share = model.expected(rows.temp_c)
+    expected = np.sum(2.0 * share * (1.0 - share) * rows.duration_s[:, None], axis=0)
+    inside = np.diff(rows.trip) == 0
+    switches = np.sum(np.abs(np.diff(on, axis=0))[inside], axis=0)
+    return np.clip(expected / np.maximum(switches, 1.0), LEAST_MEMORY_S, 7200.0)

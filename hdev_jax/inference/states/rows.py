@@ -1,0 +1,65 @@
+"""Rows as the hidden Markov model takes them: a residual as a power, with what its states may depend on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hdev_jax.physics.states import USUAL_C
+from hdev_jax.segments import Segments, trip_slices
+
+__all__ = ["StateRows", "rows_of"]
+
+STANDSTILL_MPS = 0.1
+SAMPLES, MEANS = 0.1, 0.9  # chance that a row in which a load switches holds a share of its power
+
+
+@dataclass(frozen=True)
+class StateRows:
+    """Rows of whole trips as the hidden Markov model takes them: what the vehicle's prediction leaves, as a power.
+    `partly`: the chance that a row in which a load switches holds a share of its power and not all of it, as means over
+    rows do and samples mostly do not."""
+
+    residual_w: Float[np.ndarray, " row"]
+    trip: Int[np.ndarray, " row"]
+    duration_s: Float[np.ndarray, " row"]
+    temp_c: Float[np.ndarray, " row"]
+    standing: Int[np.ndarray, " row"]  # 1 at standstill, else 0
+    partly: float = MEANS
+
+    @property
+    def has_temperature(self) -> bool:
+        """Whether the shares may depend on the temperature: where it varies at all."""
+        return float(np.ptp(self.temp_c)) > 0 if len(self.temp_c) else False
+
+    def take(self, rows: np.ndarray | slice) -> "StateRows":
+        """Rows by mask, index or slice."""
+        columns = (self.residual_w, self.trip, self.duration_s, self.temp_c, self.standing)
+        residual, trip, seconds, temp, standing = (x[rows] for x in columns)
+        return StateRows(residual, trip, seconds, temp, standing, self.partly)
+
+    def coarse(self, seconds: float) -> "StateRows":
+        """Means over runs of rows of at least so many seconds in a trip; the rows themselves where they are long."""
+        starts = []
+        for _, s in trip_slices(self.trip):
+            clock = np.floor(np.cumsum(self.duration_s[s]) / seconds - 1e-9)
+            starts += [np.flatnonzero(np.r_[True, np.diff(clock) > 0]) + s.start]
+        at = np.concatenate(starts)
+        total = np.add.reduceat(self.duration_s, at)
+
+        def mean(x: np.ndarray) -> np.ndarray:
+            return np.add.reduceat(x * self.duration_s, at) / total
+
+        standing = (mean(self.standing.astype(float)) > 0.5).astype(int)
+        return StateRows(mean(self.residual_w), self.trip[at], total, mean(self.temp_c), standing)
+
+
+def rows_of(segments: Segments, residual_w: Float[np.ndarray, " row"], *, samples: bool) -> StateRows:
+    """The first rows of (padded) segments with their residual [W]; `samples`: measured at an instant, no means."""
+    n = len(residual_w)
+    temp = np.broadcast_to(np.asarray(segments.get("ambient_temp_c", USUAL_C), dtype=float), len(segments))[:n]
+    standing = (np.asarray(segments.speed_mps)[:n] < STANDSTILL_MPS).astype(int)
+    return StateRows(
+        np.asarray(residual_w, dtype=float), np.asarray(segments.trip)[:n], np.asarray(segments.duration_s)[:n],
+        np.array(temp), standing, SAMPLES if samples else MEANS,
+    )  # fmt: skip
