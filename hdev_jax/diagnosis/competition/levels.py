@@ -11,7 +11,7 @@ from hdev_jax.inference.states import Decoded, StateRows, Switching, errors_alon
 from hdev_jax.physics.states import KNOTS_C
 from hdev_jax.segments import trip_slices
 
-__all__ = ["FIRST_ROUNDS", "Tested", "besides", "tested"]
+__all__ = ["FIRST_ROUNDS", "Tested", "besides", "level_test"]
 
 COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
 FIRST_ROUNDS = 3  # of expectation-maximisation
@@ -31,13 +31,13 @@ class Tested:
     p: float
 
 
-def tested(rows: StateRows, training: Training, rng: np.random.Generator) -> Tested | None:
+def level_test(rows: StateRows, training: Training, rng: np.random.Generator) -> Tested | None:
     """The load that explains most of these rows, and whether noise of their colour would give as good a one."""
     rows = _some_trips(rows)
     if len(rows.trip) < LEAST_ROWS or np.ptp(rows.residual_w) <= 0 or not np.all(np.isfinite(rows.residual_w)):
         return None
     model, gain = _best(rows)
-    noise = estimate_noise(rows.residual_w, rows.trip, rows.duration_s, levels=training.clusters.kind == "trip")
+    noise = estimate_noise(rows.residual_w, rows.trip, rows.duration_s, levels=False)
     others = []
     for _ in range(training.settings.shifts):
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
@@ -95,14 +95,12 @@ def besides(one: Switching) -> list[Switching]:
 
 
 def _surrogate(rows: StateRows, noise: Noise, rng: np.random.Generator) -> np.ndarray:
-    """Noise of the residual's own colour: its innovations with random signs, coloured again; the trips' means with
-    random signs, too."""
+    """Noise of the residual's own colour: its innovations with random signs, coloured again, trip by trip."""
     out = np.empty(len(rows.trip))
-    filter_ = np.r_[1.0, -noise.coefficients[-1]]
+    whiten = np.r_[1.0, -noise.coefficients[-1]]
+    left = rows.residual_w - np.median(rows.residual_w)
     for _, s in trip_slices(rows.trip):
-        mean = float(np.mean(rows.residual_w[s]))
-        innovations = np.asarray(signal.lfilter(filter_, [1.0], rows.residual_w[s] - mean))
-        drawn = innovations * rng.choice((-1.0, 1.0), len(innovations))
-        coloured = np.asarray(signal.lfilter([1.0], filter_, drawn))
-        out[s] = coloured - np.mean(coloured) + mean * rng.choice((-1.0, 1.0))
+        innovations = np.asarray(signal.lfilter(whiten, [1.0], left[s]))
+        signs = rng.choice((-1.0, 1.0), len(innovations))
+        out[s] = signal.lfilter([1.0], whiten, innovations * signs)
     return out

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.cycle import barred
-from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, Tested, besides, tested
+from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, Tested, besides, level_test
 from hdev_jax.diagnosis.competition.refit import fitted, joined, without
 from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
@@ -124,7 +124,7 @@ def _sought(
     of the first where it is not. `left`: rows without the loads that are held already."""
     model, tests, settings = held, list[Tested](), training.settings
     for _ in range(most):
-        last = tested(left, training, rng)
+        last = level_test(left, training, rng)
         significant = last is not None and last.p * len(training.library) <= settings.fdr
         if last is None or not significant:
             tests += [last] if last is not None and not tests else []

@@ -16,6 +16,7 @@ __all__ = ["errors_alone", "fit_switching", "shares_of"]
 FREEDOMS = (2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 60.0)  # degrees of freedom of the errors
 LEAST_SHARE, MOST_SHARE = 0.005, 0.995  # of time on: a state that is never taken has no dwell time
 SHRINK_S = 300.0  # of time at a temperature, worth as much as the mean over all temperatures
+WANDERS = 0.9999  # share that errors keep from row to row, at most: a random walk
 FEW_ROWS = 100.0  # of the errors of all rows, mixed with those at standstill and in motion
 MOST_ERROR = 0.2  # of a load's memory: errors that last longer are not told from its levels
 LEAST_MEMORY_S = 30.0  # contactors and compressors are not switched faster; what is faster counts as an error
@@ -55,10 +56,15 @@ def _updated(model: Switching, rows: StateRows, decoded: Decoded, coloured: bool
     if coloured:
         weight[starts] = 0.0
         share_kept = float(np.sum(weight * error * last) / (np.sum(weight * last**2) + 1e-12))
-        memory = -float(np.median(rows.duration_s)) / np.log(share_kept) if 0.01 < share_kept < 1.0 else 0.0
+        memory = _memory_of(share_kept, rows)
         new = replace(new, error_s=min(memory, MOST_ERROR * float(np.min(new.memory_s))))
     innovation = error - kept_errors(new, rows, starts)[:, None] * last
     return _with_errors(new, innovation, same, rows.standing)
+
+
+def _memory_of(kept: float, rows: StateRows) -> float:
+    """Memory [s] of errors that keep such a share from row to row; 0 where they keep none."""
+    return -float(np.median(rows.duration_s)) / np.log(min(kept, WANDERS)) if kept > 0.01 else 0.0
 
 
 def _with_errors(
@@ -99,7 +105,7 @@ def errors_alone(rows: StateRows) -> tuple[float, float]:
     starts = np.array([s.start for _, s in trip_slices(rows.trip)])
     inside = np.diff(rows.trip) == 0
     kept = float(np.sum((error[1:] * error[:-1])[inside]) / (np.sum((error[:-1] ** 2)[inside]) + 1e-12))
-    memory = -float(np.median(rows.duration_s)) / np.log(kept) if 0.01 < kept < 1.0 else 0.0
+    memory = _memory_of(kept, rows)
     model = Switching(
         np.zeros(1), middle, np.full(2, float(np.std(error)) + 1e-9), np.full((1, len(KNOTS_C)), 0.5),
         np.full(1, 7200.0), memory,

@@ -1,0 +1,149 @@
+"""Loads that switch: planted in a log they are named with their power, share and energy; noise has none."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted import breaches, diagnosed, named, training
+
+from hdev_jax.diagnosis.competition.levels import level_test
+from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.fleet.switching import Load, with_loads
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.inference.states import StateRows
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY
+from hdev_jax.problem import prepare, split_trips
+from hdev_jax.report.build import answer_text, of_diagnosis
+from hdev_jax.report.page import write_report
+
+FEW = {k: LIBRARY[k] for k in ("auxiliary_power", "hvac_power", "switching_load", "second_switching_load", "headwind")}
+LOAD = Load(12e3, share=0.35, by_temp=0.01)
+
+
+def log_with(folder: Path, *loads: Load, seed: int = 3):
+    """A log of samples with these loads, read as a user's would be, with its truth."""
+    synthetic = synthetic_log(seed=seed, trips=9, rows_per_trip=900, entry="shaft", mode="samples", effects={})
+    synthetic = with_loads(synthetic, loads, seed=seed) if loads else synthetic
+    files = synthetic.write(folder, truth=False)
+    log = read_log([files["log"]])
+    split = split_trips(log)
+    return synthetic, prepare(split.log, read_sheet(files["sheet"])), split
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """One load in a log, and what is made of it; each state of the competition as it is kept."""
+    synthetic, problem, split = log_with(tmp_path_factory.mktemp("switching"), LOAD)
+    kept = {}
+
+    def checkpoint(name, compute):
+        kept[name] = compute()
+        return kept[name]
+
+    return synthetic, problem, split, diagnosed(problem, split, FEW, checkpoint=checkpoint), kept
+
+
+@pytest.fixture(scope="module")
+def some(tmp_path_factory):
+    """Any training rows: the test of levels reads the settings and the kind of clusters of them."""
+    _, problem, _ = log_with(tmp_path_factory.mktemp("some"))
+    return training(problem, ("auxiliary_power",))
+
+
+def test_it_is_named_with_its_power_and_its_share(found):
+    synthetic, _, _, result, _ = found
+    assert named(result) == ["switching_load"]
+    assert breaches(result) == []
+    (effect,) = result.summary["effects"]
+    power = effect["parameters"]["power_w"]
+    assert abs(power["value"] - LOAD.power_w) < 0.1 * LOAD.power_w
+    assert power["interval_90"][0] - 600.0 < LOAD.power_w < power["interval_90"][1] + 600.0
+    train = np.isin(synthetic.frame["trip_id"], result.summary["split"]["train_trips"])
+    assert abs(effect["state"]["mean_share_on"] - synthetic.truth["on:0"][train].mean()) < 0.03
+    assert 0.4 * LOAD.dwell_s < effect["state"]["dwell_on_s"] < 2.0 * LOAD.dwell_s
+    assert result.summary["unexplained"]["significant"] is False
+
+
+def test_the_states_and_the_energy_of_held_out_trips_are_right(found):
+    synthetic, problem, split, result, _ = found
+    on = np.asarray(result.given.segments.channels["derived:switching_load"])
+    true = synthetic.truth["on:0"].to_numpy()
+    test = problem.rows(split.test)
+    assert np.mean((on > 0.5) == (true > 0.5), where=test) > 0.95
+    kwh = result.summary["effects"][0]["state"]["kwh_by_trip"]
+    seconds = np.asarray(problem.segments.duration_s)
+    for k, trip in enumerate(problem.log.trip_names):
+        rows = problem.rows([k])
+        energy = LOAD.power_w * float(np.sum((true * seconds)[rows])) / 3.6e6
+        value, low, high = kwh[trip]
+        assert low <= value <= high
+        assert abs(value - energy) < 0.15 * energy + 0.05
+
+
+def test_three_errors_are_kept_apart(found):
+    *_, result, _ = found
+    after = result.summary["after"]
+    assert after["given_states"]["rmse"] < 0.8 * after["test"]["rmse"]
+    assert after["one_step"]["rmse"] < 0.8 * after["test"]["rmse"]
+    # the headline is the free run, which knows no measured power
+    free = result.problem.predict(result.after)
+    test = result.problem.rows(result.split.test)
+    error = (result.problem.measured - free)[test]
+    assert after["test"]["rmse"] == pytest.approx(float(np.sqrt(np.mean(error**2))))
+    assert after["test"]["rmse"] < result.summary["before"]["test"]["rmse"]
+
+
+def test_a_kept_state_is_the_same_again(found):
+    _, problem, *_, kept = found
+    steps = [v for k, v in kept.items() if k.startswith("step-")]
+    plain = next(p for p in steps if p["hidden"] is not None)
+    again = to_plain(from_plain(plain, problem.vehicle, training(problem, FEW)))
+    assert again["hidden"]["ids"] == plain["hidden"]["ids"]
+    np.testing.assert_array_equal(again["hidden"]["on"], plain["hidden"]["on"])
+    np.testing.assert_array_equal(again["hidden"]["model"]["power_w"], plain["hidden"]["model"]["power_w"])
+    assert again["hidden"]["model"]["freedom"] == plain["hidden"]["model"]["freedom"]
+
+
+def test_the_page_and_the_answer_say_it(found, tmp_path):
+    *_, result, _ = found
+    data = of_diagnosis(result, "hdev diagnose", 0.0)
+    write_report(data, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert (tmp_path / "figures" / "switching_loads.png").stat().st_size > 10_000
+    assert "Loads that switch" in page
+    assert "% of the time at" in answer_text(data)
+    assert "given the states" in answer_text(data)
+    breakdown = data.breakdown["after"]["switching_load"]
+    kwh = result.summary["effects"][0]["state"]["kwh_by_trip"]
+    test = sum(kwh[t][0] for t in result.summary["split"]["test_trips"])
+    assert breakdown == pytest.approx(test, rel=0.03)
+    json.dumps(result.summary, allow_nan=False)
+
+
+@pytest.mark.parametrize("noise", ["white", "ar1", "walk", "student_t"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_has_no_levels(noise, seed, some):
+    rng = np.random.default_rng(seed)
+    trips, n = 6, 700
+    steps = rng.standard_t(3, (trips, n)) if noise == "student_t" else rng.standard_normal((trips, n))
+    kept = {"white": 0.0, "ar1": 0.95, "walk": 0.9999, "student_t": 0.9}[noise]
+    x = np.zeros((trips, n))
+    for t in range(1, n):
+        x[:, t] = kept * x[:, t - 1] + steps[:, t]
+    rows = StateRows(
+        2e3 * (x / x.std()).ravel(), np.repeat(np.arange(trips), n), np.ones(trips * n), np.full(trips * n, 15.0),
+        np.zeros(trips * n, int), 0.1,
+    )  # fmt: skip
+    result = level_test(rows, some, rng)
+    assert result is None or result.p * len(LIBRARY) > 0.05
+
+
+def test_a_power_that_is_missing_constant_or_short_gives_no_load(some):
+    rng = np.random.default_rng(0)
+    for residual in (np.zeros(500), np.full(500, 3e3), np.array([1.0, 2.0]), np.r_[np.nan, np.ones(499)]):
+        n = len(residual)
+        rows = StateRows(residual, np.zeros(n, int), np.ones(n), np.full(n, 15.0), np.ones(n, int))
+        assert level_test(rows, some, rng) is None
