@@ -263,7 +263,14 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
     """The answer as (text, bold) pieces, so that a page can escape names and mark them."""
     s = data.summary
     verdict, effects = s.get("verdict", ""), s.get("effects", [])
-    if effects:
+    if verdict == "suspect_log":
+        first, *more = s["suspicions"]
+        said = [x[:1].upper() + x[1:] for x in (first["evidence"], first["mend"])]
+        text = f"\x02This log is suspect: {first['what']}\x03. {'. '.join(said)}."
+        if more:
+            text += f" Suspected too: {names.verbose_join([m['what'] for m in more])}."
+        text += " No effect was searched; --trust searches all the same."
+    elif effects:
         text = f"The declared model misses {_missing(effects)}: {_where(data)} {_errors(data)}."
         if "unexplained" in verdict:
             text += f" \x02Something more\x03 is missing that {_unnamed(data)}: {remaining(data)}."

@@ -27,7 +27,7 @@ def trips(sign: float = 1.0) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def test_no_effect_is_named_on_a_suspect_log():
+def test_no_effect_is_named_on_a_suspect_log(tmp_path):
     found = hdev_jax.diagnose(trips(-1.0), SHEET, only=["headwind"])
     assert found.summary["verdict"] == "suspect_log"
     assert found.summary["effects"] == []
@@ -35,6 +35,9 @@ def test_no_effect_is_named_on_a_suspect_log():
     assert one["what"] == "sign of battery_power_w"
     assert set(one) == {"what", "evidence", "mend"}
     assert "affine = [0, -1]" in str(found)
+    page = found.report(tmp_path / "page.html").read_text()
+    assert "This log is suspect: sign of battery_power_w" in page
+    assert "Nothing was tried" not in page
 
 
 @pytest.mark.parametrize(("sign", "trust"), [(1.0, False), (-1.0, True)])
