@@ -62,8 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as e:
         return _fail(str(e), 2)
     except Exception as e:
-        what = " ".join(f"{type(e).__name__}: {e}".split())
-        return _fail(f"internal error: {textwrap.shorten(what, 300)} (HDEV_DEBUG=1 shows the traceback)", 1)
+        what = textwrap.shorten(" ".join(f"{type(e).__name__}: {e}".split()), 300)
+        return _fail(f"internal error: {what} (HDEV_DEBUG=1 shows the traceback)", 1)
     return 0
 
 
@@ -167,9 +167,9 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="the file to write (.csv, .csv.gz or .parquet): trip_id, time_s, predicted, lower, upper, level",
     )
-    predict.add_argument(
-        "--level", type=_share, default=0.9, metavar="P", help="probability inside the interval (default: 0.9)"
-    )
+    level = "probability inside the interval (default: 0.9)"
+    predict.add_argument("--level", type=_share, default=0.9, metavar="P", help=level)
+    predict.add_argument("--online", action="store_true", help="loads that switch follow the power of the rows before")
 
     simulate = verbs.add_parser(
         "simulate",

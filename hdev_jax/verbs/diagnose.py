@@ -19,6 +19,7 @@ from hdev_jax.problem import implausible
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.rundir import Run, open_run
 from hdev_jax.verbs.arguments import names_of
+from hdev_jax.verbs.online import states_of
 from hdev_jax.verbs.opening import (
     Effects,
     Logs,
@@ -131,6 +132,8 @@ def _diagnosed(
     sheet = _augmented(outcome, start.sheet)
     predictive, notes = predictive_of(start.problem, start.split, outcome.fit, "normal", sheet_digest(sheet))
     outcome.summary["notes"] += notes
+    if outcome.given is not None:
+        predictive["states"] = states_of(outcome.given.ids, outcome.given.model)
     progress.step("writing the report")
     data = of_diagnosis(outcome, command_line("diagnose", run), started)
     return Diagnosis(text or answer_text(data), outcome.summary, sheet, predictive, data)

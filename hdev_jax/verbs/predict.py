@@ -15,6 +15,7 @@ from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, l
 from hdev_jax.problem import Problem, Split, derivable, prepare
 from hdev_jax.rundir import atomic_file
 from hdev_jax.targets import TARGETS
+from hdev_jax.verbs.online import one_step_ahead
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles, digest, known_effects, log_of, sheet_of, tried
 from hdev_jax.verbs.result import PREDICTIVE, Prediction, Result
 
@@ -71,6 +72,7 @@ def predict(
     target: str | None = None,
     effects: Effects = None,
     level: float = 0.9,
+    online: bool = False,
     *,
     out: str | Path | None = None,
 ) -> Prediction:
@@ -80,6 +82,9 @@ def predict(
     else their sds in the sheet) and the noise of a row: by cross-validation over trips of that fit, else from this log
     where it measures the target. The interval of a trip's total is from errors of whole trips, by a Student t with as
     many degrees of freedom as there were trips; for a single trip, from its autocorrelation.
+
+    `online`: loads that switch are filtered along the log, so that each row is predicted from the rows before it; the
+    log has to measure the target, and the sheet to have such loads.
 
     **Arguments:** `vehicle`: a sheet's path, a `Sheet`, or what `diagnose` or `calibrate` returned; `out`, a file to
     write (.csv, .csv.gz or .parquet). **Returns:** a `Prediction`: its `rows`, and as text the total of each trip with
@@ -113,6 +118,15 @@ def predict(
     spread = _spread(problem, predicted, x, known, measures)
     half = np.linalg.norm(x, axis=1)
     half = reach * half if spread is None else spread.rows(level, half, predicted)
+    lines = [_whence(level, spread, bool(known)), *_totals(problem, predicted, x, spread, level)]
+    if online:
+        free = predicted
+        predicted, half = one_step_ahead(problem, known, measures, level)
+        errors = [float(np.sqrt(np.mean((problem.measured - p) ** 2))) for p in (predicted, free)]
+        lines.append(
+            f"rows one step ahead, from the rows before: RMSE {errors[0]:.4g} {problem.unit} ({errors[1]:.4g} in the "
+            "free run, of which the totals above are)"
+        )
     frame = pd.DataFrame(
         {
             "trip_id": np.asarray(log.trip_names, dtype=object)[log.segments.trip],
@@ -123,7 +137,6 @@ def predict(
             "level": level,
         }
     )
-    lines = [_whence(level, spread, bool(known)), *_totals(problem, predicted, x, spread, level)]
     lines += _warnings(problem, spread, beside, known)
     if out is None:
         return Prediction(frame, "\n".join([*lines, f"{len(frame)} rows of {name}"]))

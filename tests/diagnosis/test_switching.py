@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from planted import breaches, diagnosed, named, training
 
+import hdev_jax
 from hdev_jax.diagnosis.competition.levels import level_test
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
+from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.switching import Load, with_loads
 from hdev_jax.inference.sheet import read_sheet
@@ -147,3 +149,27 @@ def test_a_power_that_is_missing_constant_or_short_gives_no_load(some):
         n = len(residual)
         rows = StateRows(residual, np.zeros(n, int), np.ones(n), np.full(n, 15.0), np.ones(n, int))
         assert level_test(rows, some, rng) is None
+
+
+def test_predicting_online_filters_along_the_log(tmp_path):
+    synthetic, *_ = log_with(tmp_path, LOAD)
+    files = {k: str(tmp_path / f"synthetic_truck.{k}") for k in ("csv", "toml")}
+    found = hdev_jax.diagnose(files["csv"], files["toml"], only=[*FEW])
+    assert found.predictive["states"]["ids"] == ["switching_load"]
+    frame = synthetic.frame
+    free, online = (hdev_jax.predict(frame, found, online=x) for x in (False, True))
+    measured = frame["battery_power_kw"] if "battery_power_kw" in frame else frame["battery_power_w"] / 1e3
+    error = {k: measured.to_numpy() - p.rows["predicted"].to_numpy() for k, p in (("free", free), ("online", online))}
+    assert np.std(error["online"]) < 0.8 * np.std(error["free"])
+    inside = (measured >= online.rows["lower"]) & (measured <= online.rows["upper"])
+    assert 0.8 < inside.mean() < 0.97
+    assert "one step ahead" in str(online)
+    # what comes later changes nothing
+    cut = frame[frame["trip_id"] == frame["trip_id"].iloc[0]].iloc[:300]
+    part = hdev_jax.predict(cut, found, online=True).rows["predicted"].to_numpy()
+    np.testing.assert_allclose(part[:-1], online.rows["predicted"].to_numpy()[:299], atol=1e-6)
+    with pytest.raises(InputError, match="no load that switches"):
+        hdev_jax.predict(frame, files["toml"], online=True)
+    without = frame.drop(columns=[c for c in frame if c.startswith(("battery_power", "energy"))])
+    with pytest.raises(InputError, match="does not measure"):
+        hdev_jax.predict(without, found, target="battery_power_kw", online=True)
