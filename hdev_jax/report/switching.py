@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.report import names
-from hdev_jax.report.canvas import AFTER, GREY, INK, MEASURED, axis_label, figure, tidy
+from hdev_jax.report.canvas import GREY, INK, MEASURED, axis_label, figure, tidy
 from hdev_jax.report.data import ReportData, test_rows
 from hdev_jax.report.figures import WIDTH, short
 from hdev_jax.targets import TARGETS
@@ -55,7 +55,8 @@ def _levels(data: ReportData, found: list[dict[str, Any]], rows: np.ndarray, ax:
     kw = _power_kw(data, "measured")[chosen]
     low, high = np.quantile(kw, (0.002, 0.998))
     power = [e["parameters"]["power_w"]["value"] / 1e3 for e in found]
-    base = float(np.median((_power_kw(data, "given") - _loads_kw(data, found))[chosen]))
+    off = chosen & np.all([data.row(on_column(e["id"])) < 0.1 for e in found], axis=0)
+    base = float(np.median(_power_kw(data, "measured")[off])) if off.any() else float(np.min(kw))
     levels = {0.0: "all off"}
     for k, e in enumerate(found):
         levels[power[k]] = names.effect(e["id"])
@@ -64,7 +65,8 @@ def _levels(data: ReportData, found: list[dict[str, Any]], rows: np.ndarray, ax:
     ax.hist(kw, bins=np.linspace(low, max(high, base + sum(power)), 90), color="#b3bdc6")
     for level, words in levels.items():
         ax.axvline(base + level, color=INK, linewidth=0.9, linestyle="--")
-        ax.text(base + level, 0.97, f" {words}", rotation=90, va="top", ha="left", fontsize=7,
+        ax.text(base + level, 0.97, words, rotation=90, va="top", ha="left", fontsize=7,
+                bbox={"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 1.0},
                 transform=ax.get_xaxis_transform())  # fmt: skip
     ax.set_xlabel("measured battery power [kW]")
     ax.set_ylabel("rows")
@@ -115,19 +117,20 @@ def _course(data: ReportData, found: list[dict[str, Any]], rows: np.ndarray, ax:
     assert best is not None
     here = best[1]
     minutes = time[here] / 60.0
-    ax.plot(minutes, _power_kw(data, "measured")[here], color=MEASURED, linewidth=0.8, label="measured")
-    ax.plot(minutes, _power_kw(data, "given")[here], color=AFTER, linewidth=0.8, label="model given the states")
-    floor = float(np.min(_power_kw(data, "measured")[here]))
-    step = 0.09 * float(np.ptp(_power_kw(data, "measured")[here]) or 1.0)
+    left = (_power_kw(data, "measured") - _power_kw(data, "given") + _loads_kw(data, found))[here]
+    floor = np.zeros(len(here))
     for k, e in enumerate(found):
-        y = floor - step * (k + 1)
-        ax.fill_between(minutes, y, y + 0.7 * step * data.row(on_column(e["id"]))[here], color=COLOURS[k % 2],
-                        linewidth=0, step="mid", label=f"on: {_label(e)}")  # fmt: skip
+        top = floor + e["parameters"]["power_w"]["value"] / 1e3 * data.row(on_column(e["id"]))[here]
+        ax.fill_between(minutes, floor, top, color=COLOURS[k % 2], alpha=0.55, linewidth=0, step="mid", label=_label(e))
+        floor = top
+    ax.plot(minutes, left, color=MEASURED, linewidth=0.7, label="measured power less all else in the model")
+    low, high = np.quantile(left, (0.005, 0.995))
+    ax.set_ylim(min(low, -2.0), 1.3 * max(high, float(floor.max())))
     name = data.trip_names[int(trip[here[0]])]
-    ax.set_title(f"Half an hour of {short(name, 30)}")
+    ax.set_title(f"Half an hour of {short(name, 30)}: when they are on")
     ax.set_xlabel(axis_label("time since start of the trip", "min"))
-    ax.set_ylabel("battery power [kW]")
+    ax.set_ylabel("power [kW]")
     ax.axhline(0, color=GREY, linewidth=0.6)
     ax.margins(x=0.005)
-    ax.legend(loc="upper right", ncols=4, framealpha=0.9, frameon=True, edgecolor="none", fontsize=7.5)
+    ax.legend(loc="upper right", ncols=3, framealpha=0.9, frameon=True, edgecolor="none", fontsize=7.5)
     tidy(ax)
