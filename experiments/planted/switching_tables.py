@@ -118,7 +118,8 @@ def collect(config: Any, results: Sequence[Log], run: Run) -> dict[str, Any]:
                  for r in (*rows, *({"line": f"nothing planted: {x['noise']}", **x} for x in noises),
                            *({"line": f"beside: {x['beside']}", **x} for x in beside))],
         "better_than_paper": 0, "of": 0, "skipped": skipped, "missed": missed,
-        "findings": [*_found_sentences(planted), *_false_sentences(empty, planted), *_beside_sentence(beside)],
+        "findings": [*_found_sentences(planted), *_interval_sentence(planted), *_false_sentences(empty, planted),
+                     *_beside_sentence(beside)],
         "notes": [
             "Size: the power of the load over that of the noise; of samples the noise's RMS, of segments the RMS of "
             "its energy over the median duration of a row. Samples: battery power each second, torque and motor speed "
@@ -224,6 +225,16 @@ def _found_sentences(planted: Sequence[Log]) -> list[str]:
         every = [scored(t["effects"], r).all_found for t, r in one if t["loads"][0]["size"] == size]
         parts.append(f"{sum(every)} of {len(every)} at {size:g}")
     return [f"One load is found in {', '.join(parts)} times the noise"] if parts else []
+
+
+def _interval_sentence(planted: Sequence[Log]) -> list[str]:
+    """How often the 90 % intervals hold the truth, over all loads that are found."""
+    every = [scored(t["effects"], r) for t, r in planted]
+    power, energy = [x for s in every for x in s.power_covered], [x for s in every for x in s.covered]
+    if not power:
+        return []
+    trips = f"the energy of {100.0 * np.mean(energy):.0f} % of trips"
+    return [f"Of loads that are found, the 90 % interval holds the power of {sum(power)} of {len(power)} and {trips}"]
 
 
 def _false_sentences(empty: Sequence[Log], planted: Sequence[Log]) -> list[str]:
