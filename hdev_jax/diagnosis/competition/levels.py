@@ -65,7 +65,8 @@ def _best(rows: StateRows) -> tuple[Switching, float]:
             tried.append(fit_switching(_two_levels(coarse, memory), rows, 1))
     first = max(tried, key=lambda t: t[1].log_likelihood)[0]
     model, decoded = fit_switching(first, rows, FIRST_ROUNDS + 1)
-    return model if model.power_w[0] > 0 else model.turned(), decoded.log_likelihood - alone
+    gain = max(decoded.log_likelihood - alone, 0.0)  # a load of no power gains nothing
+    return model if model.power_w[0] > 0 else model.turned(), gain
 
 
 def _two_levels(coarse: StateRows, memory: float) -> Switching:

@@ -69,59 +69,57 @@ def _moves(model: Switching, rows: StateRows, starts: np.ndarray) -> Float[np.nd
     return out
 
 
-def _fits(model: Switching, rows: StateRows, starts: np.ndarray) -> Float[np.ndarray, "row state state"]:
-    """Log-likelihood of each row's residual for each pair of states before and after it.
+class _Pairs(NamedTuple):
+    """Of each row, for each pair of states before and after it: the log-likelihood of its residual where it is at the
+    level after it (`whole`), or holds any share of the step alike (`partly`), and the share as measured (`way`)."""
 
-    Where they differ, the row is at the level after it, or holds any share of the difference alike: a density that is
-    flat between the two levels.
-    """
+    whole: Float[np.ndarray, "row state state"]
+    partly: Float[np.ndarray, "row state state"]
+    way: Float[np.ndarray, "row state state"]
+
+
+def _pairs(model: Switching, rows: StateRows, starts: np.ndarray) -> _Pairs:
+    """Densities about the levels, the errors being an autoregression: of a share, flat between the two levels."""
     levels, kept = model.base_w + model.on @ model.power_w, kept_errors(model, rows, starts)
     scale = model.scale_w[rows.standing][:, None, None]
     before = np.r_[0.0, rows.residual_w[:-1]][:, None] - levels  # error of the row before, by the state before
     x = (rows.residual_w[:, None] - kept[:, None] * before)[:, :, None]
-    first = _is_first(rows, starts)
+    first = np.zeros(len(rows.trip), dtype=bool)
+    first[starts] = True  # begins in the state that it ends in
+    first = first[:, None, None]
     low, high = (np.where(first, levels, f(levels[:, None], levels)) for f in (np.minimum, np.maximum))
     off = np.maximum(np.maximum(low - x, x - high), 0.0)
     flat = 1.0 + (high - low) / scale * np.exp(log_t(0.0, model.freedom))
-    partly = log_t(off / scale, model.freedom) - np.log(scale * flat)
-    whole = log_t((x - levels) / scale, model.freedom) - np.log(scale)
-    return np.logaddexp(np.log(rows.partly) + partly, np.log1p(-rows.partly) + whole)
-
-
-def _is_first(rows: StateRows, starts: np.ndarray) -> np.ndarray:
-    """Whether a row is the first of its trip, against pairs of states: it begins in the state that it ends in."""
-    first = np.zeros(len(rows.trip), dtype=bool)
-    first[starts] = True
-    return first[:, None, None]
-
-
-def _on_in(model: Switching, rows: StateRows, starts: np.ndarray) -> Float[np.ndarray, "row state state load"]:
-    """The share of each row that each load is on, for each pair of states before and after it: as measured, where a row
-    may hold a share and the step is larger than the error, else half of it."""
-    levels, kept = model.base_w + model.on @ model.power_w, kept_errors(model, rows, starts)
-    scale = model.scale_w[rows.standing][:, None, None]
-    before = np.r_[0.0, rows.residual_w[:-1]][:, None] - levels
-    x = (rows.residual_w[:, None] - kept[:, None] * before)[:, :, None]
+    partly = np.log(rows.partly) + log_t(off / scale, model.freedom) - np.log(scale * flat)
+    whole = np.log1p(-rows.partly) + log_t((x - levels) / scale, model.freedom) - np.log(scale)
     step = levels[None, :] - levels[:, None]
     way = np.clip((x - levels[:, None]) / np.where(step == 0, 1.0, step), 0.0, 1.0)
     sure = step**2 / (step**2 + 12.0 * scale**2)  # variance of a uniform share over that with the error's
-    way = np.where(_is_first(rows, starts), 1.0, 0.5 + sure * (way - 0.5))[..., None]
+    return _Pairs(whole, partly, np.where(first, 1.0, 0.5 + sure * (way - 0.5)))
+
+
+def _on_in(model: Switching, pairs: _Pairs) -> Float[np.ndarray, "row state state load"]:
+    """The share of each row that each load is on, for each pair of states: all of it, or as measured, by how likely
+    either is."""
+    partly = np.exp(pairs.partly - np.logaddexp(pairs.whole, pairs.partly))
+    way = (1.0 - partly * (1.0 - pairs.way))[..., None]
     return (1.0 - way) * model.on[:, None, :] + way * model.on[None, :, :]
 
 
-def _posed(model: Switching, rows: StateRows) -> tuple[_Lanes, np.ndarray, np.ndarray]:
+def _posed(model: Switching, rows: StateRows) -> tuple[_Lanes, np.ndarray, np.ndarray, _Pairs]:
     lanes = _Lanes.of(rows.trip)
     moves = lanes.spread(_moves(model, rows, lanes.starts), np.eye(len(model.on)))
-    return lanes, moves, lanes.spread(_fits(model, rows, lanes.starts), 0.0)
+    pairs = _pairs(model, rows, lanes.starts)
+    return lanes, moves, lanes.spread(np.logaddexp(pairs.whole, pairs.partly), 0.0), pairs
 
 
 def decode(model: Switching, rows: StateRows) -> Decoded:
     """The states of rows by filter and smoother."""
-    lanes, moves, fits = _posed(model, rows)
+    lanes, moves, fits, each = _posed(model, rows)
     found = smooth(moves, fits)
     at = lanes.place, lanes.lane
     pairs = np.asarray(found.pairs)[at]
-    on = np.einsum("rij,rijk->rk", pairs, _on_in(model, rows, lanes.starts))
+    on = np.einsum("rij,rijk->rk", pairs, _on_in(model, each))
     same = np.einsum("rii->ri", pairs).copy()
     same[lanes.starts] = pairs[lanes.starts].sum(axis=1)  # nothing comes before
     filtered, ahead = (np.asarray(x)[at] @ model.on for x in (found.filtered, found.ahead))
@@ -136,8 +134,8 @@ def energy_draws(
     model: Switching, rows: StateRows, *, key: jax.Array, draws: int
 ) -> Float[np.ndarray, "draw load trip"]:
     """Energy of each load in each trip [Wh] over draws of the state sequence from its posterior."""
-    lanes, moves, fits = _posed(model, rows)
-    filtered, where = smooth(moves, fits).filtered, _on_in(model, rows, lanes.starts)
+    lanes, moves, fits, each = _posed(model, rows)
+    filtered, where = smooth(moves, fits).filtered, _on_in(model, each)
     which, at = [s for _, s in trip_slices(rows.trip)], np.arange(len(rows.trip))
     hours = rows.duration_s / 3600.0
     out = np.empty((draws, len(model.power_w), len(which)))
