@@ -61,7 +61,7 @@ def _best(rows: StateRows) -> tuple[Switching, float]:
     tried: list[tuple[Switching, Decoded]] = []
     for seconds in COARSE_S:
         coarse = rows.coarse(seconds)
-        if len(coarse.trip) >= LEAST_ROWS and (not tried or len(coarse.trip) < len(rows.trip)):
+        if not tried or LEAST_ROWS <= len(coarse.trip) < len(rows.trip):
             tried.append(fit_switching(_two_levels(coarse, memory), rows, 1))
     first = max(tried, key=lambda t: t[1].log_likelihood)[0]
     model, decoded = fit_switching(first, rows, FIRST_ROUNDS + 1)

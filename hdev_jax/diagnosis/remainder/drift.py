@@ -71,6 +71,8 @@ def drift_of(
     slow = mean(residual_w)
     block_trip = trip[at]
     slow = slow - np.mean(slow)
+    if not np.any(slow):
+        return nothing
     memory = _memory(slow, block_trip)
     if memory <= 0:
         return nothing

@@ -14,8 +14,15 @@ STANDS_MPS = 0.1  # instruments at rest show a little
 # Into the battery: the slowest charger (6 A, one phase, IEC 61851-1) gives 1.4 kW; a sensor's zero is off by less.
 CHARGES_W = -1000.0
 LASTS_S = 60.0  # regeneration is over within a sample or two after a stop; the shortest charge at a stop lasts minutes
+BEYOND = 6.0  # standard deviations of noise at standstill
+COHERENT = 8  # rows of one sign: 1 in 256 of as many rows of noise
 CHARGED_WH = 200.0  # of one stand; less is also what the noise of a log of intervals gives while standing
 _DRIVES = 20  # rows that accelerate, for a judgement on the sign
+
+
+def _spread(power: np.ndarray) -> float:
+    """Standard deviation of noisy power about 0 at standstill [W], by its positive side: charging is on the other."""
+    return float(np.quantile(np.maximum(power, 0.0), 0.9)) / 1.2816 if len(power) else 0.0  # of a normal distribution
 
 
 def without_charging(rows: Rows, sampled: bool, keep: bool) -> Rows:
@@ -52,7 +59,13 @@ def without_charging(rows: Rows, sampled: bool, keep: bool) -> Rows:
     index = np.arange(len(run))
     first = np.minimum.reduceat(np.where(charges, index, len(run)), edges)
     last = np.maximum.reduceat(np.where(charges, index, -1), edges)
-    cut = long[run] & (index >= first[run]) & (index <= last[run])
+    inside = (index >= first[run]) & (index <= last[run])
+    # one sign in many rows, or far beyond what a noisy log shows at standstill: a few rows may be negative by chance
+    rows_in, rows_of = np.add.reduceat(charges, edges), np.add.reduceat(inside, edges)
+    coherent = (rows_in >= COHERENT) & (rows_in >= 0.9 * rows_of)
+    mean = np.add.reduceat(np.where(charges, power, 0.0), edges) / np.maximum(rows_in, 1)
+    long &= coherent | (mean < -BEYOND * _spread(power[stands]))
+    cut = long[run] & inside
     if not cut.any():
         return rows
     kwh = -float(np.sum(power[cut] * duration[cut])) / 3.6e6
