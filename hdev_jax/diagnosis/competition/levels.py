@@ -17,6 +17,7 @@ COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and 
 FIRST_ROUNDS = 3  # of expectation-maximisation
 MOST_ROWS = 30_000  # that the test looks at
 LEAST_ROWS = 100
+LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
 LEAST_SPREAD = 2.0  # of the surrogates' gains, in log-likelihood
 EARLY = 3  # surrogates, one of which does as well: no load
@@ -33,7 +34,7 @@ class Tested:
 
 def level_test(rows: StateRows, training: Training, rng: np.random.Generator) -> Tested | None:
     """The load that explains most of these rows, and whether noise of their colour would give as good a one."""
-    rows = _some_trips(rows)
+    rows = _some_rows(rows)
     if len(rows.trip) < LEAST_ROWS or np.ptp(rows.residual_w) <= 0 or not np.all(np.isfinite(rows.residual_w)):
         return None
     model, gain = _best(rows)
@@ -48,11 +49,19 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
     return Tested(model, gain, p)
 
 
-def _some_trips(rows: StateRows) -> StateRows:
-    """Whole trips, evenly spread over the log, of at most `MOST_ROWS` rows in all; one trip at least."""
+def _some_rows(rows: StateRows) -> StateRows:
+    """At most about `MOST_ROWS` rows: the middle of every trip, or of trips evenly spread over the log."""
+    if len(rows.trip) <= MOST_ROWS:
+        return rows
     slices = [s for _, s in trip_slices(rows.trip)]
-    every = int(np.ceil(len(rows.trip) / MOST_ROWS))
-    return rows if every < 2 else rows.take(np.concatenate([np.arange(s.start, s.stop) for s in slices[::every]]))
+    chosen = slices[:: max(1, -(-len(slices) * LEAST_STRETCH // MOST_ROWS))]
+    most = max(MOST_ROWS // len(chosen), LEAST_STRETCH)
+
+    def middle(s: slice) -> np.ndarray:
+        spare = max(s.stop - s.start - most, 0) // 2
+        return np.arange(s.start + spare, s.stop - spare)
+
+    return rows.take(np.concatenate([middle(s) for s in chosen]))
 
 
 def _best(rows: StateRows) -> tuple[Switching, float]:

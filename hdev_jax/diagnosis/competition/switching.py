@@ -40,6 +40,9 @@ LOADS = (SwitchingLoad, SecondSwitchingLoad)
 ROUNDS = 6  # of expectation-maximisation, at the last
 LEAST_S = 60.0  # on, and off, for a power of its own (of a trip, at standstill)
 LEAST_SWITCHES = 8.0
+# of its power: sd over trips, and difference between standstill and motion. A bus's heater and compressor have stages:
+# 0.15 to 0.35 on the measured ones
+ALIKE = 0.5
 
 
 def with_states(training: Training, state: State) -> Training:
@@ -92,7 +95,7 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         return no(Kind.NOT_SIGNIFICANT, f"no more levels than noise of this colour has (FDR-adjusted p = {q:.2g})", q)
     decoded = decode(model, rows)
     places = range(len(held), len(model.power_w))
-    why = {k: x for k in places if (x := _unlike(rows, model, decoded, k, settings))}
+    why = {k: x for k in places if (x := _unlike(rows, model, decoded, k))}
     kept = [*range(len(held)), *(k for k in places if k not in why)]
     if len(kept) == len(held):
         k = next(iter(why))
@@ -223,7 +226,7 @@ def _power(rows: StateRows, on: np.ndarray) -> tuple[float, float] | None:
     return float(np.median(rows.residual_w[on > 0.9]) - np.median(rows.residual_w[on < 0.1])), min(seconds)
 
 
-def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, settings: Settings) -> str | None:
+def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int) -> str | None:
     """Why a decoded load is not one consumer that is switched on and off, or None."""
     power, on, alone = float(model.power_w[k]), decoded.on[:, k], _alone(rows, model, decoded, k)
     size = next(p for p in SwitchingLoad.parameters if p.name == "power_w")
@@ -236,13 +239,13 @@ def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, setting
         return "it switches in one trip alone"
     by_trip, weight = np.array(each).T
     mean = float(np.average(by_trip, weights=weight))
-    if np.sqrt(np.average((by_trip - mean) ** 2, weights=weight)) > settings.alike_spread * power:
+    if np.sqrt(np.average((by_trip - mean) ** 2, weights=weight)) > ALIKE * power:
         return "its power is not the same in every trip"
     if np.sum(rows.duration_s[rows.standing == 1]) > 4.0 * LEAST_S:
         standing, moving = (_power(alone.take(x), on[x]) for x in (rows.standing == 1, rows.standing == 0))
         if standing is None or moving is None:
             return f"it does not switch {'at standstill' if standing is None else 'in motion'}"
-        if abs(standing[0] - moving[0]) > settings.alike_spread * power:
+        if abs(standing[0] - moving[0]) > ALIKE * power:
             return f"it has {standing[0] / 1e3:.2g} kW at standstill and {moving[0] / 1e3:.2g} kW in motion"
     return None
 
