@@ -118,7 +118,7 @@ _STEMS = {
     "battery_power": "power",
 }
 # units that people log a quantity in: what a column may have been in whose unit is told wrongly
-UNITS_IN_USE = {
+UNITS_IN_USE: dict[str, tuple[str, ...]] = {
     "speed_mps": ("m/s", "km/h", "mph", "knot"),
     "grade_rad": ("rad", "tan", "%", "permille", "deg"),
     "battery_power_w": ("W", "kW"),

@@ -11,6 +11,7 @@ from hdev_jax.logs.columns.headers import Header, parse_header
 from hdev_jax.logs.columns.numbers import numbers
 from hdev_jax.logs.columns.timing import CLOCKS, find_clock
 from hdev_jax.logs.expression import Quantity, evaluate
+from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.readers.raw import Raw
 from hdev_jax.logs.repair import fill_forward, fill_linear, fill_nearest, increments
 from hdev_jax.units import COLUMNS, NEEDED_STEMS, conversion, registry, unit_of
@@ -34,12 +35,15 @@ class Work:
     """The table under way: what has been translated so far."""
 
     def __init__(self, raw: Raw, adapter: Adapter, headers: list[str], trip: np.ndarray):
-        self.raw, self.adapter, self.headers, self.trip = raw, adapter, headers, trip
-        self.parsed = {h: Header.of(h, raw.units.get(h)) for h in headers}
+        self.raw: Raw = raw
+        self.adapter: Adapter = adapter
+        self.headers: list[str] = headers
+        self.trip: np.ndarray = trip
+        self.parsed: dict[str, Header] = {h: Header.of(h, raw.units.get(h)) for h in headers}
         self.data: dict[str, np.ndarray] = {}
         self.unfilled: dict[str, np.ndarray] = {}
         self.columns: list[ColumnInfo] = []
-        self.ledger = raw.ledger
+        self.ledger: Ledger = raw.ledger
         self.absent: set[str] = set()
 
     def note(self, column: str, reason: str, count: int = 0, kind: str = "noted") -> None:
