@@ -19,6 +19,8 @@ def test_errors_on_measured_logs_are_those_of_the_page():
     before, after = re.search(r"\*\*ZTBus\*\*: test RMSE (\S+) → (\S+) kW", REAL).groups()  # pyright: ignore
     assert f"RMSE {after} kW" in README
     assert f"{before} kW for the calibrated sheet" in README
+    pooled = next(x for x in REAL.splitlines() if x.startswith("| pooled |")).split("|")
+    assert f"{pooled[4].strip()} kW given the states of two loads that switch" in README
     each = [row(REAL, str(trip)) for trip in (1, 2, 3, 4)]
     mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
     assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} parameters" in README
