@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["Column", "Ids", "Segments", "trip_slices"]
+__all__ = ["Column", "Ids", "Segments", "starts_of_runs", "trip_slices"]
 
 Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
 Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
@@ -120,3 +120,12 @@ def trip_slices(trip: np.ndarray) -> Iterator[tuple[int, slice]]:
     edges = np.flatnonzero(np.diff(trip)) + 1
     for start, stop in zip(np.r_[0, edges], np.r_[edges, len(trip)], strict=True):
         yield int(trip[start]), slice(int(start), int(stop))
+
+
+def starts_of_runs(trip: np.ndarray, duration_s: np.ndarray, seconds: float) -> np.ndarray:
+    """First rows of runs of at least so many seconds inside a trip; every row's own where rows are as long."""
+    starts = []
+    for _, s in trip_slices(trip):
+        clock = np.floor(np.cumsum(duration_s[s]) / seconds - 1e-9)
+        starts.append(np.flatnonzero(np.r_[True, np.diff(clock) > 0]) + s.start)
+    return np.concatenate(starts)

@@ -117,7 +117,7 @@ _STEMS = {
     "energy": "energy",
     "battery_power": "power",
 }
-# units that people log a quantity in: what a column may have been in whose unit is told wrongly
+# units that people log a quantity in: what a column may have been in whose unit is wrong
 UNITS_IN_USE: dict[str, tuple[str, ...]] = {
     "speed_mps": ("m/s", "km/h", "mph", "knot"),
     "grade_rad": ("rad", "tan", "%", "permille", "deg"),

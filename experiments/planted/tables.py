@@ -134,7 +134,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
 
 
 def _unexplained_wanted(config: Config, done: Group) -> str:
-    """What is wanted besides of logs with a cause outside the library; empty where there are none."""
+    """The further targets of logs with a cause outside the library; empty where there are none."""
     wanted = [w for t, _ in done if (w := config.cases[t["case"]].wanted_unexplained) is not None]
     return f" and, with a cause outside the library, {max(wanted):g} of logs are called unexplained" if wanted else ""
 

@@ -117,7 +117,25 @@ class Settings:
     mode_side: int = _number(2, "least trips of either mode", "trips", "one is an outlier")
     mode_enough: float = _number(0.01, "p-value above which two values are enough for all trips", "1", "a test at 1 %")
 
+    # loads that switch
+    load_alike: float = _number(
+        0.5, "largest sd of a load's power over trips, and difference between standstill and motion, over it", "1",
+        "measured loads of buses have stages: 0.15 to 0.35",
+    )  # fmt: skip
+    load_s: float = _number(
+        60.0, "least time on, and off, in a trip, at standstill or in motion, for a power there", "s", "a minute"
+    )
+    load_switches: float = _number(
+        8.0, "least number of times that a load switches", "switches", "as for trips as clusters"
+    )
+    load_spread: float = _number(
+        2.0, "least sd of the gain of a load on noise", "log-likelihood", "sd of half a χ² of 8 free numbers"
+    )
+
     # what remains
+    drifts: float = _number(
+        0.2, "least correlation of the means of neighbouring minutes of a slow remainder", "1", "4 % of their variance"
+    )
     level: float = _number(
         1e-3, "p-value of unexplained structure; a tenth of it for change points and intercepts", "1",
         "four kinds of structure are tested",

@@ -85,12 +85,14 @@ def evaluate(text: str, where: str, column: Callable[[str], Quantity], to: str |
             )
         return q.values * q.unit
 
+    from pint.errors import PintError  # pint takes long to import, and most logs have no expression
+
     value = _value(_walk(_tree(text, where), leaf, text, where), text, where)
     if to is None:
         return np.asarray(value, dtype=np.float64)
     try:
         return np.asarray(value.to(to).magnitude, dtype=np.float64)
-    except Exception:  # pint's for other dimensions, Python's where no unit is left
+    except (PintError, AttributeError):  # another dimension, or a bare number
         found = f"{value.units:~P}" if hasattr(value, "units") else "a bare number"
         raise InputError(f"{where} = {text!r}: its unit is {found}, {to} is expected") from None
 
@@ -99,6 +101,8 @@ def _value(tree: Any, text: str, where: str) -> Any:
     if not isinstance(tree, tuple):
         return tree
     operation, *parts = tree
+    from pint.errors import PintError
+
     a = _value(parts[0], text, where)
     if operation in (ast.USub, ast.UAdd):
         return -a if operation is ast.USub else a
@@ -108,7 +112,7 @@ def _value(tree: Any, text: str, where: str) -> Any:
             return {ast.Add: lambda: a + b, ast.Sub: lambda: a - b, ast.Mult: lambda: a * b, ast.Div: lambda: a / b}[
                 operation
             ]()
-    except Exception:  # pint's, where the two measure different things; Python's ZeroDivisionError of two numbers
+    except (PintError, ArithmeticError, TypeError):  # they measure different things, or a number is divided by 0
         raise InputError(
             f"{where} = {text!r}: the two sides of '{_OPERATIONS[operation]}' do not go together"
         ) from None

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
 from hdev_jax.physics.parameter import Choice, Size
 
-__all__ = ["KNOTS_C", "SecondSwitchingLoad", "SwitchingLoad", "expected_share", "state_channel"]
+__all__ = ["KNOTS_C", "SWITCHING_LOADS", "SecondSwitchingLoad", "SwitchingLoad", "expected_share", "state_channel"]
 
 KNOTS_C = (0.0, 10.0, 20.0, 30.0)  # ambient temperatures at which the share of time on is given
 USUAL_C = 15.0  # where the log has no temperature; the shares are one number then
@@ -79,3 +79,6 @@ class SecondSwitchingLoad(SwitchingLoad):
 
     id: ClassVar[str] = "second_switching_load"
     label: ClassVar[str] = "second load that switches"
+
+
+SWITCHING_LOADS = (SwitchingLoad, SecondSwitchingLoad)  # in the order in which they are found

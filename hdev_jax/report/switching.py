@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.report import names
 from hdev_jax.report.canvas import GREY, INK, MEASURED, axis_label, figure, tidy
 from hdev_jax.report.data import ReportData, test_rows
 from hdev_jax.report.figures import WIDTH, short
-from hdev_jax.targets import TARGETS
+from hdev_jax.targets import as_watts
 
 __all__ = ["loads", "on_column", "switching_loads"]
 
 COLOURS = ("#009E73", "#CC79A7")  # of the loads; Okabe and Ito (2008)
-STANDSTILL_MPS = 0.1
 STRETCH_S = 1800.0
 
 
@@ -29,9 +29,8 @@ def loads(data: ReportData) -> list[dict[str, Any]]:
 
 def _power_kw(data: ReportData, name: str) -> np.ndarray:
     """A column of the target as a power [kW]."""
-    if TARGETS[data.summary["target"]].weight != "row":
-        return data.row(name)
-    return data.row(name) * 3.6 / np.maximum(data.row("duration_s"), 1e-9)
+    seconds = np.maximum(data.row("duration_s"), 1e-9)
+    return as_watts(data.summary["target"], data.row(name), seconds) / 1e3
 
 
 def switching_loads(data: ReportData) -> Any | None:

@@ -126,9 +126,9 @@ def _diagnosed(
     if suspected:
         suspect = {"verdict": "suspect_log", "suspicions": [s.to_dict() for s in suspected]}
         outcome.summary.update(suspect)
-        told = [s.line() for s in suspected]
-        outcome.summary["notes"] = [f"suspected: {line}" for line in told] + outcome.summary["notes"]
-        text = "\n".join(["The log is suspect; no effect was searched (--trust searches all the same):", *told])
+        said = [s.line() for s in suspected]
+        outcome.summary["notes"] = [f"suspected: {line}" for line in said] + outcome.summary["notes"]
+        text = "\n".join(["The log is suspect; no effect was searched (--trust searches all the same):", *said])
     sheet = _augmented(outcome, start.sheet)
     predictive, notes = predictive_of(start.problem, start.split, outcome.fit, "normal", sheet_digest(sheet))
     outcome.summary["notes"] += notes

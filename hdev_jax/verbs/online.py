@@ -8,14 +8,11 @@ from scipy import stats
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.states import Switching, decode, rows_of
-from hdev_jax.physics import SecondSwitchingLoad, SwitchingLoad
-from hdev_jax.physics.states import state_channel
+from hdev_jax.physics.states import SWITCHING_LOADS, state_channel
 from hdev_jax.problem import Problem
 from hdev_jax.targets import TARGETS, as_watts
 
 __all__ = ["one_step_ahead", "states_of"]
-
-LOADS = (SwitchingLoad.id, SecondSwitchingLoad.id)
 
 
 def states_of(ids: tuple[str, ...], model: Switching) -> dict[str, Any]:
@@ -35,7 +32,7 @@ def one_step_ahead(
     not measure the target, the sheet has no load that switches, or nothing is known of the errors.
     """
     car = problem.vehicle
-    ids = [i for i in LOADS if car.has(i)]
+    ids = [e.id for e in SWITCHING_LOADS if car.has(e.id)]
     if not ids:
         raise InputError("--online: the sheet has no load that switches; hdev diagnose finds them")
     if not measures:

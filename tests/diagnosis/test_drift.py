@@ -1,9 +1,10 @@
-"""What drifts is told by where it is large: everywhere, with the speed, with the power."""
+"""What drifts is named by where it is large: everywhere, with the speed, with the power."""
 
 import numpy as np
 import pytest
 
 from hdev_jax.diagnosis.remainder.drift import drift_of
+from hdev_jax.diagnosis.settings import SETTINGS
 
 TRIPS, SECONDS = 8, 3600
 
@@ -35,7 +36,7 @@ def test_it_is_called_what_it_is_with_its_size_and_memory(like, size):
     trip, speed, power, seconds, rng = drive(1)
     by = {"load": np.ones(len(trip)), "force": speed, "gain": power}[like]
     residual = size * by * wandering(rng, 300.0) + 1500.0 * rng.standard_normal(len(trip))
-    found = drift_of(residual, power, speed, seconds, trip)
+    found = drift_of(residual, power, speed, seconds, trip, SETTINGS)
     assert found.like == like
     assert 0.7 * size < found.sd < 1.4 * size
     assert 120.0 <= found.memory_s <= 720.0
@@ -45,10 +46,10 @@ def test_it_is_called_what_it_is_with_its_size_and_memory(like, size):
 @pytest.mark.parametrize("seed", range(5))
 def test_white_noise_does_not_drift(seed):
     trip, speed, power, seconds, rng = drive(seed)
-    found = drift_of(3000.0 * rng.standard_normal(len(trip)), power, speed, seconds, trip)
+    found = drift_of(3000.0 * rng.standard_normal(len(trip)), power, speed, seconds, trip, SETTINGS)
     assert (found.like, found.memory_s, found.words) == ("none", 0.0, "")
 
 
 def test_a_short_log_says_nothing():
-    found = drift_of(np.ones(50), np.ones(50), np.ones(50), np.ones(50), np.zeros(50, int))
+    found = drift_of(np.ones(50), np.ones(50), np.ones(50), np.ones(50), np.zeros(50, int), SETTINGS)
     assert found.memory_s == 0.0

@@ -24,8 +24,7 @@ from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.physics import Effect
 from hdev_jax.physics.loads import PeriodicLoad
-from hdev_jax.targets import TARGETS
-from hdev_jax.units import J_PER_WH
+from hdev_jax.targets import TARGETS, as_watts
 
 __all__ = ["add_cycle", "barred"]
 
@@ -135,7 +134,7 @@ def _rows(training: Training, residual: np.ndarray, left: np.ndarray) -> _Rows:
     levels = training.clusters.kind == "trip"
     noise = estimate_noise(left, training.trip, training.seconds, levels=levels)
     start = np.asarray(training.rows.segments.time_s)[: training.rows.rows]
-    worth = training.seconds / J_PER_WH if training.target == "energy_wh" else np.full(len(start), 1e-3)
+    worth = 1.0 / as_watts(training.target, np.ones(len(start)), training.seconds)
     clocked = Clocked(start + 0.5 * training.seconds, training.seconds, training.trip, worth, noise)
     return _Rows(**vars(clocked), white=clocked.whitened(residual[:, None])[:, 0])
 

@@ -15,12 +15,11 @@ __all__ = ["FIRST_ROUNDS", "Tested", "besides", "level_test"]
 
 COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
 FIRST_ROUNDS = 3  # of expectation-maximisation
-MOST_ROWS = 30_000  # that the test looks at
+MOST_ROWS = 30_000  # that the test looks at: time
 LEAST_ROWS = 100
 LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
-LEAST_SPREAD = 2.0  # of the surrogates' gains, in log-likelihood
-EARLY = 3  # surrogates, one of which does as well: no load
+EARLY = 3  # surrogates, after which one that gains as much ends the test: p is 0.25 at least, and the rest saves time
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
         if len(others) == EARLY and gain <= max(others):
             return Tested(model, gain, 1.0)
-    spread = max(float(np.std(others, ddof=1)), LEAST_SPREAD) * np.sqrt(1.0 + 1.0 / len(others))
+    spread = max(float(np.std(others, ddof=1)), training.settings.load_spread) * np.sqrt(1.0 + 1.0 / len(others))
     p = float(stats.t.sf((gain - np.mean(others)) / spread, len(others) - 1))
     return Tested(model, gain, p)
 

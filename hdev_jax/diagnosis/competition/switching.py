@@ -29,20 +29,14 @@ from hdev_jax.inference.states import (
     fit_switching,
     rows_of,
 )
-from hdev_jax.physics import SecondSwitchingLoad, SwitchingLoad, Vehicle
-from hdev_jax.physics.states import KNOTS_C, state_channel
+from hdev_jax.physics import SwitchingLoad, Vehicle
+from hdev_jax.physics.states import KNOTS_C, SWITCHING_LOADS, state_channel
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TARGETS, as_watts
 
-__all__ = ["LOADS", "add_switching", "decoded_again", "mistaken", "with_states"]
+__all__ = ["add_switching", "decoded_again", "mistaken", "with_states"]
 
-LOADS = (SwitchingLoad, SecondSwitchingLoad)
 ROUNDS = 6  # of expectation-maximisation, at the last
-LEAST_S = 60.0  # on, and off, for a power of its own (of a trip, at standstill)
-LEAST_SWITCHES = 8.0
-# of its power: sd over trips, and difference between standstill and motion. A bus's heater and compressor have stages:
-# 0.15 to 0.35 on the measured ones
-ALIKE = 0.5
 
 
 def with_states(training: Training, state: State) -> Training:
@@ -73,8 +67,10 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
     they may be what the loads are on average.
     """
     held = state.hidden.ids if state.hidden else ()
-    able = [e for e in LOADS if e.id in training.library and not state.fit.vehicle.has(e.id)]
-    if not able or any(state.fit.vehicle.has(e.id) and e.id not in held for e in LOADS):  # in the sheet: not decoded
+    able = [e for e in SWITCHING_LOADS if e.id in training.library and not state.fit.vehicle.has(e.id)]
+    if not able or any(
+        state.fit.vehicle.has(e.id) and e.id not in held for e in SWITCHING_LOADS
+    ):  # in the sheet: not decoded
         return None, None
     if (verdict := barred(training, state, able[0])) is not None:
         return None, verdict
@@ -95,7 +91,7 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         return no(Kind.NOT_SIGNIFICANT, f"no more levels than noise of this colour has (FDR-adjusted p = {q:.2g})", q)
     decoded = decode(model, rows)
     places = range(len(held), len(model.power_w))
-    why = {k: x for k in places if (x := _unlike(rows, model, decoded, k))}
+    why = {k: x for k in places if (x := _unlike(rows, model, decoded, k, settings))}
     kept = [*range(len(held)), *(k for k in places if k not in why)]
     if len(kept) == len(held):
         k = next(iter(why))
@@ -217,35 +213,37 @@ def _alone(rows: StateRows, model: Switching, decoded: Decoded, k: int) -> State
     return replace(rows, residual_w=rows.residual_w - decoded.on[:, others] @ model.power_w[others])
 
 
-def _power(rows: StateRows, on: np.ndarray) -> tuple[float, float] | None:
+def _power(rows: StateRows, on: np.ndarray, least_s: float) -> tuple[float, float] | None:
     """The power between the two levels of some rows [W] by medians, and its weight: the time [s] at the rarer level.
     None where that is too little."""
     seconds = [float(np.sum(rows.duration_s[x])) for x in (on > 0.9, on < 0.1)]
-    if min(seconds) < LEAST_S:
+    if min(seconds) < least_s:
         return None
     return float(np.median(rows.residual_w[on > 0.9]) - np.median(rows.residual_w[on < 0.1])), min(seconds)
 
 
-def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int) -> str | None:
+def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, settings: Settings) -> str | None:
     """Why a decoded load is not one consumer that is switched on and off, or None."""
     power, on, alone = float(model.power_w[k]), decoded.on[:, k], _alone(rows, model, decoded, k)
     size = next(p for p in SwitchingLoad.parameters if p.name == "power_w")
     if not size.least <= power <= size.upper:
         return "its power is out of range"
-    if np.sum(np.abs(np.diff(on))[np.diff(rows.trip) == 0]) < LEAST_SWITCHES:
-        return "it switches too seldom to be told from a change that stays"
-    each = [p for _, s in trip_slices(rows.trip) if (p := _power(alone.take(s), on[s])) is not None]
+    if np.sum(np.abs(np.diff(on))[np.diff(rows.trip) == 0]) < settings.load_switches:
+        return "it switches too seldom to be distinguished from a change that stays"
+    each = [p for _, s in trip_slices(rows.trip) if (p := _power(alone.take(s), on[s], settings.load_s)) is not None]
     if len(each) < min(2, len(np.unique(rows.trip))):
         return "it switches in one trip alone"
     by_trip, weight = np.array(each).T
     mean = float(np.average(by_trip, weights=weight))
-    if np.sqrt(np.average((by_trip - mean) ** 2, weights=weight)) > ALIKE * power:
+    if np.sqrt(np.average((by_trip - mean) ** 2, weights=weight)) > settings.load_alike * power:
         return "its power is not the same in every trip"
-    if np.sum(rows.duration_s[rows.standing == 1]) > 4.0 * LEAST_S:
-        standing, moving = (_power(alone.take(x), on[x]) for x in (rows.standing == 1, rows.standing == 0))
+    if np.sum(rows.duration_s[rows.standing == 1]) > 4.0 * settings.load_s:
+        standing, moving = (
+            _power(alone.take(x), on[x], settings.load_s) for x in (rows.standing == 1, rows.standing == 0)
+        )
         if standing is None or moving is None:
             return f"it does not switch {'at standstill' if standing is None else 'in motion'}"
-        if abs(standing[0] - moving[0]) > ALIKE * power:
+        if abs(standing[0] - moving[0]) > settings.load_alike * power:
             return f"it has {standing[0] / 1e3:.2g} kW at standstill and {moving[0] / 1e3:.2g} kW in motion"
     return None
 

@@ -14,7 +14,7 @@ from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.diagnosis.noise.spectrum import Clocked, strongest_period
 from hdev_jax.diagnosis.scores.scores import Scores, score_all
 from hdev_jax.diagnosis.training import Training
-from hdev_jax.targets import TARGETS
+from hdev_jax.targets import TARGETS, as_watts
 
 __all__ = ["add_unnamed"]
 
@@ -68,7 +68,7 @@ def _swing_w(training: Training, state: State) -> np.ndarray:
     nothing = np.zeros(len(seconds))
     if not target.of_battery:
         return nothing
-    worth = seconds / 3600.0 if target.weight == "row" else np.full(len(seconds), 1e-3)
+    worth = 1.0 / as_watts(target, np.ones(len(seconds)), seconds)
     noise = training.noise(state.fit)
     period = strongest_period(training.residual(state.fit), Clocked.of(training.trip, seconds, worth, noise))
     return nothing if period is None or period.p > training.settings.level else period.amplitudes

@@ -11,15 +11,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from hdev_jax.segments import trip_slices
+from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.segments import starts_of_runs
 
 __all__ = ["LIKE", "Drift", "drift_of"]
 
 MINUTE_S = 60.0
 LEAST_BLOCKS = 30
-LEAST_CORRELATION = 0.2
-LEVEL = 1e-3  # p-value of the correlation
-CLEARLY = 3.0  # in log-likelihood, that one form suits better than the next (Kass and Raftery 1995: strong)
 LIKE = ("load", "force", "gain", "none")
 LONGEST = 60  # minutes between two means, at most
 
@@ -52,13 +50,10 @@ def drift_of(
     speed_mps: Float[np.ndarray, " row"],
     duration_s: Float[np.ndarray, " row"],
     trip: Int[np.ndarray, " row"],
+    settings: Settings,
 ) -> Drift:
     """What is slow in a residual [W]. `like` is "none" with a memory of 0 where nothing is."""
-    starts = []
-    for _, s in trip_slices(trip):
-        clock = np.floor(np.cumsum(duration_s[s]) / MINUTE_S - 1e-9)
-        starts += [np.flatnonzero(np.r_[True, np.diff(clock) > 0]) + s.start]
-    at = np.concatenate(starts)
+    at = starts_of_runs(trip, duration_s, MINUTE_S)
     seconds = np.add.reduceat(duration_s, at)
     whole = seconds > 0.5 * MINUTE_S
     nothing = Drift("none", float("nan"), 0.0)
@@ -73,7 +68,7 @@ def drift_of(
     slow = slow - np.mean(slow)
     if not np.any(slow):
         return nothing
-    memory = _memory(slow, block_trip)
+    memory = _memory(slow, block_trip, settings)
     if memory <= 0:
         return nothing
     # the rows' own noise in a mean: what neighbouring means do not share
@@ -82,11 +77,11 @@ def drift_of(
     forms = {"load": np.ones(len(slow)), "force": mean(np.abs(speed_mps)), "gain": mean(np.abs(predicted_w))}
     found = {like: _fit(slow[whole], x[whole], own) for like, x in forms.items()}
     best, second = sorted(found, key=lambda k: -found[k][0])[:2]
-    like = best if found[best][0] - found[second][0] > CLEARLY else "none"
+    like = best if found[best][0] - found[second][0] > settings.ahead else "none"
     return Drift(like, found[best][1] if like != "none" else float("nan"), memory)
 
 
-def _memory(slow: np.ndarray, trip: np.ndarray) -> float:
+def _memory(slow: np.ndarray, trip: np.ndarray, settings: Settings) -> float:
     """Time after which the correlation of minutes has fallen to 1/e [s]; 0 where neighbours are not correlated."""
 
     def correlation(lag: int) -> tuple[float, int]:
@@ -94,7 +89,7 @@ def _memory(slow: np.ndarray, trip: np.ndarray) -> float:
         return float(np.sum((slow[lag:] * slow[:-lag])[pair]) / np.sum(slow**2)), int(pair.sum())
 
     first, n = correlation(1)
-    if n < LEAST_BLOCKS or first < LEAST_CORRELATION or stats.norm.sf(first * np.sqrt(n)) > LEVEL:
+    if n < LEAST_BLOCKS or first < settings.drifts or stats.norm.sf(first * np.sqrt(n)) > settings.level:
         return 0.0
     for lag in range(2, LONGEST + 1):
         if lag >= len(slow):

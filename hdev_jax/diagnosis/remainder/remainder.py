@@ -141,7 +141,7 @@ def remainder(
     grows = scales_with(train, settings) if parts else None
     if grows is not None:
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
-    drift = _drift(problem, problem.rows(split.train), given)
+    drift = _drift(problem, problem.rows(split.train), given, settings)
     if drift.words:
         parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
@@ -158,11 +158,11 @@ def remainder(
     )  # fmt: skip
 
 
-def _drift(problem: Problem, rows: np.ndarray, given: np.ndarray) -> Drift:
+def _drift(problem: Problem, rows: np.ndarray, given: np.ndarray, settings: Settings) -> Drift:
     """What is slow in the residual of some rows of a battery's target; nothing of another target."""
     if not TARGETS[problem.target].of_battery:
         return Drift("none", float("nan"), 0.0)
     s = problem.segments
     seconds = np.asarray(s.duration_s)[rows]
     residual, predicted = (as_watts(problem.target, x[rows], seconds) for x in (problem.measured - given, given))
-    return drift_of(residual, predicted, np.asarray(s.speed_mps)[rows], seconds, np.asarray(s.trip)[rows])
+    return drift_of(residual, predicted, np.asarray(s.speed_mps)[rows], seconds, np.asarray(s.trip)[rows], settings)

@@ -46,16 +46,16 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
         return None
     ids, seconds = state.hidden.ids, np.asarray(problem.segments.duration_s)
 
-    def told(on: np.ndarray) -> Segments:
+    def known(on: np.ndarray) -> Segments:
         return problem.segments.with_channels(**{state_channel(i): on[:, k] for k, i in enumerate(ids)})
 
-    off = told(np.zeros((len(seconds), len(ids))))
+    off = known(np.zeros((len(seconds), len(ids))))
     left = as_watts(problem.target, problem.measured - problem.predict(fit.vehicle, off), seconds)
     rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
     power = np.array([float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids])
     model, _ = fit_switching(state.hidden.model, rows.take(problem.rows(split.train)), 1)
     decoded = decode(model, rows)
-    where = told(decoded.on)
+    where = known(decoded.on)
     error = decoded.error_w / as_watts(problem.target, np.ones(len(seconds)), seconds)
     kwh: dict[str, dict[str, list[float]]] = {i: {} for i in ids}
     drawn = energy_draws(replace(model, power_w=power), rows, key=jax.random.key(seed), draws=DRAWS) / 1e3
@@ -71,7 +71,7 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
             for t, m, a, b in zip(trips, drawn[:, k].mean(axis=0), low, high, strict=True)
         }
     return Given(
-        where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, told(decoded.ahead)) + error, ids,
+        where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, known(decoded.ahead)) + error, ids,
         model, kwh,
     )  # fmt: skip
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.physics.states import USUAL_C
-from hdev_jax.segments import Segments, trip_slices
+from hdev_jax.segments import Segments, starts_of_runs
 
 __all__ = ["StateRows", "rows_of"]
 
-STANDSTILL_MPS = 0.1
 SAMPLES, MEANS = 0.1, 0.9  # chance that a row in which a load switches holds a share of its power
 
 
@@ -40,11 +40,7 @@ class StateRows:
 
     def coarse(self, seconds: float) -> "StateRows":
         """Means over runs of rows of at least so many seconds in a trip; the rows themselves where they are long."""
-        starts = []
-        for _, s in trip_slices(self.trip):
-            clock = np.floor(np.cumsum(self.duration_s[s]) / seconds - 1e-9)
-            starts += [np.flatnonzero(np.r_[True, np.diff(clock) > 0]) + s.start]
-        at = np.concatenate(starts)
+        at = starts_of_runs(self.trip, self.duration_s, seconds)
         total = np.add.reduceat(self.duration_s, at)
 
         def mean(x: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from hdev_jax.errors import InputError
 from hdev_jax.logs.log import Log
 from hdev_jax.units import UNITS_IN_USE, conversion
 
@@ -31,7 +32,7 @@ def alternatives(log: Log, name: str) -> dict[str, float]:
     """Other units that column `name` may have been in, and what its values would have to be multiplied by."""
     column = next((c for c in log.columns if c.name == name), None)
     units = UNITS_IN_USE.get(name, ())
-    told = (column.unit if column is not None else "") or units[0]
+    declared = (column.unit if column is not None else "") or units[0]
 
     def factor(unit: str) -> float:
         small = np.asarray(1e-3)  # of slopes, where the tangent is the angle
@@ -40,8 +41,8 @@ def alternatives(log: Log, name: str) -> dict[str, float]:
         )
 
     try:
-        own = factor(told)
-    except Exception:  # made from several columns, or by an expression: its unit is the one in memory
+        own = factor(declared)
+    except InputError:  # made from several columns, or by an expression: its unit is the one in memory
         own = factor(units[0])
     found = {unit: factor(unit) / own for unit in units}
     return {unit: k for unit, k in found.items() if abs(k - 1.0) > 1e-3}
@@ -53,8 +54,8 @@ def mended(log: Log, name: str, *, unit: str | None = None, sign: bool = False) 
     source = column.source if column is not None else name
     if " * " in source:  # voltage times current
         return f'in an adapter: [columns] {name} = {{ expr = "-voltage_v * current_a" }}, or turn the sign of current_a'
-    told = column.unit if column is not None else ""
+    declared = column.unit if column is not None else ""
     keys = [f'source = "{source}"']
     keys += ["affine = [0, -1]"] if sign else []
-    keys += [f'unit = "{unit or told}"'] if unit or told else []
+    keys += [f'unit = "{unit or declared}"'] if unit or declared else []
     return f"in an adapter: [columns] {name} = {{ {', '.join(keys)} }}"

@@ -47,7 +47,7 @@ def read_clock(raw: Raw, headers: tuple[str, ...], trip: np.ndarray, how: Clock,
     """Times `[row]` in seconds: numbers as they are, dates and times of day counted from the first.
 
     **Arguments:** `headers`, of one column, or of a date and a time; `trip`, codes by row, in which time runs forward;
-    `note(reason, count)` is told what was assumed. **Raises:** `InputError` naming row and column.
+    `note(reason, count)` gets what was assumed. **Raises:** `InputError` naming row and column.
     """
     series = _joined(raw, headers)
     where = " ".join(f"'{h}'" for h in headers)

@@ -15,7 +15,7 @@ _ONE = np.asarray(1.0)
 
 @dataclass(frozen=True)
 class Header:
-    """`Vehicle Speed[km/h]` is the name `Vehicle Speed` and the unit `km/h`; `unit` is None where none is told."""
+    """`Vehicle Speed[km/h]` is the name `Vehicle Speed` and the unit `km/h`; `unit` is None where there is none."""
 
     text: str
     name: str

@@ -20,7 +20,7 @@ def pivoted(raw: Raw, adapter: Adapter, measured: tuple[str, ...]) -> Raw:
     (without one, at those of the channel with the most values).
 
     Between its own values a channel that has a unit is linear, one without keeps its last value; over more than ten of
-    its own steps nothing is told. Of the channels `measured` each value stays alone, at the time nearest to it: what
+    its own steps no value is known. Of the channels `measured` each value stays alone, at the time nearest to it: what
     lies between two measurements is none. Raises `InputError` for a column that is not there, a channel of two units.
     """
     long = adapter.long

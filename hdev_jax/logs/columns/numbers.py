@@ -24,7 +24,7 @@ def numbers(raw: Raw, header: str, known: bool, note: Callable[[str, int], None]
     """The column as float64 `[row]`; None where it is text and the contract does not know it.
 
     **Arguments:** `known`, whether the contract knows the column, so that text in it is a fault; `note(reason, count)`
-    is told what was taken out of the numbers. **Raises:** `InputError` for stray text.
+    reports what was taken out of the numbers. **Raises:** `InputError` for stray text.
     """
     series = raw.table[header]
     if isinstance(series.dtype, pd.CategoricalDtype):

@@ -47,7 +47,7 @@ def stamps(
 
     **Arguments:** `where`, the column for messages; `form`, the adapter's strptime format; `note(reason, count)` is
     told what was assumed. **Raises:** `InputError` for the first text that is no time, or where day and month cannot be
-    told apart.
+    distinguished.
     """
     told = text[text.notna()]
     if form is not None:

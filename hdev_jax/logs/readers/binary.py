@@ -1,7 +1,9 @@
 """Tables that libraries read: Parquet, Feather, JSON lines, Excel."""
 
 import io
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -17,27 +19,27 @@ def read_binary(path: Path, data: bytes, kind: str) -> pd.DataFrame:
 
 
 def _parquet(path: Path, data: bytes) -> pd.DataFrame:
-    import pyarrow
     import pyarrow.parquet
 
-    try:
-        table = pyarrow.parquet.read_table(io.BytesIO(data))
-        check_header(path, list(table.column_names))
-        return table.to_pandas(ignore_metadata=True)
-    except (pyarrow.ArrowException, OSError, ValueError) as e:
-        raise InputError(f"{path}: truncated or damaged Parquet file ({str(e)[:120]})") from None
+    return _arrow(path, "Parquet", lambda: pyarrow.parquet.read_table(io.BytesIO(data)))
 
 
 def _feather(path: Path, data: bytes) -> pd.DataFrame:
-    import pyarrow
     import pyarrow.feather
 
+    return _arrow(path, "Feather", lambda: pyarrow.feather.read_table(io.BytesIO(data)))
+
+
+def _arrow(path: Path, kind: str, read: Callable[[], Any]) -> pd.DataFrame:
+    """The frame of a table of Arrow. Raises `InputError` where it is damaged or has a column twice."""
+    import pyarrow
+
     try:
-        table = pyarrow.feather.read_table(io.BytesIO(data))
+        table = read()
         check_header(path, list(table.column_names))
         return table.to_pandas(ignore_metadata=True)
     except (pyarrow.ArrowException, OSError, ValueError) as e:
-        raise InputError(f"{path}: truncated or damaged Feather file ({str(e)[:120]})") from None
+        raise InputError(f"{path}: truncated or damaged {kind} file ({str(e)[:120]})") from None
 
 
 def _json_lines(path: Path, data: bytes) -> pd.DataFrame:
