@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
-from hdev_jax.diagnosis.competition.compete import compete, named_alone, rows_with
+from hdev_jax.diagnosis.competition.compete import compete, named_alone, no_instrument_named, none_named, rows_with
 from hdev_jax.diagnosis.competition.refit import as_reported
 from hdev_jax.diagnosis.competition.state import State
+from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.remainder.remainder import Formula, Remainder, remainder
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
 from hdev_jax.diagnosis.result.hidden import Given, given_states
@@ -75,33 +76,25 @@ def diagnose(
 
     state = compete(training, problem.vehicle, problem.table, seed=seed, tell=tell, remember=remember)
 
-    # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing
+    # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing;
+    #    the declared one where the held-out trips do not bear them out
+    # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
+    #    points, random intercepts of trips. While most of it is no noise, no instrument is the cause
     tell("error before and after on the held-out test trips")
     training = rows_with(training, state)
-    named = named_alone(training, state)
-    steps = path(training, problem, named)
-    predicted = [problem.predict(fit.vehicle) for fit in steps]
 
-    # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
-    #    points, random intercepts of trips
-    given = given_states(problem, split, named, steps[-1], seed)
-    explained = predicted[-1] if given is None else given.predicted
-    described = _formula(problem, training, state, explained, given)
-    plain = checkpoint(
-        "remainder",
-        lambda: (
-            remainder(
-                problem, split, predicted[-1], predicted[0], described, settings, given=explained, seed=seed, tell=tell
-            ).__dict__
-        ),
-    )
-    left = Remainder(**plain)
-    if named.found and not left.significant:  # beside something unexplained, these weights would fit that
-        known = as_reported(training, named)
-        steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
-        test = problem.rows(split.test)
-        left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
-        given = given_states(problem, split, named, known, seed)
+    def handed_out(named: State, state: State | None, name: str) -> _Model:
+        return _handed_out(
+            problem, split, training, named, state, seed=seed, tell=tell, keep=lambda compute: checkpoint(name, compute)
+        )
+
+    model = handed_out(named_alone(training, state), state, "remainder")
+    if model.left.significant and model.left.share > settings.instrument_share:
+        physics = no_instrument_named(training, model.named, model.left.share)
+        if physics is not model.named:
+            tell("no instrument is named while most of what is left is no noise")
+            model = handed_out(physics, None, "remainder-2")
+    named, steps, predicted, given, left = model
 
     # 5. Sizes with their intervals, classes, and the drives that separate the members of a class
     leeway = {f.id: left_open(training, named, f.score, steps[-1]) for f in named.found}
@@ -119,6 +112,49 @@ def diagnose(
         problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found,
         given,
     )  # fmt: skip
+
+
+class _Model(NamedTuple):
+    """A model that may be handed out: the effects it names, the fits on the way there with their predictions, the
+    decoded states, what remains."""
+
+    named: State
+    steps: list[Calibration]
+    predicted: list[np.ndarray]
+    given: Given | None
+    left: Remainder
+
+
+def _handed_out(
+    problem: Problem, split: Split, training: Training, named: State, state: State | None, *, seed: int, tell: Tell,
+    keep: Callable[[Callable[[], Any]], Any],
+) -> _Model:  # fmt: skip
+    """The model with the named effects, or the declared one where the held-out trips do not bear them out. `state`
+    holds the term without a name, where it is still to be described."""
+    settings = training.settings
+    steps = path(training, problem, named)
+    predicted = [problem.predict(fit.vehicle) for fit in steps]
+    if named.found and held_out_gain(problem, split, predicted[0], predicted[-1]) <= 0.0:
+        tell("the held-out trips do not bear it out: nothing is named")
+        named, steps, predicted = none_named(named, steps[0]), steps[:1], predicted[:1]
+    given = given_states(problem, split, named, steps[-1], seed)
+    explained = predicted[-1] if given is None else given.predicted
+    described = _formula(problem, training, state, explained, given) if state is not None else None
+    plain = keep(
+        lambda: (
+            remainder(
+                problem, split, predicted[-1], predicted[0], described, settings, given=explained, seed=seed, tell=tell
+            ).__dict__
+        )
+    )
+    left = Remainder(**plain)
+    if named.found and not left.significant:  # beside something unexplained, these weights would fit that
+        known = as_reported(training, named)
+        steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
+        test = problem.rows(split.test)
+        left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
+        given = given_states(problem, split, named, known, seed)
+    return _Model(named, steps, predicted, given, left)
 
 
 def training_of(

@@ -86,6 +86,10 @@ class Settings:
         "relative efficiency 4",
     )
 
+    moved: float = _number(
+        3.0, "|prior_z| beyond which no effect may drive a declared coefficient", "sd", "0.3 %, two-sided"
+    )
+
     # is X still needed beside Y
     keep: float = _number(0.05, "p-value up to which an effect stays beside those added later", "1", "Wald test, 5 %")
     class_share: float = _number(
@@ -94,6 +98,10 @@ class Settings:
     class_p: float = _number(
         0.05, "p-value above which an effect is not needed beside another of its class", "1", "Wald test, 5 %"
     )
+    inexact: float = _number(
+        0.2, "share by which the form of an effect may differ from the vehicle's: less tells no two effects apart", "1",
+        "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
+    )  # fmt: skip
     most_in_class: int = _number(2, "members of a class that are listed at most", "effects", "contract §4")
     wider_p: float = _number(
         1e-3, "p-value below which a size joins an effect that was found without it", "1", "as strict as `level`"
@@ -147,6 +155,11 @@ class Settings:
     least_levels: float = _number(
         0.1, "least share of the variance that random intercepts of trips explain", "1", "chosen on seeds 1-99"
     )
+
+    instrument_share: float = _number(
+        0.5, "share of the test variance left unexplained above which no instrument is named", "1",
+        "more structure than noise: the model's form is wrong",
+    )  # fmt: skip
 
     # notes
     far: float = _number(2.0, "|prior_z| above which a coefficient is flagged", "sd", "5 %, two-sided")

@@ -26,7 +26,7 @@ from hdev_jax.physics.loads import (
     PeriodicLoad,
     StandstillLoad,
 )
-from hdev_jax.physics.losses import CopperLoss, DrivelineDrag, GearEfficiency, InverterLoss, IronLoss
+from hdev_jax.physics.losses import CopperLoss, DrivelineDrag, GearEfficiency, InverterLoss, IronLoss, PartLoad
 from hdev_jax.physics.machine import Machine
 from hdev_jax.physics.parameter import GROUPS, Choice, Parameter, Shape, Size, Switch
 from hdev_jax.physics.road import (
@@ -108,6 +108,7 @@ __all__ = [
     "MassScale",
     "ModeChange",
     "Parameter",
+    "PartLoad",
     "PassengerHeat",
     "PeriodicLoad",
     "Point",

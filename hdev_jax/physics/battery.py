@@ -104,15 +104,17 @@ class EfficiencyScale(Effect):
 class RegenEfficiency(Effect):
     """Of the braking energy another share is recovered than the sheet says: s·max(−P, 0) is lost.
 
-    With a regenerating efficiency that is estimated it is that one under another name.
+    With a regenerating efficiency that is estimated it is that one under another name. A machine brakes hardly better
+    than it drives.
     """
 
     id: ClassVar[str] = "regen_efficiency"
     label: ClassVar[str] = "efficiency of regeneration"
     stage: ClassVar[Stage] = "battery"
+    of_efficiency: ClassVar[bool] = True
     equation: ClassVar[str] = "s·max(−P, 0)"
     source: ClassVar[str] = "paper 2, eq. 7-9 (η_rg)"
-    parameters: ClassVar[Parameters] = (Size("share", "1", 0.0, 0.1, -0.3, 1.0, least=0.005),)
+    parameters: ClassVar[Parameters] = (Size("share", "1", 0.0, 0.1, -0.05, 1.0, least=0.005),)
     mistaken_for: ClassVar[Names] = ("friction_blending", "mass_scale", "power_gain", "mode_change")
     separated_by: ClassVar[str] = "coasting and braking on the flat, and the balance of charge"
     order: ClassVar[int] = 25

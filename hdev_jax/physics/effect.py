@@ -157,6 +157,8 @@ class Effect(eqx.Module):
     order: ClassVar[int] = 0  # limits come after what they limit
     of_battery: ClassVar[bool] = False  # says nothing of a force or a torque
     goes_with: ClassVar[GoesWith] = ""
+    of_efficiency: ClassVar[bool] = False  # every drive has it, where a sheet declares one efficiency for all of it
+    instrument: ClassVar[bool] = False  # a fault of a reading: said only where no cause in the vehicle does as well
     declared: ClassVar[Mapping[str, str]] = {}  # fields of a declared term with their keys in a sheet
     searched: ClassVar[str] = ""  # where it is looked for, if its columns are not known before it is found
 

@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
-from hdev_jax.physics.parameter import Size
+from hdev_jax.physics.parameter import Shape, Size
 
-__all__ = ["CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "IronLoss"]
+__all__ = ["CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "IronLoss", "PartLoad"]
 
 
 class DrivelineDrag(Effect):
@@ -120,3 +120,37 @@ class InverterLoss(Effect):
 
     def power(self, row: Row, car: Car, point: Point) -> Real:
         return self.standby_w + self.per_nm_w * jnp.abs(point.torque_nm)
+
+
+class PartLoad(Effect):
+    """Efficiency that falls at low load, and at high load: P₀·|P|/(P_h + |P|) + c·P², P what comes from the drive.
+
+    A part that is in proportion to |P| is the declared efficiency (`efficiency_scale`). The first term is the rest of
+    what a working drive loses at any load: half of P₀ at P_h, and none of it where the drive does nothing, which tells
+    it from a load at standstill.
+    """
+
+    id: ClassVar[str] = "part_load"
+    label: ClassVar[str] = "efficiency that depends on the load"
+    stage: ClassVar[Stage] = "machine"
+    of_efficiency: ClassVar[bool] = True
+    equation: ClassVar[str] = "P₀·|P|/(P_h + |P|) + c·P²"
+    source: ClassVar[str] = "Larminie and Lowry, Electric Vehicle Technology Explained, eq. 7.23 (constant, copper)"
+    parameters: ClassVar[Parameters] = (
+        # a drive of 100 kW that has 94 % at its best and 75 % at a twentieth of its power loses 1.4 kW more than 6 %
+        Size("standby_w", "W", 0.0, 500.0, 0.0, 1.5e4, least=20.0, label="loss at any load"),
+        # 5 % of 50 kW, of a small machine at its rated power, are 1e-6 per watt; of a truck's 300 kW a sixth of that
+        Size("per_w", "1/W", 0.0, 1e-7, 0.0, 5e-6, least=5e-9, label="loss per power squared"),
+        Shape("half_w", "W", 3e3, 2e3, 300.0, 1e5, grid=(1e3, 3e3, 1e4, 3e4), of="standby_w", label="load of half"),
+    )
+    variants: ClassVar[tuple[Names, ...]] = (("standby_w",), ("per_w",), ("standby_w", "per_w"))
+    mistaken_for: ClassVar[Names] = ("power_gain", "copper_loss", "battery_resistance", "regen_efficiency")
+    separated_by: ClassVar[str] = "constant speeds, from slow to fast"
+    order: ClassVar[int] = 10  # of the machine's losses the last: it takes what they leave
+    standby_w: Any
+    per_w: Any
+    half_w: Any
+
+    def power(self, row: Row, car: Car, point: Point) -> Real:
+        load = jnp.abs(point.power_w)
+        return self.standby_w * load / (self.half_w + load) + self.per_w * load**2

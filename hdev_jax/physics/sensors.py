@@ -48,6 +48,7 @@ class GradeBias(Effect):
     id: ClassVar[str] = "grade_bias"
     label: ClassVar[str] = "slope bias"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "θ → θ + b"
     source: ClassVar[str] = "mounting of an inclinometer"
     needs: ClassVar[Names] = ("grade_rad",)
@@ -67,6 +68,7 @@ class GradeScale(Effect):
     id: ClassVar[str] = "grade_scale"
     label: ClassVar[str] = "scale of the slope"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "θ → θ·(1 + s)"
     source: ClassVar[str] = "differences of smoothed heights"
     needs: ClassVar[Names] = ("grade_rad",)
@@ -88,6 +90,7 @@ class GradeLag(Effect):
     id: ClassVar[str] = "grade_lag"
     label: ClassVar[str] = "lag of the slope"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "θ(t) → θ(t + L)"
     source: ClassVar[str] = "lag of a barometric altimeter"
     needs: ClassVar[Names] = ("grade_rad",)
@@ -110,6 +113,7 @@ class SpeedScale(Effect):
     id: ClassVar[str] = "speed_scale"
     label: ClassVar[str] = "scale of the speed signal"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "v → v·(1 + s), d → d·(1 + s)"
     source: ClassVar[str] = "wear and pressure of tyres"
     entries: ClassVar[Names] = ("road",)
@@ -133,6 +137,7 @@ class AccelerometerBias(Effect):
     id: ClassVar[str] = "accelerometer_bias"
     label: ClassVar[str] = "bias of the accelerometer"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "a_sensor → a_sensor − b"
     source: ClassVar[str] = "mounting tilt"
     needs: ClassVar[Names] = ("accel_mps2",)
@@ -153,6 +158,7 @@ class TorqueOffset(Effect):
     id: ClassVar[str] = "torque_offset"
     label: ClassVar[str] = "offset or gain of the torque signal"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "τ → τ·(1 + g) + τ₀"
     source: ClassVar[str] = "torque estimated from currents"
     needs: ClassVar[Names] = ("motor_torque_nm",)
@@ -177,6 +183,7 @@ class PowerGain(Effect):
     id: ClassVar[str] = "power_gain"
     label: ClassVar[str] = "offset or gain of the power signal"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "P → P·(1 + g) + P₀"
     source: ClassVar[str] = "current sensor"
     of_battery: ClassVar[bool] = True
@@ -202,6 +209,7 @@ class TimeSkew(Effect):
     id: ClassVar[str] = "time_skew"
     label: ClassVar[str] = "time skew between channels"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "P(t) → P(t − s)"
     source: ClassVar[str] = "messages of several control units on one bus"
     parameters: ClassVar[Parameters] = (
@@ -227,6 +235,7 @@ class SamplingFilter(Effect):
     id: ClassVar[str] = "sampling_filter"
     label: ClassVar[str] = "filter of the measured signal"
     stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "P → P + Σ cⱼ·(P₋ⱼ − 2P + P₊ⱼ), or τ·dP/dt + P"
     source: ClassVar[str] = "Proakis and Manolakis, Digital Signal Processing (symmetric FIR; first-order lag)"
     parameters: ClassVar[Parameters] = (

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hdev_jax.physics.driveline import Driveline
+from hdev_jax.physics.driveline import Driveline, EfficiencyMap
 from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.physics.parameter import as_array
@@ -123,6 +123,13 @@ class Vehicle(eqx.Module):
         if self.nominal_voltage_v is None:
             raise ValueError("the log has no voltage_v and the vehicle no nominal_voltage_v; one of them is expected")
         return self.nominal_voltage_v
+
+    @property
+    def one_efficiency(self) -> bool:
+        """Whether one number stands for all losses from the wheel to the battery, driving and braking."""
+        line = self.driveline
+        whole = self.entry == "road" and line.covers_machine and line.regenerating_efficiency is None
+        return whole and not isinstance(line.efficiency, EfficiencyMap)
 
     @property
     def stands_in(self) -> tuple[str, ...]:

@@ -112,7 +112,7 @@ def test_an_effect_without_a_column_has_none(log):
 
 NUMBERS = {
     "reason": "needs the channel gap_m", "by": "road.c_rr", "least": 3, "there": 2, "q": 0.21, "how": "its column",
-    "percent": 12.4, "beside": "headwind", "share": 0.25,
+    "percent": 12.4, "name": "road.c_rr", "z": 3.2, "beside": "headwind", "share": 0.25,
 }  # fmt: skip
 
 

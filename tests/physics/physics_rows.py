@@ -58,6 +58,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "friction_blending": {"share": 0.3},
     "hvac_power": {"below_w_per_k": 150.0, "above_w_per_k": 110.0, "heat_c": 15.3, "cool_c": 21.7},
     "mode_change": {"power_w": 700.0, "c_rr": 8e-4, "loss": 0.03, "regeneration": 0.15, "share": 0.4, "in_mode": 1.0},
+    "part_load": {"standby_w": 900.0, "per_w": 4e-7, "half_w": 5e3},
     "passenger_heat": {"w_per_passenger": 45.0},
     "periodic_load": {"power_w": 4000.0, "period_s": 11.0, "duty": 0.4, "phase": 0.1},
     "regen_cutoff": {"speed_mps": 4.6},

@@ -130,6 +130,8 @@ def battery_power_w(r: dict, car: dict, effects: dict) -> float:
         power += p["w_per_nm2"] * torque**2
     if p := effects.get("iron_loss"):
         power += p["w_per_radps"] * abs(omega) + p["w_per_radps2"] * omega**2
+    if p := effects.get("part_load"):
+        power += p["standby_w"] * abs(power) / (p["half_w"] + abs(power)) + p["per_w"] * power**2
     if p := effects.get("efficiency_scale"):
         power += p["scale"] * abs(power)
     power += car["auxiliary_w"]

@@ -34,6 +34,7 @@ REFERENCED = (
     "driveline_drag", "gear_efficiency",
     "copper_loss", "iron_loss", "auxiliary_power", "hvac_power", "passenger_heat", "cabin_warmup", "friction_blending",
     "battery_resistance", "regen_limit", "rolling_linear", "grade_scale", "efficiency_scale", "regen_efficiency",
+    "part_load",
 )  # fmt: skip
 SEEDS = st.integers(0, 10_000)
 evaluate = eqx.filter_jit(lambda car, log: car.energy(log))

@@ -69,6 +69,16 @@ class Candidate:
         sizes, groups, columns = (tuple(x[k] for k in at) for x in (self.sizes, self.groups, self.columns))
         return replace(self, sizes=sizes, groups=groups, columns=columns)
 
+    def narrower(self, kept: Sequence[bool] | np.ndarray) -> "Candidate | None":
+        """The variant of the effect that has these of its sizes, with the shapes that act on them; None where there is
+        none."""
+        at = np.flatnonzero(np.asarray(kept))
+        sizes, groups, columns = (tuple(x[k] for k in at) for x in (self.sizes, self.groups, self.columns))
+        if len(at) == len(self.sizes) or sizes not in self.effect.variants:
+            return None
+        shapes = tuple((n, v) for n, v in self.shapes if _matters(self.parameter(n), sizes))
+        return replace(self, sizes=sizes, groups=groups, columns=columns, shapes=shapes)
+
     @property
     def by_trip(self) -> dict[str, dict[int, float]]:
         """Shapes that were estimated for each trip, `phase[3]` among `shapes`: by name, then by the trip's id."""

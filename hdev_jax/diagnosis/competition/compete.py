@@ -1,6 +1,6 @@
 """The competition: candidates are added, taken out and exchanged, one at a time, until none of these does better."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,16 +13,17 @@ from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.mode import add_mode
 from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import widened, without
-from hdev_jax.diagnosis.competition.state import State, Verdict
+from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.competition.switching import add_switching, decoded_again, mistaken, with_states
 from hdev_jax.diagnosis.competition.unnamed_step import add_unnamed
 from hdev_jax.diagnosis.competition.verdicts import verdicts_of
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.training import Training
-from hdev_jax.inference import ParameterTable
+from hdev_jax.inference import Calibration, ParameterTable
 from hdev_jax.physics import Vehicle
 
-__all__ = ["compete", "named_alone", "rows_with"]
+__all__ = ["compete", "named_alone", "no_instrument_named", "none_named", "rows_with"]
 
 Tell = Callable[[str], None]
 
@@ -116,5 +117,32 @@ def named_alone(training: Training, state: State) -> State:
     alone = without(training, state, *(t.id for t in state.terms))
     kept = decoded_again(training, backward(training, alone, newest=True))
     lost = [f for f in alone.found if f.id not in kept.ids]
-    verdicts = tuple(Verdict(f.id, f.gain, f.q_value, kept.removed[f.id]) for f in lost)
+    verdicts = tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
     return replace(kept, verdicts=(*verdicts, *state.verdicts))
+
+
+def none_named(state: State, declared: Calibration) -> State:
+    """The declared model again: what was found does not predict the held-out trips better."""
+    why = Rejection(Kind.NOT_HELD_OUT)
+    return State(declared, verdicts=(*_verdicts(state.found, why), *state.verdicts), absorbs=state.absorbs)
+
+
+def no_instrument_named(training: Training, state: State, share: float) -> State:
+    """The state without instruments' faults, and without what is not needed any more; itself where it has none.
+
+    `share`: of the variance that is left, what the log's channels predict: then the model's form is wrong, and an
+    instrument not the likely cause.
+    """
+    blamed = [f for f in state.found if f.score.candidate.effect.instrument]
+    if not blamed:
+        return state
+    less = without(training, state, *(f.id for f in blamed))
+    kept = decoded_again(training, backward(training, less, newest=True))
+    lost = [f for f in less.found if f.id not in kept.ids]
+    verdicts = _verdicts(blamed, Rejection(Kind.INSTRUMENT, {"percent": 100.0 * share}))
+    verdicts += tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
+    return replace(kept, verdicts=(*verdicts, *state.verdicts))
+
+
+def _verdicts(found: Sequence[Found], why: Rejection) -> tuple[Verdict, ...]:
+    return tuple(Verdict(f.id, f.gain, f.q_value, why) for f in found)

@@ -72,20 +72,37 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
 
 
 def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:
-    """The leader, or the simplest member of its class: physics before an instrument's fault, fewer coefficients before
-    more; and the ids of the class."""
+    """The leader, or the simplest of those that these rows cannot distinguish from it; and the ids of the class.
 
-    def asks(s: Score) -> tuple[bool, int]:
-        return s.candidate.effect.stage == "sensors", s.candidate.freedoms
+    Where it is an instrument's fault, a cause in the vehicle or its mass that does about as well takes its place; where
+    it is the mass, the efficiency, if one number is declared for all of it.
+    """
+    one = round_.state.fit.vehicle.one_efficiency
 
-    members = {able[0].candidate.id, *of_class(round_.asked(able[0]))}
-    return min((s for s in able if s.candidate.id in members), key=asks), members
+    def asks(s: Score) -> tuple[int, int]:
+        effect = s.candidate.effect
+        return effect.instrument + (effect.stage == "sensors"), s.candidate.freedoms
+
+    def prior(s: Score) -> tuple[bool, bool, float]:
+        effect = s.candidate.effect
+        return effect.instrument, not (one and effect.of_efficiency), -round_.scores.worth(s)
+
+    same = {able[0].candidate.id, *of_class(round_.asked(able[0]), inexact=0.0)}
+    first = min((s for s in able if s.candidate.id in same), key=asks)
+    if first.candidate.effect.stage != "sensors":
+        return first, same
+    members = of_class(round_.asked(first))
+    instead = [s for s in able if s.candidate.id in members]
+    if not first.candidate.effect.instrument:
+        instead = [s for s in instead if one and s.candidate.effect.of_efficiency]
+    return min((first, *instead), key=prior), same | {*members}
 
 
 def _refitted(round_: Round, s: Score) -> Refit | None:
     """A candidate's joint refit, None where it fails.
 
-    Without a group (a gear) whose size the refit puts beyond 0 it is another candidate, which passes every gate again.
+    Without a group (a gear) or a size that the refit puts out of range it is another candidate, which passes every gate
+    again.
     """
     again = round_.scores.again(s)
     round_.tell(f"refitting with {s.candidate.id}")
@@ -95,10 +112,11 @@ def _refitted(round_: Round, s: Score) -> Refit | None:
         round_.scores.replaced(s)
         if not round_.passes(s):
             break
-        round_.tell(f"refitting {s.candidate.id} with {len(s.candidate.groups)} groups")
+        round_.tell(f"refitting {s.candidate.id} with {len(s.candidate.sizes)} of its sizes")
         came = refit(round_.training, round_.state, s, round_.scores)
     if came.fit is None:
-        round_.turned_down(s.candidate.id, Rejection(Kind.REFIT))
+        why = Rejection(Kind.FAR, dict(zip(("name", "z"), came.far, strict=True))) if came.far else None
+        round_.turned_down(s.candidate.id, why or Rejection(Kind.REFIT))
         return None
     return came
 

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
-from hdev_jax.diagnosis.competition.refit import without
+from hdev_jax.diagnosis.competition.refit import in_range, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import alike
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of
-from hdev_jax.diagnosis.scores.scores import Scores, worth
+from hdev_jax.diagnosis.scores.scores import Scores, best_ways
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
 from hdev_jax.physics import unavailable
@@ -41,17 +42,6 @@ class Without:
     def rivals(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         """Other candidates at their places in this evidence."""
         return [replace(c, columns=tuple(k + self.shift for k in c.columns)) for c in candidates]
-
-    def best_ways(self, candidates: Sequence[Candidate], scores: Scores) -> list[Candidate]:
-        """Of each effect the way that gains most in this model: beside the effect another one may have looked best."""
-        ways = self.rivals(candidates)
-        gains = self.evidence.gains(self.evidence.totals(), [c.columns for c in ways])
-        best: dict[str, tuple[float, Candidate]] = {}
-        for c, gain in zip(ways, gains, strict=True):
-            value = worth(float(gain), c, scores.settings)
-            if np.isfinite(value) and (c.id not in best or value > best[c.id][0]):
-                best[c.id] = (value, c)
-        return [c for _, c in best.values()]
 
 
 def model_without(evidence: Evidence, fit: Calibration, *out: Found) -> Without:
@@ -99,15 +89,16 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
     (the two may be parts of one cause) or is a constant load. The same holds for a constant load beside a cycle.
     """
     settings = training.settings
-    while asked := [f for f in (state.found if newest or state.terms else state.found[:-1]) if _has_columns(f)]:
+    while asked := [f for f in state.found if _has_columns(f)]:
         evidence = evidence_of(training.baseline(state.fit))
-        worst: tuple[float, Found] | None = None
+        worst: tuple[tuple[float, bool], Found] | None = None
         for f in asked:
-            p = needed(evidence, state.fit, f).p
+            p = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
             strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
             allowed = settings.fdr / _tried(training, state) if strictly else settings.keep
-            if p > allowed and (worst is None or p / allowed > worst[0]):
-                worst = (p / allowed, f)
+            rank = (p / allowed, f.score.candidate.effect.stage == "sensors")
+            if p > allowed and (worst is None or rank >= worst[0]):
+                worst = (rank, f)
         if worst is None:
             break
         drop = worst[1].id
@@ -117,6 +108,36 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
         why = Rejection(Kind.SUPERFLUOUS, {"beside": beside, "times": times})
         state = replace(state, removed={**state.removed, drop: why})
     return state
+
+
+def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
+    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is in their span, or is
+    one of a class with one of them. The newest (not `old`) has been tested already but for the last."""
+    if any(_doubles(evidence, state, f, g, settings) for g in state.found if g is not f):
+        return 1.0
+    if not old:
+        return 0.0
+    own = needed(evidence, state.fit, f)
+    return own.p if own.left > settings.absorbed and in_range(state.fit, f.score.candidate) else 1.0
+
+
+def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Settings) -> bool:
+    """Whether two found effects are one class, of which `f` is the one to go: in the place of g it explains about as
+    much, and beside g no more than g's form may be inexact."""
+    if not (can_be_asked(f) and can_be_asked(g)) or f.score.plain or g.score.plain:
+        return False
+    w = model_without(evidence, state.fit, f, g)
+    totals = w.evidence.totals()
+    before = w.evidence.base_likelihood(totals)
+    own, other = w.each
+    alone, beside, both = (
+        w.evidence.gain(totals, k, before)[0] for k in (own.columns, other.columns, (*own.columns, *other.columns))
+    )
+    later = (f.score.candidate.effect.stage == "sensors", -alone) >= (
+        g.score.candidate.effect.stage == "sensors",
+        -beside,
+    )
+    return later and alone > settings.class_share * beside and both - beside < settings.inexact**2 * beside
 
 
 def _tried(training: Training, state: State) -> int:
@@ -154,6 +175,13 @@ def classes(scores: Scores, state: State) -> tuple[Found, ...]:
             continue
         w = model_without(scores.plain if f.score.plain else scores.white, scores.baseline.fit, f)
         own = (w.evidence.plain_score if f.score.plain else w.evidence.score)(w.own)
-        rivals = w.best_ways([c for c in scores.source.candidates if c.id in scores.best], scores)
-        out.append(replace(f, alike=alike(w.evidence, w.own, rivals, own.gain, scores, plain=f.score.plain)))
+        # beside the effect another way of a rival may have looked best
+        ways = w.rivals([c for c in scores.source.candidates if c.id in scores.best])
+        simple = [c for c in ways if c.freedoms <= w.own.freedoms]
+        rivals = [c for some in (ways, simple) for c in best_ways(w.evidence, some, scores.settings)]
+        share = scores.settings.inexact
+        members = alike(
+            w.evidence, w.own, list(dict.fromkeys(rivals)), own.gain, scores, plain=f.score.plain, inexact=share
+        )
+        out.append(replace(f, alike=members))
     return tuple(out)

@@ -21,19 +21,21 @@ from hdev_jax.inference import Calibration, ParameterTable, effect_coefficients,
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Choice, Effect, Switch, Vehicle
 
-__all__ = ["Refit", "as_reported", "fitted", "gained", "joined", "refit", "widened", "without"]
+__all__ = ["Refit", "as_reported", "fitted", "gained", "in_range", "joined", "refit", "widened", "without"]
 
 
 @dataclass(frozen=True)
 class Refit:
     """A joint refit: the `fit` (None where the candidate is out of range or not significant in it), its gain in
-    log-likelihood, the score at the shapes that it started from; `fewer`, the candidate without the group (a gear)
-    whose size ends beyond its null, where that is the reason."""
+    log-likelihood, the score at the shapes that it started from. Where that is the reason: `fewer`, the candidate
+    without the group (a gear) or the size that ends out of range; `far`, the declared coefficient that it drives away
+    from its table, with how far in prior sd."""
 
     fit: Calibration | None
     gain: float
     score: Score
     fewer: Candidate | None = None
+    far: tuple[str, float] | None = None
 
 
 def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
@@ -62,15 +64,21 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
     start = refined(training, s, scores)[0] if shaped or least_squares else s
     noise = scores.baseline.noise
     ways = [noise] * better + [None] * least_squares + [noise] * (generalise and not better)
-    fewer = None
+    fewer = far = None
     for way in ways:
         fit = _with(training, state, start, way)
-        if fit is not None and _stands(fit, c, settings) and _all_in_range(fit, state, settings):
+        good = fit is not None and _stands(fit, c, settings) and _all_in_range(fit, state, settings)
+        far = _far(fit, state.fit, settings) if good and fit is not None else None
+        if good and fit is not None and far is None:
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
             return Refit(fit, gained(training, fit, scores), started)
         if fit is not None and fewer is None and c.kind == "size":
-            fewer = without_idle(c, _sizes(fit, c))
-    return replace(failed, fewer=fewer)
+            beta = _sizes(fit, c)
+            inner = [
+                bool(p.lower <= p.null + b <= p.upper) for p, b in zip(map(c.parameter, c.sizes), beta, strict=True)
+            ]
+            fewer = without_idle(c, beta) or c.narrower(inner)
+    return replace(failed, fewer=fewer, far=far)
 
 
 def joined(training: Training, state: State, s: Score, noise: Noise | None = None) -> Calibration | None:
@@ -78,8 +86,9 @@ def joined(training: Training, state: State, s: Score, noise: Noise | None = Non
     are those of generalised least squares, and its shapes with them unless these rows do not settle them."""
     fit = _with(training, state, s, noise)
     settings = training.settings
-    good = fit is not None and _stands(fit, s.candidate, settings) and _all_in_range(fit, state, settings)
-    return fit if good else None
+    if fit is None or not _stands(fit, s.candidate, settings) or not _all_in_range(fit, state, settings):
+        return None
+    return None if _far(fit, state.fit, settings) else fit
 
 
 def _with(training: Training, state: State, s: Score, noise: Noise | None) -> Calibration | None:
@@ -217,7 +226,7 @@ def widened(training: Training, state: State) -> State | None:
                 continue
             fit = fitted(training, state.fit, vehicle, table)
             p = 2 * stats.t.sf(np.abs(fit.values[at] / fit.sd[at]), max(training.clusters.count - 1, 1))
-            if fit.converged and _in_range(fit, wider) and np.all(p < training.settings.wider_p):
+            if fit.converged and in_range(fit, wider) and np.all(p < training.settings.wider_p):
                 by_path = {r.path: float(v) for r, v in zip(fit.table.free, fit.values, strict=True)}
                 beta = np.array([by_path[f"effects.{f.id}.{n}"] for n in sizes])
                 score = replace(f.score, candidate=wider, beta=beta)
@@ -264,7 +273,7 @@ def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) 
 
 def _stands(fit: Calibration, candidate: Candidate, settings: Settings) -> bool:
     """Whether it is in range, and a size is significant with clustered errors."""
-    if not _in_range(fit, candidate):
+    if not in_range(fit, candidate):
         return False
     if candidate.kind == "limit":
         return True
@@ -276,7 +285,19 @@ def _stands(fit: Calibration, candidate: Candidate, settings: Settings) -> bool:
 def _all_in_range(fit: Calibration, state: State, settings: Settings) -> bool:
     """Whether no earlier effect is clearly out of its range now: of two sizes that cancel, one is too many. An effect
     of about 0 is left to the backward step."""
-    return all(_in_range(fit, f.score.candidate, settings.stands) for f in state.found)
+    return all(in_range(fit, f.score.candidate, settings.stands) for f in state.found)
+
+
+def _far(fit: Calibration, before: Calibration, settings: Settings) -> tuple[str, float] | None:
+    """The declared coefficient that an effect drives away from its table, with how far in prior sd: the most likely
+    reason is that the effect stands for another one. None where all stay, or come nearer than they were."""
+    was = dict(zip((c.name for c in before.table.free), before.prior_z(), strict=True))
+    moved = [
+        (c.name, float(z))
+        for c, z in zip(fit.table.free, fit.prior_z(), strict=True)
+        if not c.path.startswith("effects.") and abs(z) > max(settings.moved, abs(was.get(c.name, 0.0)))
+    ]
+    return max(moved, key=lambda m: abs(m[1]), default=None)
 
 
 def _sizes(fit: Calibration, c: Candidate) -> Float[np.ndarray, " k"]:
@@ -299,7 +320,7 @@ def _idle_shape(candidate: Candidate, name: str) -> bool:
     return name not in candidate.sizes and all(name != n for n, _ in candidate.shapes)
 
 
-def _in_range(fit: Calibration, candidate: Candidate, slack: float = 0.0) -> bool:
+def in_range(fit: Calibration, candidate: Candidate, slack: float = 0.0) -> bool:
     """Whether sizes and limits are plausible, and no limit ends up at an edge of its range; `slack` in standard errors.
 
     An edge that is its null is none: a filter of half a second is a short one, whatever the longest may be.

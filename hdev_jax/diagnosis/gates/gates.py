@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of, written_by_chunk
-from hdev_jax.diagnosis.scores.scores import Scores, plausible
+from hdev_jax.diagnosis.scores.scores import Scores, best_ways, plausible
 from hdev_jax.diagnosis.scores.significance import least_clusters
 from hdev_jax.inference import Chunk
 
@@ -138,26 +138,33 @@ def first_rejection(asked: Asked, gates: Sequence[Gate]) -> Rejection | None:
 
 
 def alike(
-    evidence: Evidence, own: Candidate, rivals: Sequence[Candidate], gain: float, scores: Scores, *, plain: bool
-) -> tuple[str, ...]:
-    """Its class: other effects that, put in its place, explain about as much and beside which it is not needed, the
-    best first. `own` and `rivals` hold places in `evidence`, in which it is not."""
-    settings, out = scores.settings, []
+    evidence: Evidence, own: Candidate, rivals: Sequence[Candidate], gain: float, scores: Scores, *,
+    plain: bool, inexact: float,
+) -> tuple[str, ...]:  # fmt: skip
+    """Its class: other effects that, put in its place, explain about as much, the best first.
+
+    Beside such an effect it is not needed; or, where the other has no more free numbers, it adds no more than forms of
+    effects are `inexact`. `own` and `rivals` hold places in `evidence`, in which it is not; a rival may come in several
+    ways.
+    """
+    settings = scores.settings
+    found: dict[str, float] = {}
     totals = evidence.totals()
     before = evidence.base_likelihood(totals)
     for other, score in zip(rivals, (evidence.plain_scores if plain else evidence.scores)(rivals), strict=True):
         if score.left <= settings.absorbed or not plausible(score, settings):
             continue
         if plain:
-            rival, beside = score.gain, evidence.beside(other.columns, own.columns)
+            rival, beside, more = score.gain, evidence.beside(other.columns, own.columns), np.inf
         else:
             both = tuple(dict.fromkeys((*other.columns, *own.columns)))
             rival = evidence.gain(totals, other.columns, before)[0]
             more = evidence.gain(totals, both, before)[0] - rival
             beside = float(stats.chi2.sf(2 * max(more, 0.0), len(own.columns)))
-        if rival > settings.class_share * gain and beside > settings.class_p:
-            out.append((-rival, other.id))
-    return tuple(id_ for _, id_ in sorted(out))
+        close = more < inexact**2 * gain and other.freedoms <= own.freedoms
+        if rival > settings.class_share * gain and (beside > settings.class_p or close):
+            found[other.id] = max(rival, found.get(other.id, -np.inf))
+    return tuple(sorted(found, key=lambda id_: -found[id_]))
 
 
 def stability(a: Asked) -> float:
@@ -191,11 +198,15 @@ def stability(a: Asked) -> float:
     return hits / settings.resamples
 
 
-def of_class(a: Asked) -> tuple[str, ...]:
-    """The class of a candidate that the vehicle does not have yet."""
-    s = a.score
-    rivals = [
-        o.candidate for id_, o in a.scores.best.items()
-        if id_ != s.candidate.id and id_ not in a.scores.absorbed_by and plausible(o, a.scores.settings)
-    ]  # fmt: skip
-    return alike(a.scores.evidence(s), s.candidate, rivals, s.gain, a.scores, plain=s.plain)
+def of_class(a: Asked, *, inexact: float | None = None) -> tuple[str, ...]:
+    """The class of a candidate that the vehicle does not have yet. `inexact`: by default as set; with 0, only what
+    these rows cannot distinguish."""
+    s, scores = a.score, a.scores
+    out = {s.candidate.id, *scores.absorbed_by}
+    rivals = [o.candidate for id_, o in scores.best.items() if id_ not in out and plausible(o, scores.settings)]
+    share = scores.settings.inexact if inexact is None else inexact
+    if share > 0.0 and not s.plain:
+        simple = [c for c in scores.source.candidates if c.id in scores.best and c.id not in out]
+        rivals += best_ways(scores.white, [c for c in simple if c.freedoms <= s.candidate.freedoms], scores.settings)
+    rivals = list(dict.fromkeys(rivals))
+    return alike(scores.evidence(s), s.candidate, rivals, s.gain, scores, plain=s.plain, inexact=share)

@@ -21,9 +21,12 @@ class Kind(StrEnum):
     CONTRADICTED = "contradicted"
     OUTSCORED = "outscored"
     REFIT = "refit"
+    FAR = "far_from_table"
     PLACEBO = "placebo"
     UNSTABLE = "unstable"
     SUPERFLUOUS = "superfluous"
+    NOT_HELD_OUT = "not_held_out"
+    INSTRUMENT = "instrument"
     FOUND = "found"
     DECLARED = "declared"
 
@@ -53,9 +56,12 @@ SENTENCES = {
     Kind.CONTRADICTED: "generalised least squares exclude {share:.0%} of its size by ordinary least squares",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
+    Kind.FAR: "beside it {name} would be {z:+.1f} prior sd from its table",
     Kind.PLACEBO: "a placebo ({how}) does as well",
     Kind.UNSTABLE: "comes first in only {percent:.0f} % of resampled sets of {unit}",
     Kind.SUPERFLUOUS: "not needed beside {beside}",
+    Kind.NOT_HELD_OUT: "the model with it predicts the held-out trips no better",
+    Kind.INSTRUMENT: "an instrument is not named as the cause while {percent:.0f} % of what is left is no noise",
     Kind.FOUND: "found",
     Kind.DECLARED: "declared in the sheet",
 }

@@ -16,7 +16,18 @@ from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration, ParameterTable
 from hdev_jax.physics import Parameter
 
-__all__ = ["NO_EFFECT", "Scores", "best_of", "inside", "plausible", "score_all", "scored", "without_idle", "worth"]
+__all__ = [
+    "NO_EFFECT",
+    "Scores",
+    "best_of",
+    "best_ways",
+    "inside",
+    "plausible",
+    "score_all",
+    "scored",
+    "without_idle",
+    "worth",
+]
 
 NO_EFFECT = "no effect on this log"
 CERTAIN = 1e-6  # p below which it does not matter how small it is
@@ -69,6 +80,17 @@ def worth(gain: float, c: Candidate, settings: Settings) -> float:
     Rows of a log are not independent, and what differs only between trips has no more of them than trips.
     """
     return gain - settings.size_cost * len(c.columns) - settings.shape_cost * (c.freedoms - len(c.columns))
+
+
+def best_ways(evidence: Evidence, candidates: Sequence[Candidate], settings: Settings) -> list[Candidate]:
+    """Of each effect the way that is worth most; candidates hold places in `evidence`."""
+    best: dict[str, tuple[float, Candidate]] = {}
+    gains = evidence.gains(evidence.totals(), [c.columns for c in candidates])
+    for c, gain in zip(candidates, gains, strict=True):
+        value = worth(float(gain), c, settings)
+        if np.isfinite(value) and (c.id not in best or value > best[c.id][0]):
+            best[c.id] = (value, c)
+    return [c for _, c in best.values()]
 
 
 @dataclass

@@ -1,0 +1,116 @@
+"""Names that an engineer believes: a cause in the vehicle before an instrument's fault, one class of what no log can
+distinguish, coefficients that stay in their tables, and held-out trips that have the last word.
+
+The logs are synthetic ones with nothing planted; the kernel changes their energy as a vehicle with the effect would.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from planted import SHORT, diagnosed, named
+
+from hdev_jax.diagnosis.gates.held_out import held_out_gain
+from hdev_jax.diagnosis.gates.rejection import Kind
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs import read_log
+from hdev_jax.physics import LIBRARY, Effect, PartLoad, RegenEfficiency, Rolling
+from hdev_jax.physics.sensors import MassScale
+from hdev_jax.problem import Problem, Split, prepare, split_trips
+
+ESTIMATED = "efficiency = { value = 0.91, sd = 0.03 }"
+DRIVE = ("regen_efficiency", "part_load", "mass_scale", "power_gain", "auxiliary_power", "copper_loss")
+
+
+@cache
+def nothing(c_rr_sd: float = 0.0008) -> tuple[Problem, Split]:
+    """A log with nothing planted, and a sheet whose one efficiency is to be estimated."""
+    with TemporaryDirectory() as folder:
+        files = synthetic_log(seed=7301, **SHORT).write(Path(folder), truth=False)
+        text = files["sheet"].read_text()
+        assert "efficiency = 0.91" in text
+        text = text.replace("efficiency = 0.91", ESTIMATED).replace("sd = 0.0008", f"sd = {c_rr_sd}")
+        files["sheet"].write_text(text)
+        log = read_log([files["log"]])
+        split = split_trips(log)
+        return prepare(split.log, read_sheet(files["sheet"]), None), split
+
+
+def changed(problem: Problem, effect: Effect, rows: np.ndarray | bool = True) -> Problem:
+    """The log as this effect would have made it, in some of its rows."""
+    more = problem.predict(problem.vehicle.plus(effect)) - problem.predict(problem.vehicle)
+    return replace(problem, measured=problem.measured + np.where(rows, more, 0.0))
+
+
+def without_noise(problem: Problem) -> Problem:
+    """A hundredth of the noise: what is left then is the form of the effects, not chance."""
+    exact = problem.predict(problem.vehicle)
+    return replace(problem, measured=exact + 0.01 * (problem.measured - exact))
+
+
+def only(*ids: str) -> dict[str, type[Effect]]:
+    return {k: LIBRARY[k] for k in ids}
+
+
+def test_regeneration_is_named_before_payload_and_gain_which_are_its_class():
+    """With one efficiency estimated for both directions, (1 + g)² = η_braking/η_driving, so that all three fit."""
+    problem, split = nothing()
+    problem = changed(problem, RegenEfficiency(0.15))
+    result = diagnosed(problem, split, only(*DRIVE))
+    (e,) = result.summary["effects"]
+    assert e["id"] == "regen_efficiency"
+    assert {"mass_scale", "power_gain"} & {*e["indistinguishable_from"]}
+    assert e["parameters"]["share"]["value"] == pytest.approx(0.15, abs=0.04)
+
+
+def test_payload_is_named_before_a_gain_where_regeneration_would_beat_driving():
+    problem, split = nothing()
+    result = diagnosed(changed(problem, MassScale(0.1)), split, only(*DRIVE))
+    (e,) = result.summary["effects"]
+    assert e["id"] == "mass_scale"
+
+
+def test_an_efficiency_by_load_and_direction_blames_no_instrument():
+    """The form is not quite any effect's here: noise is a hundredth, and nothing is too small to be significant."""
+    problem, split = nothing()
+    problem = changed(changed(without_noise(problem), RegenEfficiency(0.12)), PartLoad(2500.0, 0.0, 8000.0))
+    names = named(diagnosed(problem, split, only(*DRIVE, "speed_scale", "time_skew")))
+    assert "regen_efficiency" in names
+    assert not [k for k in names if LIBRARY[k].instrument]
+
+
+@pytest.mark.parametrize(("sd", "is_named"), [(0.0008, True), (0.0001, False)])
+def test_no_effect_drives_a_coefficient_out_of_its_table(sd, is_named):
+    """A mass that is wrong for hills and starts alone: with the mass scaled, c_rr has to make up for its weight."""
+    problem, split = nothing(sd)
+    problem = without_noise(problem)
+    car, scale = problem.vehicle, 0.12
+    lighter = Rolling(car.effect("rolling").c_rr / (1.0 + scale))
+    heavier = car.minus("rolling").plus(lighter, MassScale(scale))
+    problem = replace(problem, measured=problem.measured + problem.predict(heavier) - problem.predict(car))
+    result = diagnosed(problem, split, only("mass_scale"))
+    kind = {c["id"]: c["kind"] for c in result.summary["candidates"]}["mass_scale"]
+    assert kind == (Kind.FOUND if is_named else Kind.FAR)
+
+
+def test_what_held_out_trips_contradict_is_not_named():
+    """A payload error of the training trips alone; the others have the opposite one."""
+    problem, split = nothing()
+    train = problem.rows(split.train)
+    problem = changed(changed(problem, MassScale(0.15), train), MassScale(-0.15), ~train)
+    result = diagnosed(problem, split, only("mass_scale"))
+    assert named(result) == []
+    assert {c["id"]: c["kind"] for c in result.summary["candidates"]} == {"mass_scale": Kind.NOT_HELD_OUT}
+    np.testing.assert_array_equal(result.predicted_after, result.predicted_before)
+
+
+def test_gain_on_held_out_trips_is_that_of_the_better_prediction():
+    problem, split = nothing()
+    right, wrong = problem.predict(problem.vehicle), problem.predict(problem.vehicle.plus(MassScale(0.1)))
+    assert held_out_gain(problem, split, wrong, right) > 3.0
+    assert held_out_gain(problem, split, right, wrong) < -3.0
+    assert held_out_gain(problem, split, right, right) == 0.0
