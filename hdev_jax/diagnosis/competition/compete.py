@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.mode import add_mode
-from hdev_jax.diagnosis.competition.needed import backward, classes
+from hdev_jax.diagnosis.competition.needed import backward, classes, without_idle_switches
 from hdev_jax.diagnosis.competition.refit import widened, without
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.competition.switching import add_switching, decoded_again, mistaken, with_states
@@ -96,6 +96,8 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
             tell("added a term without a name")
     asked = {v.id for v in sought}
     sought += [v for v in state.verdicts if v.id not in asked and training.library[v.id].searched]
+    if new is None and (less := without_idle_switches(training, state, scores)) is not state:
+        new = less
     if new is None:
         state = replace(state, found=classes(scores, state))
         return replace(state, verdicts=verdicts_of(round_, sought), finished=True)

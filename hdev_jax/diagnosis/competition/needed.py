@@ -10,19 +10,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
-from hdev_jax.diagnosis.competition.refit import in_range, without
+from hdev_jax.diagnosis.competition.refit import gained, in_range, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import alike
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of
-from hdev_jax.diagnosis.scores.scores import Scores, best_ways
+from hdev_jax.diagnosis.scores.scores import Scores, best_ways, worth
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
 from hdev_jax.physics import unavailable
 
-__all__ = ["backward", "can_be_asked", "classes", "model_without", "needed"]
+__all__ = ["backward", "can_be_asked", "classes", "model_without", "needed", "without_idle_switches"]
 
 
 @dataclass(frozen=True)
@@ -107,6 +107,18 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
         times = state.removed[drop].numbers["times"] + 1 if drop in state.removed else 1
         why = Rejection(Kind.SUPERFLUOUS, {"beside": beside, "times": times})
         state = replace(state, removed={**state.removed, drop: why})
+    return state
+
+
+def without_idle_switches(training: Training, state: State, scores: Scores) -> State:
+    """The state without switches (a limit, a delay) that are not worth their numbers beside what was added later: a
+    limit that is never reached any more. Only a refit can show it, so this is asked at the end."""
+    for f in [f for f in state.found if not _has_columns(f) and not f.score.candidate.effect.searched]:
+        less = without(training, state, f.id)
+        lost = gained(training, state.fit, scores) - gained(training, less.fit, scores)
+        if worth(lost, f.score.candidate, training.settings) <= 0.0:
+            why = Rejection(Kind.SUPERFLUOUS, {"beside": "effects added later", "times": 2})
+            state = replace(less, removed={**less.removed, f.id: why})
     return state
 
 

@@ -19,7 +19,7 @@ from hdev_jax.diagnosis.scores.passes import both_looks
 from hdev_jax.diagnosis.scores.scores import plausible
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
-from hdev_jax.physics import Shape
+from hdev_jax.physics import RegenEfficiency, Shape
 
 __all__ = ["Open", "left_open", "other_size", "shapes_of"]
 
@@ -27,6 +27,9 @@ BETWEEN = 3  # steps from one value of the library's grid to the next
 BEYOND = 2  # of its steps, on either side, that are looked at too
 NEGLIGIBLE = 1e-3  # likelihood over the best one's
 POINTS, REACH = 41, 4.0  # of another size, over so many standard errors to either side
+
+UNDECIDED = 0.05  # share of a column outside the span of all others, below which inexact forms decide on its size
+RECOVERS_LESS = (0.0, 0.2)  # relative: 0.03 (SUMO's vehicles), 0.1 (FASTSim's), 0.2 (small machines at low load)
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,9 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
     """
     c, names = s.candidate, shapes_of(s.candidate)
     if not names:
-        return _other_open(training, state, s, other, reported) if (other := other_size(c)) else {}
+        other = other_size(c)
+        found = _other_open(training, state, s, other, reported) if other else {}
+        return found or _undeclared(training, state, s)
     effect = state.fit.vehicle.effect(c.id)
     here = {n: float(np.asarray(getattr(effect, n))) for n in names}
     grids = {n: _wide(c, n, here[n], training.facts.row_s) for n in names}
@@ -148,6 +153,27 @@ def _other_open(training: Training, state: State, s: Score, other: str, reported
     share = stats.t.pdf((at - beta) / error, max(evidence.count - 1, 1))
     share /= share.sum()
     return {n: Open(x * at, share, float(e)) for n, x, e in zip(c.sizes, per_unit, inside, strict=True)}
+
+
+def _undeclared(training: Training, state: State, s: Score) -> dict[str, Open]:
+    """Sizes of a found effect over what a drive may recover less than it gives, where one efficiency is declared for
+    both directions and these rows cannot distinguish that from the effect."""
+    c, vehicle = s.candidate, state.fit.vehicle
+    if not vehicle.one_efficiency or vehicle.has(RegenEfficiency.id) or c.kind != "size" or None not in c.groups:
+        return {}
+    beside = plan_of(vehicle, [RegenEfficiency], training.facts, training.target)
+    if not beside.candidates or both_looks(training.baseline(state.fit), beside)[0].left([0]) > UNDECIDED:
+        return {}
+    plan = plan_of(vehicle.minus(c.id), [c.effect, RegenEfficiency], training.facts, training.target)
+    evidence = both_looks(training.baseline(_without(state.fit, c.id), training.noise(state.fit)), plan)[0]
+    own = next((k for k in plan.candidates if k.sizes == c.sizes and k.id == c.id), None)
+    other = next(k for k in plan.candidates if k.id == RegenEfficiency.id)
+    if own is None:
+        return {}
+    per_unit = evidence.traded(own.columns, other.columns[0])
+    at = np.linspace(*RECOVERS_LESS, POINTS)
+    each = zip(c.sizes, per_unit, evidence.estimate(own)[1], strict=True)
+    return {n: Open(x * at, np.full(POINTS, 1.0 / POINTS), float(e)) for n, x, e in each}
 
 
 def other_size(c: Candidate) -> str | None:
