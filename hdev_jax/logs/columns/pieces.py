@@ -7,9 +7,10 @@ import numpy as np
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
+from hdev_jax.logs.columns.clocked import clocked, named
 from hdev_jax.logs.columns.headers import Header, parse_header
 from hdev_jax.logs.columns.labels import id_columns, labels, within_vehicles
-from hdev_jax.logs.columns.long import pivoted
+from hdev_jax.logs.columns.long import channels_of_long
 from hdev_jax.logs.columns.work import MEASURED_COLUMNS, ColumnInfo, Work
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.presets import recognised
@@ -42,8 +43,13 @@ class Piece:
 def translate(raw: Raw, adapter: Adapter) -> Piece:
     """Columns of a raw table under the contract's names in SI. Raises `InputError` (file, row, column, what to do)."""
     raw, adapter = _of_its_tool(raw, adapter)
-    if adapter.long is not None:
-        raw = pivoted(raw, adapter, MEASURED_COLUMNS)
+    by_channel = adapter.long is not None or bool(raw.channels)
+    if raw.channels:
+        raw = named(raw, adapter)
+    elif adapter.long is not None:
+        raw = channels_of_long(raw, adapter)
+    if by_channel:
+        raw, adapter = clocked(raw, adapter), adapter.without("time_s")
     headers = [str(c) for c in raw.table.columns]
     raw = replace(raw, table=raw.table.set_axis(headers, axis=1))
     ids = {name: id_columns(raw, adapter, name, headers) for name in ("trip_id", "vehicle_id")}
@@ -60,7 +66,8 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
         work.clock()
     for name in adapter.columns:
         work.derive(name, ())
-    if adapter.others == "keep":
+    work.note_lacking()
+    if adapter.others != "drop":
         work.keep_others({c for columns in ids.values() for c in columns})
     work.power_of_voltage_and_current()
     piece = Piece(
@@ -76,13 +83,13 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
         headers=tuple(headers),
         ledger=work.ledger,
     )
-    return _measured_rows(piece, work, adapter)
+    return _measured_rows(piece, work, adapter, by_channel)
 
 
 def _of_its_tool(raw: Raw, adapter: Adapter) -> tuple[Raw, Adapter]:
     """Without an adapter, and where the file names no speed as the contract does: the preset of the tool that writes
     such headers, noted."""
-    headers = [str(c) for c in raw.table.columns]
+    headers = list(raw.channels) or [str(c) for c in raw.table.columns]
     if adapter.columns or adapter.preset or any(_is_speed(Header.of(h, raw.units.get(h))) for h in headers):
         return raw, adapter
     found = recognised(headers)
@@ -99,7 +106,7 @@ def _is_speed(header: Header) -> bool:
         return True
 
 
-def _measured_rows(piece: Piece, work: Work, adapter: Adapter) -> Piece:
+def _measured_rows(piece: Piece, work: Work, adapter: Adapter, by_channel: bool) -> Piece:
     """The rows where what the adapter names was measured; without a name those where a target was filled are left out:
     what was filled is no measurement."""
     if adapter.rows is not None:
@@ -111,7 +118,7 @@ def _measured_rows(piece: Piece, work: Work, adapter: Adapter) -> Piece:
         keep = np.isfinite(x) if x is not None else work.raw.table[header].notna().to_numpy()
         why = f"rows = '{header}' of the adapter: it was not measured there"
     else:
-        if adapter.long is not None:  # put on another channel's clock, a target is there at its own times alone
+        if by_channel:  # put on another channel's clock, a target is there at its own times alone
             work.unfilled |= {c: piece.data[c] for c in MEASURED_COLUMNS if c in piece.data}
         filled = [c for c in MEASURED_COLUMNS if c in work.unfilled and c in piece.data]
         if not filled:

@@ -9,8 +9,9 @@ from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.readers.binary import read_binary
 from hdev_jax.logs.readers.matlab import read_mat
-from hdev_jax.logs.readers.names import ENDINGS, ending_of, stem, trip_of
+from hdev_jax.logs.readers.names import ENDINGS, SIGNALS, ending_of, stem, trip_of
 from hdev_jax.logs.readers.raw import Raw
+from hdev_jax.logs.readers.signals import read_signals
 from hdev_jax.logs.readers.text import read_text
 
 __all__ = ["find_files", "format_of", "read_bytes", "read_raw"]
@@ -100,9 +101,11 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
     if kind == "mat":
         tables = read_mat(path, read_bytes(path, kind), adapter)
         raws = [Raw(path.name, table, trip) for trip, table in tables.items()]
+    elif kind in SIGNALS:
+        raws = [read_signals(path, kind, adapter)]
     else:
         raws = [_table(path, kind, adapter, trip_of(path, adapter))]
-    if any(r.table.empty for r in raws):
+    if any(r.table.empty and not r.channels for r in raws):
         raise InputError(f"{path}: no rows")
     vehicle = None
     if adapter.vehicle_id is not None:
@@ -175,7 +178,7 @@ def _with_companion(raw: Raw, path: Path, adapter: Adapter) -> Raw:
             f"or say optional = true in {adapter.where}"
         )
     kind = ENDINGS.get(ending_of(beside.name), "csv")
-    if kind == "mat":
+    if kind in ("mat", *SIGNALS):
         raise InputError(f"{beside}: a companion is a table of text, Parquet, Feather or xlsx")
     table = _table(beside, kind, replace(adapter, header_line=None), raw.trip).table
     for where, frame in ((path, raw.table), (beside, table)):
