@@ -32,6 +32,15 @@ def _long() -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["SECONDS", "PID", "VALUE", "UNITS"])
 
 
+def _scanned() -> pd.DataFrame:
+    """A row for each message, with the values of that message alone."""
+    t = 1000 * BASE["time_s"].to_numpy()
+    power = pd.DataFrame({"Time": t, "Battery voltage": 380.0, "Battery current": P / 380.0, "Battery power": P / 1e3})
+    speed = pd.DataFrame({"Time": np.r_[t, t[:-1] + 500.0], "Speed": 3.6 * np.r_[V, 0.5 * (V[1:] + V[:-1])]})
+    other = pd.DataFrame({"Time": t[::7], "Outside temp": 12.5})
+    return pd.concat([power, speed, other]).sort_values("Time", kind="stable").astype({"Time": int})
+
+
 # the same drive as each tool writes it; what it does not write of the power is None
 WRITTEN = {
     "carscanner": (_long(), {"sep": ";", "quoting": 1}, P),
@@ -44,6 +53,7 @@ WRITTEN = {
         {},
         P,
     ),
+    "scanmytesla": (_scanned(), {}, P),
     "teslamate": (columns(drive_id=7, date=STAMP, speed=V * 3.6, power=P / 1e3, battery_level=70), {}, P),
     "torque": (
         pd.DataFrame(
@@ -70,7 +80,7 @@ WRITTEN = {
 }  # fmt: skip
 
 
-NO_TABLES = {"fms"}  # recordings: tests of their own
+NO_TABLES = {"fms", "sumo"}  # recordings and XML: tests of their own
 
 
 def test_every_preset_has_a_file():

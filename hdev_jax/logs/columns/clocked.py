@@ -241,7 +241,7 @@ def _resampled(t: np.ndarray, x: np.ndarray, clock: _Clock, kind: str, measured:
         return x, "as they are"
     faster = _step(t) * FASTER <= clock.step * (1.0 + 1e-6)
     if measured or kind == "sum" or (kind == "mean" and faster):
-        means, far = _around(t, x, clock, total=kind == "sum")
+        means, far = _around(t, x, clock, kind == "sum", faster)
         where = f"{'the sum' if kind == 'sum' else 'the mean'} of those around a row"
         where += f", {far} of them in no row" if far else ""
         if measured or kind == "sum":
@@ -251,20 +251,28 @@ def _resampled(t: np.ndarray, x: np.ndarray, clock: _Clock, kind: str, measured:
     return _at(t, x, clock.at, linear), "linear between two" if linear else "the last one before"
 
 
-def _around(t: np.ndarray, x: np.ndarray, clock: _Clock, total: bool) -> tuple[np.ndarray, int]:
+def _around(t: np.ndarray, x: np.ndarray, clock: _Clock, total: bool, faster: bool) -> tuple[np.ndarray, int]:
     """Mean (or sum) of the values nearer to a row's time than to any other's, NaN where there is none; and how many
-    values belong to no row: outside, or in a gap, where a row reaches half a step."""
+    values belong to no row: outside, or in a gap, where a row reaches half a step.
+
+    Half-way between two rows a value of a `faster` channel counts half in each, for else the mean would be of a time
+    half a step of the channel before the row's.
+    """
     at, n = clock.at, len(clock.at)
     step = np.diff(at)
     reach = np.where(step > GAP_SAMPLES * clock.step * (1.0 + 1e-9), 0.5 * clock.step, 0.5 * step)
     ends = 0.5 * clock.step
     low, high = at - np.r_[ends, reach], at + np.r_[reach, ends]
-    row = np.searchsorted(low, t, "right") - 1
-    inside = (row >= 0) & (t <= high[np.clip(row, 0, n - 1)])
-    count = np.bincount(row[inside], minlength=n)
-    sums = np.bincount(row[inside], x[inside], minlength=n)
-    out = np.where(count > 0, sums if total else sums / np.maximum(count, 1), np.nan)
-    return out, int((~inside).sum())
+    tie = 1e-6 * clock.step if faster else 0.0
+    weights, sums, used = np.zeros(n), np.zeros(n), np.zeros(len(t), bool)
+    for shifted in (t - tie, t + tie):
+        row = np.searchsorted(low, shifted, "right") - 1
+        inside = (row >= 0) & (shifted <= high[np.clip(row, 0, n - 1)])
+        weights += 0.5 * np.bincount(row[inside], minlength=n)
+        sums += 0.5 * np.bincount(row[inside], x[inside], minlength=n)
+        used |= inside
+    out = np.where(weights > 0, sums if total else sums / np.where(weights > 0, weights, 1.0), np.nan)
+    return out, int((~used).sum())
 
 
 def _at(t: np.ndarray, x: np.ndarray, at: np.ndarray, linear: bool) -> np.ndarray:

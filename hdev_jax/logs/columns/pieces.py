@@ -11,6 +11,7 @@ from hdev_jax.logs.columns.clocked import clocked, named
 from hdev_jax.logs.columns.headers import Header, parse_header
 from hdev_jax.logs.columns.labels import id_columns, labels, within_vehicles
 from hdev_jax.logs.columns.long import channels_of_long
+from hdev_jax.logs.columns.uneven import on_one_clock
 from hdev_jax.logs.columns.work import MEASURED_COLUMNS, ColumnInfo, Work
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.presets import recognised
@@ -50,6 +51,51 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
         raw = channels_of_long(raw, adapter)
     if by_channel:
         raw, adapter = clocked(raw, adapter), adapter.without("time_s")
+    work, named_by = _begun(raw, adapter)
+    if adapter.clock is not None and not by_channel and "time_s" in work.data:
+        by_channel = True
+        kept = [c for columns in named_by.ids.values() for c in columns]
+        shown = next(f" {c.source} " for c in work.columns if c.name == "time_s")
+        rest = raw.table.drop(columns=[h for h in work.headers if f" {h} " in shown and h not in kept])
+        raw = replace(raw, table=rest, ledger=work.ledger)
+        raw = on_one_clock(raw, adapter, work.data["time_s"], named_by.trip, kept)
+        adapter = adapter.without("time_s")
+        work, named_by = _begun(raw, adapter)
+    for name in adapter.columns:
+        work.derive(name, ())
+    work.note_lacking()
+    if adapter.others != "drop":
+        work.keep_others({c for columns in named_by.ids.values() for c in columns})
+    work.power_of_voltage_and_current()
+    piece = Piece(
+        file=raw.file,
+        data=work.data,
+        trip=named_by.trip,
+        trip_names=named_by.trip_names,
+        vehicle=named_by.vehicle,
+        vehicle_names=named_by.vehicle_names,
+        row=np.arange(len(named_by.trip)),
+        lines=raw.lines,
+        columns=tuple(work.columns),
+        headers=tuple(work.headers),
+        ledger=work.ledger,
+    )
+    return _measured_rows(piece, work, adapter, by_channel)
+
+
+@dataclass(frozen=True)
+class _Named:
+    """Which columns name the trips and vehicles of a table, and which row is of which."""
+
+    ids: dict[str, tuple[str, ...]]
+    trip: np.ndarray
+    trip_names: tuple[str, ...]
+    vehicle: np.ndarray
+    vehicle_names: tuple[str, ...]
+
+
+def _begun(raw: Raw, adapter: Adapter) -> tuple[Work, _Named]:
+    """The work on a table: its trips and vehicles named, its clock read."""
     headers = [str(c) for c in raw.table.columns]
     raw = replace(raw, table=raw.table.set_axis(headers, axis=1))
     ids = {name: id_columns(raw, adapter, name, headers) for name in ("trip_id", "vehicle_id")}
@@ -64,26 +110,7 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
         work.derive("time_s", ())
     else:
         work.clock()
-    for name in adapter.columns:
-        work.derive(name, ())
-    work.note_lacking()
-    if adapter.others != "drop":
-        work.keep_others({c for columns in ids.values() for c in columns})
-    work.power_of_voltage_and_current()
-    piece = Piece(
-        file=raw.file,
-        data=work.data,
-        trip=trip,
-        trip_names=trip_names,
-        vehicle=vehicle,
-        vehicle_names=vehicle_names,
-        row=np.arange(len(trip)),
-        lines=raw.lines,
-        columns=tuple(work.columns),
-        headers=tuple(headers),
-        ledger=work.ledger,
-    )
-    return _measured_rows(piece, work, adapter, by_channel)
+    return work, _Named(ids, trip, trip_names, vehicle, vehicle_names)
 
 
 def _of_its_tool(raw: Raw, adapter: Adapter) -> tuple[Raw, Adapter]:

@@ -12,6 +12,7 @@ from hdev_jax.logs.readers.matlab import read_mat
 from hdev_jax.logs.readers.names import ENDINGS, SIGNALS, ending_of, stem, trip_of
 from hdev_jax.logs.readers.raw import Raw
 from hdev_jax.logs.readers.signals import read_signals
+from hdev_jax.logs.readers.steps import read_steps
 from hdev_jax.logs.readers.text import read_text
 
 __all__ = ["find_files", "format_of", "read_bytes", "read_raw"]
@@ -27,12 +28,13 @@ _MAGIC = {
 _CONTENT = {
     "csv": "text",
     "jsonl": "text",
+    "xml": "text",
     "parquet": "Parquet",
     "feather": "Feather",
     "xlsx": "zip (or xlsx)",
     "mat": "MATLAB",
 }
-_NOT_ALWAYS_LOGS = (".txt", ".txt.gz", ".xlsx")  # in a folder of logs these are notes and tables of the vehicles
+_NOT_ALWAYS_LOGS = (".txt", ".txt.gz", ".xlsx", ".xml")  # in a folder of logs these are notes, tables, set-ups
 
 
 def format_of(path: Path, adapter: Adapter) -> str:
@@ -118,6 +120,9 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
 
 def _table(path: Path, kind: str, adapter: Adapter, trip: str) -> Raw:
     data = read_bytes(path, kind)
+    if kind == "xml":
+        table, ledger = read_steps(path, data)
+        return Raw(path.name, table, trip, ledger=ledger)
     if kind != "csv":
         return Raw(path.name, read_binary(path, data, kind), trip)
     text = read_text(path, data, adapter)

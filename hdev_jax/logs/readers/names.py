@@ -20,6 +20,7 @@ _PLAIN = {
     ".ndjson": "jsonl",
     ".xlsx": "xlsx",
     ".mat": "mat",
+    ".xml": "xml",
 }
 _RECORDINGS = {".mf4": "mf4", ".mdf": "mf4", ".blf": "blf", ".asc": "asc"}
 SIGNALS = tuple(dict.fromkeys(_RECORDINGS.values()))
