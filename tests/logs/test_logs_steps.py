@@ -79,6 +79,8 @@ def test_what_a_battery_gave_in_each_step(vehicles, step, totals, zipped, newlin
     assert "chargingStationId, lane" in said
     assert "the rows add up to" not in said
     assert read(data, adapter="sumo").fingerprint() == log.fingerprint()
+    older = data.replace(b"energyConsumed", b"Consum")
+    assert read(older).fingerprint() == log.fingerprint()
 
 
 @pytest.mark.parametrize(
@@ -90,7 +92,9 @@ def test_what_a_battery_gave_in_each_step(vehicles, step, totals, zipped, newlin
         ("<battery-export><timestep time='0'/></battery-export>", "no vehicle in any step"),
         (xml().replace('speed="12', 'speed="fast', 1), "speed = 'fast"),
         (xml().replace('id="bus.0"', "", 1), "a vehicle without an id at time 0 s"),
-        (xml().replace('time="7.00"', 'time="7:00"', 1), "a time step whose time is no number"),
+        (xml().replace('time="7.00"', 'time="7:00"', 1), "without a time, or one that is no number"),
+        (xml().replace('time="7.00"', 'interval="0-7"', 1), "without a time"),
+        (xml().replace("speed=", 'aggregateNumber="5" speed='), "steps that were put together"),
         (xml(every=5), "it leaves steps out, whose energy is unknown"),
         ("time,speed\n1,2\n", "truncated or damaged XML file"),
     ],

@@ -101,8 +101,8 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
     """The tables of a file (a MATLAB file of layout `time_value` may hold several trips), companion joined."""
     kind = format_of(path, adapter)
     if kind == "mat":
-        tables = read_mat(path, read_bytes(path, kind), adapter)
-        raws = [Raw(path.name, table, trip) for trip, table in tables.items()]
+        tables, ledger = read_mat(path, read_bytes(path, kind), adapter)
+        raws = [Raw(path.name, table, trip, ledger=ledger) for trip, table in tables.items()]
     elif kind in SIGNALS:
         raws = [read_signals(path, kind, adapter)]
     else:
@@ -148,8 +148,8 @@ def read_bytes(path: Path, kind: str = "csv") -> bytes:
     elif _content(data) == "gzip" and not ending:
         data = _gunzip(path, data)
     found = _content(data)
-    if expected == "MATLAB" and (found == "HDF5" or data.startswith(b"MATLAB 7.3")):
-        raise InputError(f"{path}: MATLAB 7.3 (HDF5) is not read; save it in MATLAB with -v7")
+    if expected == "MATLAB" and found == "HDF5":
+        return data
     if expected == "text" and data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError(f"{path}: UTF-16 text; save it as UTF-8")
     if expected != found:

@@ -53,6 +53,8 @@ def read_steps(path: Path, data: bytes) -> tuple[pd.DataFrame, Ledger]:
         ids.append(name)
     if not ids:
         raise InputError(f"{path}: no vehicle in any step")
+    if "aggregateNumber" in numbers:
+        raise InputError(f"{path}: steps that were put together; the output of the simulation itself is needed")
     table = pd.DataFrame({"time": np.array(times), "id": ids})
     for key, column in numbers.items():
         table[key] = np.r_[np.array(column), np.full(len(ids) - len(column), np.nan)]
@@ -75,7 +77,7 @@ def _vehicles(path: Path, data: bytes) -> Iterator[tuple[float, ElementTree.Elem
         time: float | None = None
         for event, element in steps:
             if event == "start" and element.tag == "timestep":
-                time = float(element.get("time", "nan"))
+                time = float(element.attrib["time"])
             elif event == "end" and element.tag == "vehicle":
                 if time is None:
                     raise InputError(f"{path}: <vehicle> outside of a <timestep>")
@@ -86,8 +88,8 @@ def _vehicles(path: Path, data: bytes) -> Iterator[tuple[float, ElementTree.Elem
             raise InputError(f"{path}: <{root.tag}> without <timestep>: only SUMO's vehicles by time step are read")
     except (ElementTree.ParseError, StopIteration) as e:
         raise InputError(f"{path}: truncated or damaged XML file ({e})") from None
-    except ValueError as e:
-        raise InputError(f"{path}: a time step whose time is no number ({e})") from None
+    except (ValueError, KeyError) as e:
+        raise InputError(f"{path}: a <timestep> without a time, or one that is no number ({e})") from None
 
 
 def _checked(table: pd.DataFrame, ledger: Ledger, file: str) -> Ledger:

@@ -10,10 +10,10 @@ import numpy as np
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.readers.libraries import library
 from hdev_jax.logs.readers.raw import Channel
 from hdev_jax.logs.readers.signals.bits import physical
 from hdev_jax.logs.readers.signals.frames import Identifier, Recording
-from hdev_jax.logs.readers.signals.libraries import library
 
 __all__ = ["FMS", "Database", "channels_of_frames"]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.errors import InputError
-from hdev_jax.logs.readers.signals.libraries import library
+from hdev_jax.logs.readers.libraries import library
 
 __all__ = ["Asked", "Identifier", "Recording", "read_frames"]
 

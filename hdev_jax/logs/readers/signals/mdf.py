@@ -12,9 +12,9 @@ import numpy as np
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.ledger import Ledger
+from hdev_jax.logs.readers.libraries import library
 from hdev_jax.logs.readers.raw import Channel
 from hdev_jax.logs.readers.signals.frames import Asked, Identifier, Recording
-from hdev_jax.logs.readers.signals.libraries import library
 
 __all__ = ["channels_of_mdf", "frames_of_mdf", "open_mdf"]
 
