@@ -170,3 +170,15 @@ def test_an_interval_that_stands_at_both_ends_and_drives_between_them_is_no_char
         index=range(20),
     )
     assert len(log_from_frame(frame)) == 20
+
+
+@pytest.mark.parametrize("name", ["battery_power_w", "traction_force_n"])
+def test_a_target_that_never_changes_is_said_with_what_to_do(name):
+    frame = drive(CAR, 4).rename(columns={"battery_power_w": name}).assign(**{name: 0.0})
+    (one,) = suspicions(log_from_frame(frame))
+    assert one.what == "constant target 0"
+    assert ("traction_force_n = 0 in place of that column" in one.mend) == (name == "battery_power_w")
+    assert "hdev calibrate" in one.mend
+    (one,) = suspicions(log_from_frame(frame.assign(**{name: 700.0})))
+    assert one.what == "constant target"
+    assert f"in all {len(frame)} rows" in one.evidence
