@@ -72,7 +72,9 @@ def clocked(raw: Raw, adapter: Adapter) -> Raw:
         t, x = loaded(name)
         if name not in needed:
             del values[name]  # of a large file one channel is in memory at a time
-        if len(t):
+        if not len(t):
+            ledger = ledger.add("noted", "no number in it, left out", file=file, column=name)
+        else:
             kind = resampling(name, channel.unit, adapter)
             table[name], how = _resampled(t, x, clock, kind, name in measured)
             known = int(np.isfinite(table[name]).sum())
@@ -99,7 +101,8 @@ def named(raw: Raw, adapter: Adapter) -> Raw:
         raise MissingColumnError(f"{raw.file}: {what}; it has {shown}; write an adapter (hdev check --skeleton)")
     ledger = raw.ledger
     if len(kept) < len(raw.channels):
-        why = f"{len(raw.channels) - len(kept)} signals that no rule names: left out (others = 'keep' reads them)"
+        left = len(raw.channels) - len(kept)
+        why = f"signals that no rule names, left out: {left} (others = 'keep' in an adapter reads them)"
         ledger = ledger.add("noted", why, file=raw.file)
     return replace(raw, channels=kept, ledger=ledger)
 

@@ -57,18 +57,19 @@ def channels_of_mdf(path: Path, mdf: Any, ledger: Ledger) -> tuple[dict[str, Cha
         if master is None or getattr(group.channels[master], "sync_type", _TIME) != _TIME:
             other += len(group.channels)
             continue
-        title = group.channel_group.acq_name or getattr(group.channel_group, "comment", "") or f"group {g}"
+        told = (getattr(group.channel_group, key, "") for key in ("acq_name", "comment"))
+        title = next((text for text in told if text), f"group {g}")
         for i, c in enumerate(group.channels):
             if i == master:
                 continue
             if c.data_type in _TEXTS and mdf.version >= "4":
                 text += 1
                 continue
-            unit = c.unit or getattr(c.conversion, "unit", "") or ""
+            unit = getattr(c, "unit", "") or getattr(c.conversion, "unit", "") or ""
             found.append((c.name, title.strip(), g, i, unit.strip()))
     for count, why in ((other, "channels that are not over time"), (text, "channels of text or bytes")):
         if count:
-            ledger = ledger.add("noted", f"{count} {why}: left out", file=path.name)
+            ledger = ledger.add("noted", f"{why}, left out: {count}", file=path.name)
     names = Counter(name for name, *_ in found)
     channels: dict[str, Channel] = {}
     for name, title, g, i, unit in found:

@@ -53,10 +53,10 @@ def _decoded(
 ) -> tuple[dict[str, Channel], Ledger]:
     others, ids = recording.others.total(), len(recording.others)
     if others:
-        why = f"{others} frames of {ids} identifiers that {' and '.join(database.names)} lacks or no rule names"
-        ledger = ledger.add("noted", f"{why}: left out", file=path.name)
+        why = f"frames that {' and '.join(database.names)} lacks or no rule names, left out"
+        ledger = ledger.add("noted", f"{why}: {others} (identifiers: {ids})", file=path.name)
     if recording.faulty:
-        ledger = ledger.add("noted", f"{recording.faulty} error or remote frames: left out", file=path.name)
+        ledger = ledger.add("noted", f"error and remote frames, left out: {recording.faulty}", file=path.name)
     if recording.cut:
         ledger = ledger.add("noted", "never closed by its recorder: its end may be missing", file=path.name)
     if not recording.frames:
