@@ -231,13 +231,11 @@ def test_bits_are_those_of_cantools(made):
     assert np.isnan(short).all()
 
 
-@st.composite
-def disturbed(draw):
-    """The truck's frames as a bus gives them: late, lost, cut short, twice, between others, with faults."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    lost, none, late = (draw(st.sampled_from([0.0, x])) for x in (0.03, 0.02, 0.02))
+def disturbed(sender: int, lost: float, none: float, late: float, seed: int) -> tuple[list, int]:
+    """The truck's frames as a bus gives them: late, lost, cut short, between faults; how many currents there are."""
+    rng = np.random.default_rng(seed)
     frames, usable = [], 0
-    for f in drive(draw(st.integers(0, 0xFD))):
+    for f in drive(sender):
         if rng.uniform() < lost:
             continue
         if rng.uniform() < none:  # not available, or too short to tell
@@ -251,18 +249,22 @@ def disturbed(draw):
         if rng.uniform() < 0.02:
             frames.append(can.Message(timestamp=f.timestamp, is_error_frame=True))
             frames.append(can.Message(timestamp=f.timestamp, arbitration_id=0x18FEF100, is_remote_frame=True))
-    return draw(st.sampled_from(["blf", "asc", "mf4"])), frames, usable
+    return frames, usable
+
+
+SHARE = st.sampled_from([0.0, 0.03])
 
 
 @settings(max_examples=50)
-@given(disturbed())
-def test_no_disturbed_bus_is_another_drive(made):
-    ending, frames, usable = made
+@given(st.sampled_from(["blf", "asc", "mf4"]), st.integers(0, 0xFD), SHARE, SHARE, SHARE, st.integers(0, 2**32 - 1))
+def test_no_disturbed_bus_is_another_drive(ending, sender, lost, none, late, seed):
+    frames, usable = disturbed(sender, lost, none, late, seed)
     with tempfile.TemporaryDirectory() as folder:
         log = read_log(write(Path(folder) / f"x.{ending}", frames))
     t, d = np.asarray(log.segments.time_s), np.asarray(log.segments.duration_s)
     assert len(log.trip_names) == 1
     assert usable - 15 <= len(log) <= usable, "each measured current a row, but for the ends and for lost speeds"
-    np.testing.assert_allclose(np.asarray(log.segments.distance_m) / d, np.interp(t, T, V) / 3.6, atol=0.12)
-    np.testing.assert_allclose(log.measured["battery_power_w"], 600.0 * np.interp(t, T, AMPS), rtol=0.02)
+    # the time is that of a row's begin, which a lost frame before it draws forward
+    np.testing.assert_allclose(np.asarray(log.segments.distance_m) / d, np.interp(t, T, V) / 3.6, atol=0.2)
+    np.testing.assert_allclose(log.measured["battery_power_w"], 600.0 * np.interp(t, T, AMPS), atol=3e3)
     assert 0.85 * T[-1] < np.sum(d) < T[-1] + 0.2
