@@ -136,6 +136,28 @@ def test_what_the_database_calls_not_available_is_missing(tmp_path):
     np.testing.assert_allclose(np.sum(log.segments.distance_m), np.sum(V) / 36.0, rtol=1e-2)
 
 
+def test_all_ones_beyond_the_range_are_no_mass():
+    """Whether or not the database says that its messages are of SAE J1939."""
+    text = 'BU_: X\nBO_ 2566844672 Weights: 8 X\n SG_ Mass : 16|16@1+ (10,0) [0|64255] "kg" X\n'
+    (message,) = cantools.database.load_string(f'VERSION ""\n{text}').messages
+    data = np.array([[0, 0, 0xFF, 0xFF, 0, 0, 0, 0], [0, 0, 0x10, 0x01, 0, 0, 0, 0]], np.uint8)
+    found = physical(message.signals[0], data, {}, False)
+    np.testing.assert_array_equal(found, [np.nan, 2720.0])
+
+
+@pytest.mark.parametrize("ending", ["blf", "asc"])
+def test_two_recordings_in_one_file_are_not_mixed(tmp_path, ending):
+    frames = drive()
+    path = write(tmp_path / f"x.{ending}", frames)
+    if ending == "asc":
+        lines = path.read_text().splitlines(keepends=True)
+        path.write_text("".join([*lines[:-1], *lines[5:]]))
+    else:
+        write(path, [*frames, *frames])
+    with pytest.raises(InputError, match=r"the clock goes back from 19.*two recordings in one file"):
+        read_log(path)
+
+
 def test_faster_powers_are_averaged_and_states_kept(tmp_path):
     mdf, t = asammdf.MDF(version="4.10"), np.arange(0.0, 20.0, 0.01)
     mdf.append([asammdf.Signal(10.0 + T, T, name="v", unit="m/s")], comment="slow")

@@ -146,7 +146,7 @@ def _measured_rows(piece: Piece, work: Work, adapter: Adapter, by_channel: bool)
         why = f"rows = '{header}' of the adapter: it was not measured there"
     else:
         if by_channel:  # put on another channel's clock, a target is there at its own times alone
-            work.unfilled |= {c: piece.data[c] for c in MEASURED_COLUMNS if c in piece.data}
+            work.unfilled = {c: piece.data[c] for c in MEASURED_COLUMNS if c in piece.data} | work.unfilled
         filled = [c for c in MEASURED_COLUMNS if c in work.unfilled and c in piece.data]
         if not filled:
             return piece

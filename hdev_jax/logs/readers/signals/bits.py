@@ -53,8 +53,12 @@ def physical(signal: Any, data: np.ndarray, others: Mapping[str, Any], j1939: bo
         x = bits.astype(np.float64)
     out = np.asarray(conversion.offset + conversion.scale * x, np.float64)
     none = _stands_for_none(signal, x)
-    if j1939 and not signal.is_signed and not conversion.is_float:
-        none |= _beyond_valid(bits, signal.length)
+    if not signal.is_signed and not conversion.is_float:
+        if j1939:
+            none |= _beyond_valid(bits, signal.length)
+        if (most := signal.maximum) is not None and most > (signal.minimum or 0.0):
+            # all ones, and more than the database says that there can be: the custom of most makers
+            none |= (bits == np.uint64((1 << signal.length) - 1)) & (out > float(most))
     return np.where(none | ~_present(signal, data, others), np.nan, out)
 
 

@@ -13,7 +13,7 @@ from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.readers.libraries import library
 from hdev_jax.logs.readers.raw import Channel
 from hdev_jax.logs.readers.signals.bits import physical
-from hdev_jax.logs.readers.signals.frames import Identifier, Recording
+from hdev_jax.logs.readers.signals.frames import Identifier, Recording, forward
 
 __all__ = ["FMS", "Database", "channels_of_frames"]
 
@@ -45,7 +45,7 @@ class Database:
                 raise InputError(f"{path}: no database of CAN messages ({str(e)[:120]})") from None
             for m in found:
                 exact.setdefault((m.frame_id, m.is_extended_frame), m)
-                if m.is_extended_frame and (m.protocol == "j1939" or m.frame_id & 0xFF == _NULL_ADDRESS):
+                if _is_j1939(m):
                     groups.setdefault(_group(m.frame_id), m)
         if not exact:
             raise InputError(f"{', '.join(paths)}: a database without messages")
@@ -56,9 +56,10 @@ class Database:
         found = self.exact.get((number, extended))
         return found if found is not None or not extended else self.groups.get(_group(number))
 
-    def is_j1939(self, message: Any) -> bool:
-        """Whether SAE J1939 says which numbers stand for "not available" and "error"."""
-        return message.is_extended_frame and self.groups.get(_group(message.frame_id)) is message
+
+def _is_j1939(message: Any) -> bool:
+    """Whether a message is one of SAE J1939, which says what stands for "not available" and "error"."""
+    return message.is_extended_frame and (message.protocol == "j1939" or message.frame_id & 0xFF == _NULL_ADDRESS)
 
 
 def _group(number: int) -> int:
@@ -73,17 +74,20 @@ def channels_of_frames(
     """The signals of a recording as channels: by their own names, `Message.Signal` where several messages have one.
 
     Of a signal that several senders or buses have, the one with the most values is taken and the others are counted.
+    Raises `InputError` where the recording's clock goes back.
     """
     senders: dict[str, list[Identifier]] = {}
     messages: dict[str, Any] = {}
     for identifier in recording.identifiers:
+        for time, _ in recording.of(identifier):
+            forward(time, file)
         message: Any = database.message(identifier.number, identifier.extended)
         senders.setdefault(message.name, []).append(identifier)
         messages[message.name] = message
     names = [s.name for m in messages.values() for s in m.signals]
     channels: dict[str, Channel] = {}
     for title, message in messages.items():
-        j1939 = database.is_j1939(message)
+        j1939 = _is_j1939(message)
         others = {s.name: s for s in message.signals}
         for signal in message.signals:
             name = signal.name if names.count(signal.name) == 1 else f"{title}.{signal.name}"

@@ -14,13 +14,14 @@ import numpy as np
 from hdev_jax.errors import InputError
 from hdev_jax.logs.readers.libraries import library
 
-__all__ = ["Asked", "Identifier", "Recording", "read_frames"]
+__all__ = ["Asked", "Identifier", "Recording", "forward", "read_frames"]
 
 Asked = Callable[[int, bool], bool]
 """Whether frames of an identifier (and whether it is an extended one) are wanted."""
 
 _BLF_SIZE_AT = 16  # of the header: what the file's size was when it was closed
 _BLF_HEADER = 144
+_LATE_S = 1.0  # frames wait for the bus for milliseconds; a recorder that begins anew goes back further
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,14 @@ class Recording:
     def identifiers(self) -> list[Identifier]:
         """Every identifier asked for that the recording has."""
         return list(dict.fromkeys(i for i, _ in self.frames))
+
+
+def forward(time: np.ndarray, file: str) -> None:
+    """Raises `InputError` where a clock [s] goes back: what follows is another recording, which would be mixed in."""
+    if len(time) > 1 and (step := np.diff(time)).min() < -_LATE_S:
+        i = int(step.argmin())
+        back = f"from {time[i]:.10g} to {time[i + 1]:.10g} s"
+        raise InputError(f"{file}: the clock goes back {back}: two recordings in one file? Split it")
 
 
 def read_frames(path: Path, kind: str, asked: Asked) -> Recording:

@@ -14,7 +14,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.readers.libraries import library
 from hdev_jax.logs.readers.raw import Channel
-from hdev_jax.logs.readers.signals.frames import Asked, Identifier, Recording
+from hdev_jax.logs.readers.signals.frames import Asked, Identifier, Recording, forward
 
 __all__ = ["channels_of_mdf", "frames_of_mdf", "open_mdf"]
 
@@ -89,7 +89,9 @@ def _load(path: Path, mdf: Any, name: str, group: int, index: int) -> tuple[np.n
     x = x.astype(np.float64)
     if signal.invalidation_bits is not None:
         x = np.where(np.asarray(signal.invalidation_bits, bool), np.nan, x)
-    return np.asarray(signal.timestamps, np.float64), x
+    time = np.asarray(signal.timestamps, np.float64)
+    forward(time, path.name)
+    return time, x
 
 
 @contextmanager
