@@ -41,8 +41,8 @@ class Recording:
     """The frames asked for, by identifier and length: times [s] and bytes; how many others there were, by number; how
     many error and remote frames; whether the recorder never closed the file."""
 
-    frames: dict[tuple[Identifier, int], tuple[array, bytearray]] = field(default_factory=dict)
-    others: Counter = field(default_factory=Counter)
+    frames: dict[tuple[Identifier, int], tuple["array[float]", bytearray]] = field(default_factory=dict)
+    others: Counter[tuple[int, bool]] = field(default_factory=Counter)
     faulty: int = 0
     cut: bool = False
 
