@@ -78,7 +78,7 @@ def clocked(raw: Raw, adapter: Adapter) -> Raw:
             kind = resampling(name, channel.unit, adapter)
             table[name], how = _resampled(t, x, clock, kind, name in measured)
             known = int(np.isfinite(table[name]).sum())
-            if name != clock.name:
+            if how and name != clock.name:
                 why = f"{len(t)} values at the times of {clock.shown}: {how}"
                 ledger = ledger.add("derived", why, count=known, file=file, column=name)
     units = {"time_s": "s", **{n: c.unit for n, c in raw.channels.items() if c.unit is not None}}
@@ -239,9 +239,9 @@ def _step(t: np.ndarray) -> float:
 
 
 def _resampled(t: np.ndarray, x: np.ndarray, clock: _Clock, kind: str, measured: bool) -> tuple[np.ndarray, str]:
-    """A channel at the clock's times, and how it came there in words."""
+    """A channel at the clock's times, and how it came there in words; nothing to say where it is as it was."""
     if len(t) == len(clock.at) and np.array_equal(t, clock.at):
-        return x, "as they are"
+        return x, ""
     faster = _step(t) * FASTER <= clock.step * (1.0 + 1e-6)
     if measured or kind == "sum" or (kind == "mean" and faster):
         means, far = _around(t, x, clock, kind == "sum", faster)

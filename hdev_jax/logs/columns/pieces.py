@@ -45,7 +45,7 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
     """Columns of a raw table under the contract's names in SI. Raises `InputError` (file, row, column, what to do)."""
     raw, adapter = _of_its_tool(raw, adapter)
     by_channel = adapter.long is not None or bool(raw.channels)
-    if raw.channels:
+    if raw.asked_only:
         raw = named(raw, adapter)
     elif adapter.long is not None:
         raw = channels_of_long(raw, adapter)

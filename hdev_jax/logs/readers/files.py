@@ -101,8 +101,7 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
     """The tables of a file (a MATLAB file of layout `time_value` may hold several trips), companion joined."""
     kind = format_of(path, adapter)
     if kind == "mat":
-        tables, ledger = read_mat(path, read_bytes(path, kind), adapter)
-        raws = [Raw(path.name, table, trip, ledger=ledger) for trip, table in tables.items()]
+        raws = read_mat(path, read_bytes(path, kind), adapter)
     elif kind in SIGNALS:
         raws = [read_signals(path, kind, adapter)]
     else:

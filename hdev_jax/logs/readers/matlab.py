@@ -16,6 +16,7 @@ from hdev_jax.logs.adapter import Adapter
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.readers.libraries import library
 from hdev_jax.logs.readers.names import stem, trip_of
+from hdev_jax.logs.readers.raw import Channel, Raw
 
 __all__ = ["numeric_variables", "read_mat"]
 
@@ -149,8 +150,9 @@ def _of_version_5(path: Path, data: bytes) -> tuple[dict[str, np.ndarray], dict[
     return {n: a for n, a in arrays.items() if isinstance(a, np.ndarray) and a.dtype.kind in "fiub"}, others
 
 
-def read_mat(path: Path, data: bytes, adapter: Adapter) -> tuple[dict[str, pd.DataFrame], Ledger]:
-    """Tables by trip. Raises `InputError` for a damaged file, and for one without vectors or [time, value] pairs."""
+def read_mat(path: Path, data: bytes, adapter: Adapter) -> list[Raw]:
+    """A table, or each trip's channels. Raises `InputError` for a damaged file, and for one without vectors or [time,
+    value] pairs."""
     arrays, others = _variables(path, data)
     if not arrays:
         raise InputError(f"{path}: no numeric variable; {_export(others)}")
@@ -159,8 +161,9 @@ def read_mat(path: Path, data: bytes, adapter: Adapter) -> tuple[dict[str, pd.Da
         shown = ", ".join(f"{name} ({kind})" for name, kind in others.items())
         ledger = ledger.add("noted", f"variables that are no numbers, left out: {shown}", file=path.name)
     if adapter.layout == "time_value":
-        return _time_value(path, arrays, adapter), ledger
-    return _table(path, arrays, adapter), ledger
+        trips = _time_value(path, arrays, adapter)
+        return [Raw(path.name, pd.DataFrame(), t, ledger=ledger, channels=c) for t, c in trips.items()]
+    return [Raw(path.name, _table(path, arrays), trip_of(path, adapter), ledger=ledger)]
 
 
 def _export(others: dict[str, str]) -> str:
@@ -171,7 +174,7 @@ def _export(others: dict[str, str]) -> str:
     return f"'{name}' is a {kind}, which only MATLAB reads: there, {_EXPORTS[kind].format(name)}"
 
 
-def _table(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> dict[str, pd.DataFrame]:
+def _table(path: Path, arrays: dict[str, np.ndarray]) -> pd.DataFrame:
     """Each variable that is a vector is a column."""
     vectors = {n: a.ravel() for n, a in arrays.items() if a.ndim == 2 and min(a.shape) == 1}
     if not vectors:
@@ -185,12 +188,12 @@ def _table(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> dict[
         (n0, s0), (n1, s1) = next((a, b) for a in sizes.items() for b in sizes.items() if a[1] != b[1])
         raise InputError(f"{path}: variables of different length: '{n0}' has {s0} values, '{n1}' {s1}")
     size = next(iter(sizes.values()), 1)
-    return {trip_of(path, adapter): pd.DataFrame({n: v for n, v in vectors.items() if len(v) == size})}
+    return pd.DataFrame({n: v for n, v in vectors.items() if len(v) == size})
 
 
-def _time_value(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> dict[str, pd.DataFrame]:
-    """Each variable is [time, value]; variables of a trip are put on the clock of the longest one."""
-    trips: dict[str, dict[str, np.ndarray]] = {}
+def _time_value(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> dict[str, dict[str, Channel]]:
+    """Each variable is [time, value], a channel of its trip."""
+    trips: dict[str, dict[str, Channel]] = {}
     for name, array in arrays.items():
         if array.ndim != 2 or array.shape[1] != 2:
             continue
@@ -210,18 +213,10 @@ def _time_value(path: Path, arrays: dict[str, np.ndarray], adapter: Adapter) -> 
                 continue
         if channel in trips.setdefault(trip, {}):
             raise InputError(f"{path}: two variables of trip {trip} are the channel '{channel}', one of them '{name}'")
-        trips[trip][channel] = array.astype(np.float64)
+        time, values = array.astype(np.float64).T
+        if (np.diff(time[np.isfinite(time)]) < 0).any():
+            raise InputError(f"{path}: the time of '{channel}' in trip {trip} does not run forward")
+        trips[trip][channel] = Channel.of(time, values)
     if not trips:
         raise InputError(f"{path}: no variable of two columns [time, value] that the adapter {adapter.where} names")
-    tables = {}
-    for trip, channels in trips.items():
-        longest = max(channels, key=lambda c: len(channels[c]))
-        clock = channels[longest][:, 0]
-        table: dict[str, np.ndarray] = {"time_s": clock}
-        for channel, a in channels.items():
-            same = len(a) == len(clock) and np.array_equal(a[:, 0], clock, equal_nan=True)
-            if not same and (len(a) < 2 or not np.all(np.diff(a[:, 0]) > 0)):
-                raise InputError(f"{path}: the time of '{channel}' in trip {trip} does not run forward")
-            table[channel] = a[:, 1] if same else np.interp(clock, a[:, 0], a[:, 1], left=np.nan, right=np.nan)
-        tables[trip] = pd.DataFrame(table)
-    return tables
+    return trips

@@ -38,7 +38,8 @@ class Raw:
 
     `trip` is the name the file or the variables give it; a `trip_id` column goes before it. `lines` has the line of
     each row in a text file, None elsewhere; `units` what a row of units or a column of them says of a column;
-    `thousands` the separator that the adapter names; `ledger` what reading changed.
+    `thousands` the separator that the adapter names; `ledger` what reading changed; `asked_only` whether channels that
+    nothing names are left out.
     """
 
     file: str
@@ -50,6 +51,7 @@ class Raw:
     thousands: str | None = None
     ledger: Ledger = field(default_factory=Ledger)
     channels: Mapping[str, Channel] = field(default_factory=dict)
+    asked_only: bool = False
 
     def where(self, row: int) -> str:
         """`row 3 (line 4)` of a row counted from 0."""

@@ -45,7 +45,7 @@ def read_signals(path: Path, kind: str, adapter: Adapter) -> Raw:
         channels |= decoded
     if not channels:
         raise InputError(f"{path}: no channel over time and no CAN frame")
-    return Raw(path.name, pd.DataFrame(), trip_of(path, adapter), ledger=ledger, channels=channels)
+    return Raw(path.name, pd.DataFrame(), trip_of(path, adapter), ledger=ledger, channels=channels, asked_only=True)
 
 
 def _decoded(
