@@ -73,6 +73,23 @@ def test_each_kind_has_its_way():
     assert set(log.segments.channels["my_kw"]) == {1.0, 2.0, 3.0}
 
 
+def test_energies_by_row_are_summed_and_never_shared_out():
+    """On a faster clock a row would have the energy of many; a counter has a value at every time."""
+    frame = uneven({"speed_mps": 1.0, "battery_power_kw": 0.25}).rename(columns={"battery_power_kw": "energy_wh"})
+    frame["energy_wh"] *= 0.25 / 3.6
+    log = read(frame, clock="speed_mps")
+    np.testing.assert_allclose(
+        np.sum(log.target("energy_wh")), np.sum(power(np.arange(0.0, 119.25, 0.25))) / 14.4, rtol=0.01
+    )
+    slow = uneven({"speed_mps": 0.1, "battery_power_kw": 2.0}).rename(columns={"battery_power_kw": "energy_wh"})
+    with pytest.raises(InputError, match=r"'energy_wh' is a sum over each 2 s, slower than the clock of 0\.1 s"):
+        read(slow, clock="speed_mps")
+    assert len(read(slow, clock="energy_wh")) == 60
+    counts = slow.assign(energy_wh=1e4 + 5.0 * slow["time_s"].where(slow["energy_wh"].notna()))
+    log = read(counts, clock="speed_mps", columns={"energy_wh": {"source": "energy_wh", "counter": True}})
+    np.testing.assert_allclose(np.sum(log.target("energy_wh")), 5.0 * float(np.sum(log.segments.duration_s)), rtol=0.01)
+
+
 def test_trips_are_apart():
     one = uneven({"speed_mps": 1.0, "battery_power_kw": 0.5})
     both = pd.concat([one.assign(trip_id="A"), one.assign(trip_id="B")])

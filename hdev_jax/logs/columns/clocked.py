@@ -27,7 +27,6 @@ _SMOOTH = ("soc",)
 SAME_RATE = 1.5  # steps closer than that are of one rate: messages are sent every 10, 20, 50, 100 ms
 FASTER = 2.0  # at twice the clock's rate a row has two values or more, and their mean; below, a line has less delay
 
-
 _Loader = Callable[[str], tuple[np.ndarray, np.ndarray]]
 
 
@@ -50,7 +49,8 @@ def clocked(raw: Raw, adapter: Adapter) -> Raw:
 
     A power is the mean over a row's interval, an energy the sum, a state the last value, all else linear between its
     own values; over more than ten of its own steps no value is known. What is measured at the battery is never made up
-    between measurements: a row without one has none. Raises `InputError` where no channel is the clock.
+    between measurements: a row without one has none. Raises `InputError` where no channel is the clock, or a sum would
+    have to be shared out.
     """
     file, ledger = raw.file, raw.ledger
     values: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -76,6 +76,9 @@ def clocked(raw: Raw, adapter: Adapter) -> Raw:
             ledger = ledger.add("noted", "no number in it, left out", file=file, column=name)
         else:
             kind = resampling(name, channel.unit, adapter)
+            if kind == "sum" and _step(t) > SAME_RATE * clock.step:
+                what = f"'{name}' is a sum over each {_step(t):g} s, slower than the clock of {clock.step:g} s"
+                raise InputError(f"{file}: {what}: make it the clock, or say counter = true if it counts on")
             table[name], how = _resampled(t, x, clock, kind, name in measured)
             known = int(np.isfinite(table[name]).sum())
             if how and name != clock.name:
