@@ -66,12 +66,13 @@ def _counter(log: Log) -> Suspicion | None:
         return None
     trip = np.asarray(log.segments.trip)
     step = np.diff(x)[trip[1:] == trip[:-1]]
-    if len(step) < MANY or not np.any(step) or np.median(np.abs(step)) > SMOOTH * np.median(np.abs(x)):
-        return None
-    turns = min(float(np.mean(step > 0)), float(np.mean(step < 0)))
-    if turns > RETURNED:
+    if len(step) < MANY:
         return None
     value, change = float(np.median(np.abs(x))), float(np.median(np.abs(step)))
+    if value == 0.0 or change > SMOOTH * value or not np.any(step):
+        return None
+    if min(float(np.mean(step > 0)), float(np.mean(step < 0))) > RETURNED:
+        return None
     evidence = f"{value:.4g} Wh in the median row, changing by {change:.2g} Wh: a counter?"
     mend = mended(log, "energy_wh").replace(" }", ", counter = true }")
     return Suspicion("energy_wh", evidence, mend)
