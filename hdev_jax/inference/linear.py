@@ -24,7 +24,7 @@ TINY = 1e-14  # share of the largest eigenvalue under which a direction is round
 class Statistics(eqx.Module):
     """Sums over rows, each by its weight; a leading axis where they are of several vehicles or trips.
 
-    `gram` Σxxᵀ, `moment` Σxr, `square` Σr², `rows` Σ1, `driving` rows with energy out of the battery, `largest` max r².
+    `gram` Σxxᵀ, `moment` Σxr, `square` Σr², `rows` Σ1, `driving` rows that give no energy back, `largest` max r².
     """
 
     gram: Float[Array, "*group k k"]
@@ -168,7 +168,7 @@ def statistics(
     heavy = weight > 0
     each = Statistics(
         weight[:, None, None] * x[:, :, None] * x[:, None, :], (weight * r)[:, None] * x, weight * r**2,
-        weight, weight * (jnp.asarray(measured) > 0), jnp.where(heavy, weight * r**2, 0.0),
+        weight, weight * (jnp.asarray(measured) >= 0), jnp.where(heavy, weight * r**2, 0.0),
     )  # fmt: skip
     if group is None:
         return each.total()

@@ -27,11 +27,12 @@ from hdev_jax.logs.schema import (
 from hdev_jax.textfiles import read_toml
 from hdev_jax.units import COLUMNS, conversion, parse_column, unit_of
 
-__all__ = ["FILLS", "FORMATS", "LAYOUTS", "Adapter", "Companion", "Long", "Rule", "near"]
+__all__ = ["FILLS", "FORMATS", "LAYOUTS", "RESAMPLINGS", "Adapter", "Companion", "Long", "Rule", "near"]
 
-FORMATS = ("csv", "parquet", "feather", "jsonl", "xlsx", "mat")
+FORMATS = ("csv", "parquet", "feather", "jsonl", "xlsx", "mat", "xml", "mf4", "blf", "asc")
 LAYOUTS = ("table", "time_value", "long")
 FILLS = ("forward", "nearest", "linear")
+RESAMPLINGS = ("mean", "sum", "last", "linear")
 _TEXT_COLUMNS = ("trip_id", "vehicle_id")
 _THOUSANDS = (".", ",", "'", "’", " ", "\u00a0", "\u202f")
 
@@ -45,7 +46,8 @@ class Rule:
     A source that is itself a column made here is taken in SI, after its own fill. Of `alternatives` (in TOML `or`) the
     first that the file has stands in for a source that it lacks. An id, and a clock of date and time, may have several
     sources; `format` is a clock's, in the letters of strptime. Of a `counter`, an odometer or the energy since some
-    start, each sample has what was added around it.
+    start, each sample has what was added around it. `resample` says how a channel of another rate is put on the clock;
+    without it, its quantity does (`logs/columns/clocked.py`).
     """
 
     source: str | tuple[str, ...]
@@ -58,6 +60,7 @@ class Rule:
     format: str | None = None
     alternatives: tuple[str, ...] = ()
     counter: bool = False
+    resample: str | None = None
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -90,6 +93,9 @@ class Long:
 class Adapter:
     """What a file of this kind means. `where` names it in messages; without arguments it changes nothing.
 
+    `clock` names the channel at whose times rows are made where channels have rates of their own, of several the first
+    that the file has, or is a step [s]; `dbc` the databases of CAN frames. `others` (keep or drop) says what becomes of
+    columns without a rule: a table's are kept, signals of a bus are dropped.
     `rows` keeps the rows where that column was measured; `charging` says whether charging at standstill is cut;
     `repeated_stamps = "spread"` spreads rows of one time stamp over the time to the next.
     """
@@ -111,14 +117,17 @@ class Adapter:
     repeated_stamps: str = "drop"
     rows: str | None = None
     charging: str = "cut"
-    others: str = "keep"
+    others: str | None = None
+    clock: str | tuple[str, ...] | float | None = None
+    dbc: tuple[str, ...] = ()
     columns: Mapping[str, Rule] = field(default_factory=dict)
 
     @staticmethod
     def load(path: str | Path) -> "Adapter":
         """Read a TOML file. Raises `InputError` for whatever is wrong in it."""
         path = Path(path)
-        return Adapter.from_dict(read_toml(path, "adapter")[0], where=path.name)
+        made = Adapter.from_dict(read_toml(path, "adapter")[0], where=path.name)
+        return replace(made, dbc=tuple(str(path.parent / d) for d in made.dbc))
 
     @staticmethod
     def from_dict(values: Mapping[str, Any], where: str = "adapter") -> "Adapter":
@@ -141,6 +150,8 @@ class Adapter:
             "rows": text,
             "charging": one_of(("cut", "keep")),
             "others": one_of(("keep", "drop")),
+            "clock": _clock,
+            "dbc": _files,
             "columns": _columns,
         }
         made = Adapter(where=where, **checked(values, known, where))
@@ -153,6 +164,10 @@ class Adapter:
         usual = Adapter()
         own = {k: v for k in vars(usual) if (v := getattr(self, k)) != getattr(usual, k)}
         return replace(preset, **own | {"columns": {**preset.columns, **self.columns}})
+
+    def without(self, column: str) -> "Adapter":
+        """This adapter without its rule for a column."""
+        return replace(self, columns={c: r for c, r in self.columns.items() if c != column})
 
     def match(self, pattern: str, name: str) -> str | None:
         """First group of the pattern in `name` (the whole match where it has none), None without a match."""
@@ -181,6 +196,19 @@ def _companion(where: str, value: Any) -> Companion:
     return Companion(**got)
 
 
+def _clock(where: str, value: Any) -> str | tuple[str, ...] | float:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if (step := number(where, value)) <= 0:
+            raise InputError(f"{where} = {value!r}: a step above 0 s is expected, or the name of a channel")
+        return step
+    return texts(where, value)
+
+
+def _files(where: str, value: Any) -> tuple[str, ...]:
+    names = texts(where, value)
+    return (names,) if isinstance(names, str) else names
+
+
 def _long(where: str, value: Any) -> Long:
     values = table(where, value, ())
     got = checked(values, {"time": text, "name": text, "value": text, "unit": text, "clock": texts}, where)
@@ -201,6 +229,7 @@ def _columns(where: str, value: Any) -> dict[str, Rule]:
         "valid": span,
         "format": text,
         "counter": flag,
+        "resample": one_of(RESAMPLINGS),
     }
     for name, entry in table(where, value, ()).items():
         here = f"{where}.{name}"

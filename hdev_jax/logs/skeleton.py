@@ -19,15 +19,16 @@ from hdev_jax.units import COLUMNS, NEEDED_STEMS, accepted
 __all__ = ["write_adapter_skeleton"]
 
 
-def write_adapter_skeleton(path_of_log: str | Path) -> str:
+def write_adapter_skeleton(path_of_log: str | Path, adapter: Adapter | None = None) -> str:
     """TOML text to fill in: a line for each column of the file, guesses commented out, units as the file says them.
 
-    A file that the reader refuses gets one too, with what it was refused for. Raises `InputError` where not even its
-    header can be read.
+    Of an `adapter` only the databases count, by which frames have names. A file that the reader refuses gets one too,
+    with what it was refused for. Raises `InputError` where not even its header can be read.
     """
     path = Path(path_of_log)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    databases = adapter.dbc if adapter is not None else ()
     kind = format_of(path, Adapter())
     layout, trip_id, variable, headers, units = "table", "(.+)", "", list[str](), dict[str, str]()
     refused = ""
@@ -35,8 +36,10 @@ def write_adapter_skeleton(path_of_log: str | Path) -> str:
         layout, trip_id, variable, headers = pairs
     if not headers:
         try:
-            raw = read_raw(path, Adapter())[0]
+            raw = read_raw(path, Adapter(dbc=databases))[0]
             headers, units = [str(c) for c in raw.table.columns], dict(raw.units)
+            if raw.channels:
+                headers, units = list(raw.channels), {n: c.unit for n, c in raw.channels.items() if c.unit}
         except InputError as e:
             if kind != "csv":
                 raise
@@ -53,6 +56,7 @@ def write_adapter_skeleton(path_of_log: str | Path) -> str:
         if pairs_of
         else f"# trip_id = '^({re.escape(stem(path.name))})'   # else the file's name",
         *([f"variable = '{variable}'"] if variable else []),
+        *([f"dbc = [{', '.join(_quoted(str(Path(d).resolve())) for d in databases)}]"] if databases else []),
         *([f'preset = "{preset.preset}"   # its header is known; what stands below goes before it'] if preset else []),
         '# companion = { suffix = ".grade.csv", on = "time_s" }',
         "# edge_trim_s = 0.0",

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from hdev_jax.inference import padded
-from hdev_jax.logs.checks import Suspicion, alternatives, mended, suspicions
+from hdev_jax.logs.checks import Suspicion, alternatives, constant_target, mended, suspicions
 from hdev_jax.problem.problem import Problem
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS
@@ -46,6 +46,9 @@ def implausible(problem: Problem, trips: tuple[int, ...] | None = None) -> tuple
 
     **Arguments:** `trips`, ids of those to look at, else all.
     """
+    used = problem.measured if trips is None else problem.measured[problem.rows(trips)]
+    if problem.log.targets and (constant := constant_target(problem.target, used)) is not None:
+        return (constant,)
     found = suspicions(problem.log)
     target = TARGETS[problem.target]
     if (

@@ -13,6 +13,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import cluster_rows, padded
 from hdev_jax.inference.posterior.methods import METHODS, Method, Outcome, calibrated
 from hdev_jax.inference.sheet import augmented_sheet
+from hdev_jax.logs.checks import COASTING
 from hdev_jax.problem import Problem, Split, implausible, metrics
 from hdev_jax.report.build import report_data
 from hdev_jax.rundir import Run, open_run
@@ -99,7 +100,8 @@ def _calibrated(
     sheet = augmented_sheet(start.sheet, values, {})
     predictive, notes = predictive_of(problem, split, fit, noise, sheet_digest(sheet))
     summary["notes"] += notes
-    summary["notes"] += [f"suspected: {s.line()}" for s in implausible(problem, split.train)]
+    suspected = [s for s in implausible(problem, split.train) if s.what != COASTING]
+    summary["notes"] += [f"suspected: {s.line()}" for s in suspected]
     data = report_data(problem, split, summary, predicted, predicted, command_line("calibrate", run), started)
     lines = [f"{name:32s} {v:12.6g} ± {s:.3g}" for name, (v, s) in values.items()]
     lines += [] if outcome.good else [f"NOT A GOOD FIT: {fit.message}"]

@@ -6,6 +6,7 @@ import numpy as np
 
 from hdev_jax.logs import write_adapter_skeleton
 from hdev_jax.logs.checks import suspicions
+from hdev_jax.logs.read import adapter_of
 from hdev_jax.problem import implausible, prepare
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of
@@ -25,7 +26,8 @@ def check(
     With `skeleton`, an adapter to fill in instead. Raises `InputError`.
     """
     if skeleton:
-        return write_adapter_skeleton(Path(logs if isinstance(logs, str | Path) else next(iter(logs))))
+        first = Path(logs if isinstance(logs, str | Path) else next(iter(logs)))
+        return write_adapter_skeleton(first, None if adapter is None else adapter_of(adapter))
     log = log_of(logs, adapter)
     s = log.segments
     lines = [f"{len(log)} rows, {len(log.trip_names)} trips, {len(log.vehicle_names)} vehicles"]

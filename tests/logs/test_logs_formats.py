@@ -91,10 +91,17 @@ def test_mat_time_value(tmp_path):
 
 
 def test_mat_time_value_puts_channels_on_one_clock(tmp_path):
+    """That of the power, which is the slower one: between two measurements there is none."""
     t, slow = np.arange(101) * 0.5, np.arange(11) * 5.0
     scipy.io.savemat(tmp_path / "x.mat", {"Run1_V_f": np.c_[t, 30 + t], "Run1_P_f": np.c_[slow, 2.0 * slow]})
     log = read_log(tmp_path / "x.mat", Adapter.from_dict(TIME_VALUE))
-    np.testing.assert_allclose(log.measured["battery_power_w"], 2000.0 * t, atol=1e-9)
+    np.testing.assert_allclose(log.measured["battery_power_w"], 2000.0 * slow)
+    np.testing.assert_allclose(log.segments.distance_m, (30.0 + slow) / 3.6 * 5.0)
+    fast = read_log(tmp_path / "x.mat", Adapter.from_dict({**TIME_VALUE, "clock": "V"}))
+    np.testing.assert_allclose(fast.measured["battery_power_w"], 2000.0 * slow)
+    scipy.io.savemat(tmp_path / "x.mat", {"Run1_V_f": np.c_[t[::-1], 30 + t], "Run1_P_f": np.c_[slow, 2.0 * slow]})
+    with pytest.raises(InputError, match="the time of 'V' in trip 1 does not run forward"):
+        read_log(tmp_path / "x.mat", Adapter.from_dict(TIME_VALUE))
 
 
 def _adapted(tmp_path, frame, **adapter):

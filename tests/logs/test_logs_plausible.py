@@ -170,3 +170,26 @@ def test_an_interval_that_stands_at_both_ends_and_drives_between_them_is_no_char
         index=range(20),
     )
     assert len(log_from_frame(frame)) == 20
+
+
+@pytest.mark.parametrize("name", ["battery_power_w", "traction_force_n"])
+def test_a_target_that_never_changes_is_said_with_what_to_do(name):
+    frame = drive(CAR, 4).rename(columns={"battery_power_w": name}).assign(**{name: 0.0})
+    (one,) = suspicions(log_from_frame(frame))
+    assert one.what == "constant target 0"
+    assert ("traction_force_n = 0 in place of that column" in one.mend) == (name == "battery_power_w")
+    assert "hdev calibrate" in one.mend
+    (one,) = suspicions(log_from_frame(frame.assign(**{name: 700.0})))
+    assert one.what == "constant target"
+    assert f"in all {len(frame)} rows" in one.evidence
+
+
+def test_state_of_charge_times_capacity_is_a_counter_of_energy():
+    """64 kWh, in steps of 0.1 %: the sum is right to a step, and rows without a step are no counter themselves."""
+    frame = drive(CAR, 6)
+    drawn = np.cumsum(frame.pop("battery_power_w")) / 3600.0
+    frame["SOC"] = np.round(80.0 - drawn / 640.0, 1)
+    rule = {"energy_wh": {"source": "SOC", "affine": [0, -640], "counter": True}}
+    log = log_from_frame(frame, adapter=Adapter.from_dict({"columns": rule}))
+    assert abs(float(np.sum(log.target("energy_wh"))) - float(drawn.iloc[-1])) < 128.0
+    assert suspicions(log) == ()

@@ -50,3 +50,20 @@ def test_a_right_log_is_searched_and_one_that_is_trusted(sign, trust):
 def test_a_calibration_says_what_is_suspected():
     assert any(n.startswith("suspected: sign of") for n in hdev_jax.calibrate(trips(-1.0), SHEET).summary["notes"])
     assert not any("suspected" in n for n in hdev_jax.calibrate(trips(), SHEET).summary["notes"])
+
+
+def test_a_coast_down_is_calibrated_and_not_searched():
+    """The drive does nothing: its road load is what there is to find."""
+    v = [40.0]
+    while v[-1] > 8.0:
+        force = 1500.0 * 9.80665 * 0.012 + 0.5 * 1.225 * 0.65 * v[-1] ** 2
+        v.append(v[-1] - force / 1500.0)
+    one = {"time_s": np.arange(float(len(v))), "speed_mps": v, "traction_force_n": 0.0}
+    log = pd.concat([pd.DataFrame({"trip_id": name, **one}) for name in ("a", "b", "c")], ignore_index=True)
+    sheet = {"mass_kg": 1500.0, "road": {"c_rr": (0.02, 0.008), "cda_m2": (0.9, 0.3)}}
+    found = hdev_jax.diagnose(log, sheet, only=["headwind"])
+    assert (found.summary["verdict"], found.summary["effects"]) == ("suspect_log", [])
+    assert found.summary["suspicions"][0]["what"] == "constant target 0"
+    fitted = hdev_jax.calibrate(log, sheet)
+    assert not any("suspected" in note or "gives energy back" in note for note in fitted.summary["notes"])
+    assert abs(fitted.coefficients.loc["road.c_rr", "value"] / 0.012 - 1.0) < 0.05

@@ -1,4 +1,5 @@
-"""What a log alone shows: the sign of the power, the size of the consumption, distance against speed."""
+"""What a log alone shows: a target that never changes, the sign of the power, the size of the consumption, distance
+against speed."""
 
 import numpy as np
 
@@ -6,7 +7,10 @@ from hdev_jax.logs.checks.suspicion import Suspicion, mended
 from hdev_jax.logs.log import Log
 from hdev_jax.units import GRAVITY_MPS2
 
-__all__ = ["suspicions"]
+__all__ = ["COASTING", "constant_target", "suspicions"]
+
+COASTING = "constant target 0"
+"""What a log is called in which the drive does nothing: a calibration of the road load is what it is for."""
 
 ENOUGH_M = 1000.0  # shorter, neither consumption nor correlation says anything
 # Between power and (a + g·sinθ)·v: right logs of the cases and of the measured data have 0.4 to 0.98.
@@ -26,8 +30,22 @@ _FACTORS = {
 }
 
 
+def constant_target(name: str, measured: np.ndarray) -> Suspicion | None:
+    """A target `[row]` that has one value in every row, of more rows than chance makes: there is nothing to explain."""
+    if len(measured) < MANY or np.any(measured != measured[0]):
+        return None
+    evidence = f"{name} is {measured[0]:.6g} in all {len(measured)} rows"
+    if measured[0] != 0.0:
+        return Suspicion("constant target", evidence, "name the column that was measured, or another --target")
+    force = "" if name == "traction_force_n" else " with traction_force_n = 0 in place of that column"
+    mend = f"for a coast-down, hdev calibrate{force} gives rolling resistance and drag; to diagnose, log a drive"
+    return Suspicion(COASTING, evidence, mend)
+
+
 def suspicions(log: Log) -> tuple[Suspicion, ...]:
     """What about the log cannot be right, whatever the vehicle."""
+    if log.targets and (constant := constant_target(log.targets[0], log.target(log.targets[0]))) is not None:
+        return (constant,)
     if (counter := _counter(log)) is not None:  # of the others' evidence the energy is a part
         return (counter,)
     found = (_sign(log), _consumption(log), _distance(log))
@@ -48,12 +66,13 @@ def _counter(log: Log) -> Suspicion | None:
         return None
     trip = np.asarray(log.segments.trip)
     step = np.diff(x)[trip[1:] == trip[:-1]]
-    if len(step) < MANY or not np.any(step) or np.median(np.abs(step)) > SMOOTH * np.median(np.abs(x)):
-        return None
-    turns = min(float(np.mean(step > 0)), float(np.mean(step < 0)))
-    if turns > RETURNED:
+    if len(step) < MANY:
         return None
     value, change = float(np.median(np.abs(x))), float(np.median(np.abs(step)))
+    if value == 0.0 or change > SMOOTH * value or not np.any(step):
+        return None
+    if min(float(np.mean(step > 0)), float(np.mean(step < 0))) > RETURNED:
+        return None
     evidence = f"{value:.4g} Wh in the median row, changing by {change:.2g} Wh: a counter?"
     mend = mended(log, "energy_wh").replace(" }", ", counter = true }")
     return Suspicion("energy_wh", evidence, mend)

@@ -7,9 +7,11 @@ import numpy as np
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
+from hdev_jax.logs.columns.clocked import clocked, named
 from hdev_jax.logs.columns.headers import Header, parse_header
 from hdev_jax.logs.columns.labels import id_columns, labels, within_vehicles
-from hdev_jax.logs.columns.long import pivoted
+from hdev_jax.logs.columns.long import channels_of_long
+from hdev_jax.logs.columns.uneven import on_one_clock
 from hdev_jax.logs.columns.work import MEASURED_COLUMNS, ColumnInfo, Work
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.presets import recognised
@@ -42,8 +44,58 @@ class Piece:
 def translate(raw: Raw, adapter: Adapter) -> Piece:
     """Columns of a raw table under the contract's names in SI. Raises `InputError` (file, row, column, what to do)."""
     raw, adapter = _of_its_tool(raw, adapter)
-    if adapter.long is not None:
-        raw = pivoted(raw, adapter, MEASURED_COLUMNS)
+    by_channel = adapter.long is not None or bool(raw.channels)
+    if raw.asked_only:
+        raw = named(raw, adapter)
+    elif adapter.long is not None:
+        raw = channels_of_long(raw, adapter)
+    if by_channel:
+        raw, adapter = clocked(raw, adapter), adapter.without("time_s")
+    work, named_by = _begun(raw, adapter)
+    if adapter.clock is not None and not by_channel and "time_s" in work.data:
+        by_channel = True
+        kept = [c for columns in named_by.ids.values() for c in columns]
+        shown = next(f" {c.source} " for c in work.columns if c.name == "time_s")
+        rest = raw.table.drop(columns=[h for h in work.headers if f" {h} " in shown and h not in kept])
+        raw = replace(raw, table=rest, ledger=work.ledger)
+        raw = on_one_clock(raw, adapter, work.data["time_s"], named_by.trip, kept)
+        adapter = adapter.without("time_s")
+        work, named_by = _begun(raw, adapter)
+    for name in adapter.columns:
+        work.derive(name, ())
+    work.note_lacking()
+    if adapter.others != "drop":
+        work.keep_others({c for columns in named_by.ids.values() for c in columns})
+    work.power_of_voltage_and_current()
+    piece = Piece(
+        file=raw.file,
+        data=work.data,
+        trip=named_by.trip,
+        trip_names=named_by.trip_names,
+        vehicle=named_by.vehicle,
+        vehicle_names=named_by.vehicle_names,
+        row=np.arange(len(named_by.trip)),
+        lines=raw.lines,
+        columns=tuple(work.columns),
+        headers=tuple(work.headers),
+        ledger=work.ledger,
+    )
+    return _measured_rows(piece, work, adapter, by_channel)
+
+
+@dataclass(frozen=True)
+class _Named:
+    """Which columns name the trips and vehicles of a table, and which row is of which."""
+
+    ids: dict[str, tuple[str, ...]]
+    trip: np.ndarray
+    trip_names: tuple[str, ...]
+    vehicle: np.ndarray
+    vehicle_names: tuple[str, ...]
+
+
+def _begun(raw: Raw, adapter: Adapter) -> tuple[Work, _Named]:
+    """The work on a table: its trips and vehicles named, its clock read."""
     headers = [str(c) for c in raw.table.columns]
     raw = replace(raw, table=raw.table.set_axis(headers, axis=1))
     ids = {name: id_columns(raw, adapter, name, headers) for name in ("trip_id", "vehicle_id")}
@@ -58,31 +110,13 @@ def translate(raw: Raw, adapter: Adapter) -> Piece:
         work.derive("time_s", ())
     else:
         work.clock()
-    for name in adapter.columns:
-        work.derive(name, ())
-    if adapter.others == "keep":
-        work.keep_others({c for columns in ids.values() for c in columns})
-    work.power_of_voltage_and_current()
-    piece = Piece(
-        file=raw.file,
-        data=work.data,
-        trip=trip,
-        trip_names=trip_names,
-        vehicle=vehicle,
-        vehicle_names=vehicle_names,
-        row=np.arange(len(trip)),
-        lines=raw.lines,
-        columns=tuple(work.columns),
-        headers=tuple(headers),
-        ledger=work.ledger,
-    )
-    return _measured_rows(piece, work, adapter)
+    return work, _Named(ids, trip, trip_names, vehicle, vehicle_names)
 
 
 def _of_its_tool(raw: Raw, adapter: Adapter) -> tuple[Raw, Adapter]:
     """Without an adapter, and where the file names no speed as the contract does: the preset of the tool that writes
     such headers, noted."""
-    headers = [str(c) for c in raw.table.columns]
+    headers = list(raw.channels) or [str(c) for c in raw.table.columns]
     if adapter.columns or adapter.preset or any(_is_speed(Header.of(h, raw.units.get(h))) for h in headers):
         return raw, adapter
     found = recognised(headers)
@@ -99,7 +133,7 @@ def _is_speed(header: Header) -> bool:
         return True
 
 
-def _measured_rows(piece: Piece, work: Work, adapter: Adapter) -> Piece:
+def _measured_rows(piece: Piece, work: Work, adapter: Adapter, by_channel: bool) -> Piece:
     """The rows where what the adapter names was measured; without a name those where a target was filled are left out:
     what was filled is no measurement."""
     if adapter.rows is not None:
@@ -111,8 +145,8 @@ def _measured_rows(piece: Piece, work: Work, adapter: Adapter) -> Piece:
         keep = np.isfinite(x) if x is not None else work.raw.table[header].notna().to_numpy()
         why = f"rows = '{header}' of the adapter: it was not measured there"
     else:
-        if adapter.long is not None:  # put on another channel's clock, a target is there at its own times alone
-            work.unfilled |= {c: piece.data[c] for c in MEASURED_COLUMNS if c in piece.data}
+        if by_channel:  # put on another channel's clock, a target is there at its own times alone
+            work.unfilled = {c: piece.data[c] for c in MEASURED_COLUMNS if c in piece.data} | work.unfilled
         filled = [c for c in MEASURED_COLUMNS if c in work.unfilled and c in piece.data]
         if not filled:
             return piece

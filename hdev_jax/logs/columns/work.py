@@ -45,6 +45,7 @@ class Work:
         self.columns: list[ColumnInfo] = []
         self.ledger: Ledger = raw.ledger
         self.absent: set[str] = set()
+        self.lacking: list[str] = []
 
     def note(self, column: str, reason: str, count: int = 0, kind: str = "noted") -> None:
         self.ledger = self.ledger.add(kind, reason, file=self.raw.file, column=column, count=count)
@@ -149,7 +150,10 @@ class Work:
         if (name in _NEEDED and self.adapter.preset is None) or (hint and self.adapter.preset is None):
             hint = hint or near(missing[0], self.headers) or f"; it has {_some(self.headers)}"
             raise InputError(f"{self.raw.file}: no column '{missing[0]}' ({name} of {self.adapter.where}){hint}")
-        self.note(name, f"the file has no '{missing[0]}'")
+        if self.adapter.preset is None:
+            self.note(name, f"the file has no '{missing[0]}'")
+        else:  # a preset names all that its tool may log
+            self.lacking.append(missing[0])
         return None
 
     def _apply(self, name: str, rule: Rule, x: np.ndarray) -> np.ndarray:
@@ -221,6 +225,12 @@ class Work:
                 if header in COLUMNS.values():
                     hint = "; its name says no unit, so it is not read as a column of the contract"
                 self.note(header, f"unknown column, kept under its own name{hint}")
+
+    def note_lacking(self) -> None:
+        """One line for what the preset knows and the file does not have."""
+        if self.lacking:
+            shown = ", ".join(dict.fromkeys(self.lacking))
+            self.ledger = self.ledger.add("noted", f"the file has none of {shown}", file=self.raw.file)
 
     def power_of_voltage_and_current(self) -> None:
         """Where no power and no energy is measured: voltage times current, positive where the current is."""

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from hdev_jax.errors import InputError
+from hdev_jax.logs.readers.libraries import library
 from hdev_jax.logs.readers.text import check_header
 
 __all__ = ["read_binary"]
@@ -57,12 +58,7 @@ def _json_lines(path: Path, data: bytes) -> pd.DataFrame:
 
 
 def _excel(path: Path, data: bytes) -> pd.DataFrame:
-    try:
-        import openpyxl
-    except ImportError:
-        raise InputError(
-            f"{path}: reading .xlsx needs openpyxl: pip install 'hdev_jax[formats]', or save the sheet as CSV"
-        ) from None
+    openpyxl = library("openpyxl", path, "formats", "save the sheet as CSV")
     try:
         book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
         sheets = [[list(row) for row in sheet.iter_rows(values_only=True)] for sheet in book.worksheets]

@@ -9,8 +9,10 @@ from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.readers.binary import read_binary
 from hdev_jax.logs.readers.matlab import read_mat
-from hdev_jax.logs.readers.names import ENDINGS, ending_of, stem, trip_of
+from hdev_jax.logs.readers.names import ENDINGS, SIGNALS, ending_of, stem, trip_of
 from hdev_jax.logs.readers.raw import Raw
+from hdev_jax.logs.readers.signals import read_signals
+from hdev_jax.logs.readers.steps import read_steps
 from hdev_jax.logs.readers.text import read_text
 
 __all__ = ["find_files", "format_of", "read_bytes", "read_raw"]
@@ -26,12 +28,13 @@ _MAGIC = {
 _CONTENT = {
     "csv": "text",
     "jsonl": "text",
+    "xml": "text",
     "parquet": "Parquet",
     "feather": "Feather",
     "xlsx": "zip (or xlsx)",
     "mat": "MATLAB",
 }
-_NOT_ALWAYS_LOGS = (".txt", ".txt.gz", ".xlsx")  # in a folder of logs these are notes and tables of the vehicles
+_NOT_ALWAYS_LOGS = (".txt", ".txt.gz", ".xlsx", ".xml")  # in a folder of logs these are notes, tables, set-ups
 
 
 def format_of(path: Path, adapter: Adapter) -> str:
@@ -98,11 +101,12 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
     """The tables of a file (a MATLAB file of layout `time_value` may hold several trips), companion joined."""
     kind = format_of(path, adapter)
     if kind == "mat":
-        tables = read_mat(path, read_bytes(path, kind), adapter)
-        raws = [Raw(path.name, table, trip) for trip, table in tables.items()]
+        raws = read_mat(path, read_bytes(path, kind), adapter)
+    elif kind in SIGNALS:
+        raws = [read_signals(path, kind, adapter)]
     else:
         raws = [_table(path, kind, adapter, trip_of(path, adapter))]
-    if any(r.table.empty for r in raws):
+    if any(r.table.empty and not r.channels for r in raws):
         raise InputError(f"{path}: no rows")
     vehicle = None
     if adapter.vehicle_id is not None:
@@ -115,6 +119,9 @@ def read_raw(path: Path, adapter: Adapter) -> list[Raw]:
 
 def _table(path: Path, kind: str, adapter: Adapter, trip: str) -> Raw:
     data = read_bytes(path, kind)
+    if kind == "xml":
+        table, ledger = read_steps(path, data)
+        return Raw(path.name, table, trip, ledger=ledger)
     if kind != "csv":
         return Raw(path.name, read_binary(path, data, kind), trip)
     text = read_text(path, data, adapter)
@@ -140,8 +147,8 @@ def read_bytes(path: Path, kind: str = "csv") -> bytes:
     elif _content(data) == "gzip" and not ending:
         data = _gunzip(path, data)
     found = _content(data)
-    if expected == "MATLAB" and (found == "HDF5" or data.startswith(b"MATLAB 7.3")):
-        raise InputError(f"{path}: MATLAB 7.3 (HDF5) is not read; save it in MATLAB with -v7")
+    if expected == "MATLAB" and found == "HDF5":
+        return data
     if expected == "text" and data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise InputError(f"{path}: UTF-16 text; save it as UTF-8")
     if expected != found:
@@ -175,7 +182,7 @@ def _with_companion(raw: Raw, path: Path, adapter: Adapter) -> Raw:
             f"or say optional = true in {adapter.where}"
         )
     kind = ENDINGS.get(ending_of(beside.name), "csv")
-    if kind == "mat":
+    if kind in ("mat", *SIGNALS):
         raise InputError(f"{beside}: a companion is a table of text, Parquet, Feather or xlsx")
     table = _table(beside, kind, replace(adapter, header_line=None), raw.trip).table
     for where, frame in ((path, raw.table), (beside, table)):

@@ -5,7 +5,7 @@ from pathlib import Path
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter
 
-__all__ = ["ENDINGS", "ending_of", "stem", "trip_of"]
+__all__ = ["ENDINGS", "SIGNALS", "ending_of", "stem", "trip_of"]
 
 _PLAIN = {
     ".csv": "csv",
@@ -20,8 +20,12 @@ _PLAIN = {
     ".ndjson": "jsonl",
     ".xlsx": "xlsx",
     ".mat": "mat",
+    ".xml": "xml",
 }
-ENDINGS = {ending + zipped: kind for zipped in (".gz", "") for ending, kind in _PLAIN.items()}
+_RECORDINGS = {".mf4": "mf4", ".mdf": "mf4", ".blf": "blf", ".asc": "asc"}
+SIGNALS = tuple(dict.fromkeys(_RECORDINGS.values()))
+"""The formats of recordings, which are read a channel at a time and not unzipped in memory."""
+ENDINGS = {ending + zipped: kind for zipped in (".gz", "") for ending, kind in _PLAIN.items()} | _RECORDINGS
 """What a log's name may end in, and the format that it says."""
 
 

@@ -166,7 +166,12 @@ def _bad_rows(rows: Rows, sampled: bool, measured: list[str]) -> tuple[np.ndarra
 
 def _mend(reasons: dict[str, tuple[int, int]]) -> str:
     """The key of an adapter that helps against the most frequent reason."""
-    return ', or spread them: repeated_stamps = "spread" in an adapter' if _SAME in reasons else ""
+    if _SAME in reasons:
+        return ', or spread them: repeated_stamps = "spread" in an adapter'
+    missing = next((why.removesuffix(" missing") for why in reasons if why.endswith("_w missing")), None)
+    if missing is None:
+        return ""
+    return f"; where columns have rates of their own, clock = … in an adapter names the one of {missing}"
 
 
 def _check_order(rows: Rows, bad: np.ndarray) -> Rows:
