@@ -53,7 +53,7 @@ $(READY): pyproject.toml constraints.txt $(if $(wildcard $(PY)),,FORCE)
 	@touch $(CUT_OFF)
 	@echo "installing $$(grep -c == constraints.txt) pinned packages into $(VENV)/ (a few minutes the first time)"
 	@$(PIP) hatchling editables
-	@$(PIP) --no-build-isolation -e '.[test,dev,experiments,fleet,nuts]'
+	@$(PIP) --no-build-isolation -e '.[test,dev,experiments,fleet,nuts,can]'
 	@rm -f $(CUT_OFF)
 	@touch $@
 	@echo "$(VENV)/ is ready"

@@ -28,7 +28,6 @@ __all__ = [
 
 STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom of a robust working model
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
-NEXT_TO = 1e-2  # of its scale: a start as near to its lower edge is taken from the table
 MOST_STEPS = 50
 SETTLED = 1e-3  # standard errors that a further step would move the estimate by
 LEAST_GAIN = 1e-5  # of a step, in log-likelihood
@@ -242,9 +241,6 @@ def calibrate(
         chunks = list(chunks_of_fit(fit, Shapes(rows, longest)))
     if free:
         prior, prior_sd = tabular(table)
-        # a fit that ended at an edge would hold this one there: the transform has next to no slope
-        theta = [p if c.lower < p and x < c.lower + NEXT_TO * c.scale else x
-                 for x, p, c in zip(theta, prior, free, strict=True)]  # fmt: skip
         theta = np.array([inside(x, c.lower, c.upper) for x, c in zip(theta, free, strict=True)])
     else:
         prior = prior_sd = np.zeros(0)

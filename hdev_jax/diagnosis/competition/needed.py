@@ -123,14 +123,16 @@ def without_idle_switches(training: Training, state: State, scores: Scores) -> S
 
 
 def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
-    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is in their span, or is
-    one of a class with one of them. The newest (not `old`) has been tested already but for the last."""
+    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is in their span, is not
+    confirmed by cross-validation there, or is one of a class with one of them. The newest (not `old`) has been tested
+    already but for the last."""
     if any(_doubles(evidence, state, f, g, settings) for g in state.found if g is not f):
         return 1.0
     if not old:
         return 0.0
     own = needed(evidence, state.fit, f)
-    return own.p if own.left > settings.absorbed and in_range(state.fit, f.score.candidate) else 1.0
+    stands = own.left > settings.absorbed and own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate)
+    return own.p if stands else 1.0
 
 
 def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Settings) -> bool:
