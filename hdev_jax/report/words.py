@@ -166,9 +166,16 @@ def switching(effect: Mapping[str, Any]) -> str:
     shares = [(c, x) for c, x, *_ in state["share_on"]] or [(None, state["mean_share_on"])]
     at = [f"{100 * x:.0f}{NBSP}%{'' if c is None else f' at {c:.0f}{NBSP}°C'}" for c, x in shares]
     parts.append(f"{at[0].replace('%', '% of the time', 1)}{''.join(f', {a}' for a in at[1:])}")
-    text = " ".join(parts)
+    text = " ".join(parts) + "".join(f", {_contrast(c)}" for c in state.get("depends_on", ()))
     share = state.get("share_of_test_energy")
     return text + (f"; {100 * share:.0f}{NBSP}% of the energy of the test trips" if _finite(share) else "")
+
+
+def _contrast(c: Mapping[str, Any]) -> str:
+    """`more often at standstill (61 % against 30 % in motion)`."""
+    ends = sorted((("share_high", "high"), ("share_low", "low")), key=lambda k: -c[k[0]])
+    (more, where), (less, elsewhere) = ((f"{100 * c[share]:.0f}{NBSP}%", c[said]) for share, said in ends)
+    return f"more often {where} ({more} against {less} {elsewhere})"
 
 
 def known_errors(summary: Mapping[str, Any], unit: str) -> list[str]:

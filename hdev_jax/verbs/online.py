@@ -47,6 +47,7 @@ def one_step_ahead(
         np.array([float(np.asarray(e.power_w)) for e in effects]), float(states["base_w"]),
         np.asarray(states["scale_w"], dtype=float), np.stack([np.asarray(e.shares()) for e in effects]),
         np.array([float(np.asarray(e.memory_s)) for e in effects]), float(states["error_s"]), float(states["freedom"]),
+        np.stack([np.asarray(e.by()) for e in effects]),
     )  # fmt: skip
     seconds = np.asarray(problem.segments.duration_s)
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.inference import Calibration
-from hdev_jax.inference.states import Switching, decode, energy_draws, fit_switching, rows_of, shares_of
+from hdev_jax.inference.states import Switching, contrasts, decode, energy_draws, fit_switching, rows_of, shares_of
 from hdev_jax.physics.states import KNOTS_C, state_channel
 from hdev_jax.problem import Problem, Split, metrics
 from hdev_jax.segments import Segments, trip_slices
@@ -92,6 +92,7 @@ def state_block(problem: Problem, split: Split, given: Given, effect_id: str) ->
         "power_w": float(model.power_w[k]),
         "share_on": _shares(rows.take(train), on[train], share),
         "mean_share_on": share,
+        "depends_on": contrasts(model, rows.take(train), k),
         "dwell_on_s": memory / max(1.0 - share, 1e-3),
         "dwell_off_s": memory / max(share, 1e-3),
         "kwh_by_trip": given.kwh[effect_id],

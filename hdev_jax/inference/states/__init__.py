@@ -8,6 +8,7 @@ expectation-maximisation (Rabiner, Proc. IEEE 77, 1989; Hamilton, Econometrica 5
 84, 1989), trips as separate sequences.
 """
 
+from hdev_jax.inference.states.chances import contrasts, what_it_depends_on
 from hdev_jax.inference.states.decode import Decoded, decode, energy_draws
 from hdev_jax.inference.states.fit import errors_alone, fit_switching, shares_of
 from hdev_jax.inference.states.model import Switching
@@ -17,10 +18,12 @@ __all__ = [
     "Decoded",
     "StateRows",
     "Switching",
+    "contrasts",
     "decode",
     "energy_draws",
     "errors_alone",
     "fit_switching",
     "rows_of",
     "shares_of",
+    "what_it_depends_on",
 ]

@@ -12,7 +12,7 @@ from hdev_jax.inference.states.model import Switching, kept_errors, log_t
 from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.segments import trip_slices
 
-__all__ = ["Decoded", "decode", "energy_draws"]
+__all__ = ["Decoded", "decode", "energy_draws", "kept_states"]
 
 LANES = 16  # trips run side by side
 
@@ -20,12 +20,14 @@ LANES = 16  # trips run side by side
 class Decoded(NamedTuple):
     """The states of rows: the share of each row that a load is on given all rows of the trip (`on`) and given the rows
     before alone (`ahead`), what the errors before say of a row's own [W] (`error_w`), the probability that a row begins
-    and ends in the same joint state (`same`), and the log-likelihood."""
+    and ends in the same joint state (`same`), that each load goes from one state to another (`moves`), and the
+    log-likelihood."""
 
     on: Float[np.ndarray, "row load"]
     ahead: Float[np.ndarray, "row load"]
     error_w: Float[np.ndarray, " row"]
     same: Float[np.ndarray, "row state"]
+    moves: Float[np.ndarray, "row load before after"]
     log_likelihood: float
 
 
@@ -55,11 +57,18 @@ class _Lanes(NamedTuple):
         return out
 
 
-def _moves(model: Switching, rows: StateRows, starts: np.ndarray) -> Float[np.ndarray, "row state state"]:
-    """Chance of each joint state given the one before; a trip's first row has none before it."""
+def kept_states(model: Switching, rows: StateRows) -> Float[np.ndarray, "row load"]:
+    """The chance that a load keeps its state over a row, whatever its share of time on; a trip's first row has no state
+    before it."""
     keep = np.exp(-rows.duration_s[:, None] / model.memory_s)
-    keep[starts] = 0.0
-    share = model.expected(rows.temp_c)
+    keep[np.r_[True, np.diff(rows.trip) != 0]] = 0.0
+    return keep
+
+
+def _moves(model: Switching, rows: StateRows) -> Float[np.ndarray, "row state state"]:
+    """Chance of each joint state given the one before."""
+    keep = kept_states(model, rows)
+    share = model.expected(rows)
     out = np.ones((len(rows.trip), 1, 1))
     for k in range(len(model.power_w)):
         p = np.stack([1.0 - share[:, k], share[:, k]], axis=1)
@@ -108,7 +117,7 @@ def _on_in(model: Switching, pairs: _Pairs) -> Float[np.ndarray, "row state stat
 
 def _posed(model: Switching, rows: StateRows) -> tuple[_Lanes, np.ndarray, np.ndarray, _Pairs]:
     lanes = _Lanes.of(rows.trip)
-    moves = lanes.spread(_moves(model, rows, lanes.starts), np.eye(len(model.on)))
+    moves = lanes.spread(_moves(model, rows), np.eye(len(model.on)))
     pairs = _pairs(model, rows, lanes.starts)
     return lanes, moves, lanes.spread(np.logaddexp(pairs.whole, pairs.partly), 0.0), pairs
 
@@ -122,12 +131,14 @@ def decode(model: Switching, rows: StateRows) -> Decoded:
     on = np.einsum("rij,rijk->rk", pairs, _on_in(model, each))
     same = np.einsum("rii->ri", pairs).copy()
     same[lanes.starts] = pairs[lanes.starts].sum(axis=1)  # nothing comes before
+    lit = np.stack([1.0 - model.on, model.on], axis=-1)  # of a joint state, each load's own
+    each_moves = np.einsum("rij,ika,jkb->rkab", pairs, lit, lit, optimize=True)
     filtered, ahead = (np.asarray(x)[at] @ model.on for x in (found.filtered, found.ahead))
     # half of a row in which it may switch is spent in the state before
     before = np.r_[filtered[:1], filtered[:-1]]
     before[lanes.starts] = ahead[lanes.starts]
     error = np.r_[0.0, (rows.residual_w - model.predicted_w(filtered))[:-1]] * kept_errors(model, rows, lanes.starts)
-    return Decoded(on, 0.5 * (before + ahead), error, same, float(np.sum(np.asarray(found.log_likelihood))))
+    return Decoded(on, 0.5 * (before + ahead), error, same, each_moves, float(np.sum(np.asarray(found.log_likelihood))))
 
 
 def energy_draws(

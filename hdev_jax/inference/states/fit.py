@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from hdev_jax.inference.states.chances import chances
 from hdev_jax.inference.states.decode import Decoded, decode
-from hdev_jax.inference.states.model import Switching, kept_errors, log_t
+from hdev_jax.inference.states.model import LEAST_MEMORY_S, MOST_MEMORY_S, Switching, kept_errors, log_t
 from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.physics.states import KNOTS_C
 from hdev_jax.segments import trip_slices
@@ -19,7 +20,6 @@ SHRINK_S = 300.0  # of time at a temperature, worth as much as the mean over all
 WANDERS = 0.9999  # share that errors keep from row to row, at most: a random walk
 FEW_ROWS = 100.0  # of the errors of all rows, mixed with those at standstill and in motion
 MOST_ERROR = 0.2  # of a load's memory: errors that last longer are not told from its levels
-LEAST_MEMORY_S = 30.0  # contactors and compressors are not switched faster; what is faster counts as an error
 SWEEPS = 4  # of reweighted least squares for the levels
 
 
@@ -49,9 +49,13 @@ def _updated(model: Switching, rows: StateRows, decoded: Decoded, coloured: bool
         gram = (z.T * ((1.0 - kept) ** 2 @ weight)) @ z
         gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
         beta = np.linalg.solve(gram, z.T @ (((1.0 - kept) * y) @ weight))
+    new = replace(model, power_w=beta[1:], base_w=float(beta[0]))
+    if np.any(model.by):
+        new = chances(new, rows, decoded)
+    alike = ~np.any(model.by, axis=1)  # by moments, where there are no covariates: faster
     share = np.stack([shares_of(rows, decoded.on[:, k]) for k in range(len(model.power_w))])
-    new = replace(model, power_w=beta[1:], base_w=float(beta[0]), share=share)
-    new = replace(new, memory_s=_memories(new, rows, decoded.on))
+    new = replace(new, share=np.where(alike[:, None], share, new.share))
+    new = replace(new, memory_s=np.where(alike, _memories(new, rows, decoded.on), new.memory_s))
     error, last = (x[:, None] - z @ beta for x in (rows.residual_w, before))
     if coloured:
         weight[starts] = 0.0
@@ -108,7 +112,7 @@ def errors_alone(rows: StateRows) -> tuple[float, float]:
     memory = _memory_of(kept, rows)
     model = Switching(
         np.zeros(1), middle, np.full(2, float(np.std(error)) + 1e-9), np.full((1, len(KNOTS_C)), 0.5),
-        np.full(1, 7200.0), memory,
+        np.full(1, MOST_MEMORY_S), memory,
     )  # fmt: skip
     innovation = error - np.r_[0.0, error[:-1]] * kept_errors(model, rows, starts)
     model = _with_errors(model, innovation[:, None], np.ones((len(error), 1)), rows.standing)
@@ -129,8 +133,8 @@ def shares_of(rows: StateRows, on: Float[np.ndarray, " row"]) -> Float[np.ndarra
 
 def _memories(model: Switching, rows: StateRows, on: np.ndarray) -> np.ndarray:
     """The memory that makes as many switches as there are: they come at a rate of 2·share·(1 − share)/memory."""
-    share = model.expected(rows.temp_c)
+    share = model.expected(rows)
     expected = np.sum(2.0 * share * (1.0 - share) * rows.duration_s[:, None], axis=0)
     inside = np.diff(rows.trip) == 0
     switches = np.sum(np.abs(np.diff(on, axis=0))[inside], axis=0)
-    return np.clip(expected / np.maximum(switches, 1.0), LEAST_MEMORY_S, 7200.0)
+    return np.clip(expected / np.maximum(switches, 1.0), LEAST_MEMORY_S, MOST_MEMORY_S)

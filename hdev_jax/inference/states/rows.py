@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hdev_jax.physics.loads import STANDSTILL_MPS
-from hdev_jax.physics.states import USUAL_C
+from hdev_jax.physics.states import COVARIATES, USUAL_C, covariates_of
 from hdev_jax.segments import Segments, starts_of_runs
 
 __all__ = ["StateRows", "rows_of"]
@@ -26,6 +26,12 @@ class StateRows:
     temp_c: Float[np.ndarray, " row"]
     standing: Int[np.ndarray, " row"]  # 1 at standstill, else 0
     partly: float = MEANS
+    others: Float[np.ndarray, "row covariate"] | None = None  # `COVARIATES` in each row; None: of no interest
+
+    @property
+    def beside(self) -> Float[np.ndarray, "row covariate"]:
+        """`COVARIATES` in each row; 0 where they are not known."""
+        return np.zeros((len(self.trip), len(COVARIATES))) if self.others is None else self.others
 
     @property
     def has_temperature(self) -> bool:
@@ -36,7 +42,8 @@ class StateRows:
         """Rows by mask, index or slice."""
         columns = (self.residual_w, self.trip, self.duration_s, self.temp_c, self.standing)
         residual, trip, seconds, temp, standing = (x[rows] for x in columns)
-        return StateRows(residual, trip, seconds, temp, standing, self.partly)
+        others = None if self.others is None else self.others[rows]
+        return StateRows(residual, trip, seconds, temp, standing, self.partly, others)
 
     def coarse(self, seconds: float) -> "StateRows":
         """Means over runs of rows of at least so many seconds in a trip; the rows themselves where they are long."""
@@ -58,4 +65,5 @@ def rows_of(segments: Segments, residual_w: Float[np.ndarray, " row"], *, sample
     return StateRows(
         np.asarray(residual_w, dtype=float), np.asarray(segments.trip)[:n], np.asarray(segments.duration_s)[:n],
         np.array(temp), standing, SAMPLES if samples else MEANS,
+        np.asarray(covariates_of(segments))[:n].astype(float),
     )  # fmt: skip
