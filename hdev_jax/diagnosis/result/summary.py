@@ -193,6 +193,7 @@ def summarise(
             "behaves_like": left.behaves_like,
             "sd": left.sd,
             "memory_s": left.memory_s,
+            "course": left.course,
         },
         "not_decidable": _not_decidable(state.verdicts, left, settings),
         "verdict": verdict,

@@ -9,6 +9,7 @@ expectation-maximisation (Rabiner, Proc. IEEE 77, 1989; Hamilton, Econometrica 5
 """
 
 from hdev_jax.inference.states.chances import contrasts, what_it_depends_on
+from hdev_jax.inference.states.course import course
 from hdev_jax.inference.states.decode import Decoded, decode, energy_draws
 from hdev_jax.inference.states.fit import errors_alone, fit_switching, shares_of
 from hdev_jax.inference.states.model import Switching
@@ -19,6 +20,7 @@ __all__ = [
     "StateRows",
     "Switching",
     "contrasts",
+    "course",
     "decode",
     "energy_draws",
     "errors_alone",

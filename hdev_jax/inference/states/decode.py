@@ -1,20 +1,18 @@
 """Decoding: the states of rows by filter and smoother, and draws of them."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.inference.rows import padded_rows
 from hdev_jax.inference.states.chain import draw, smooth
+from hdev_jax.inference.states.lanes import Lanes
 from hdev_jax.inference.states.model import Switching, kept_errors, log_t
 from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Decoded", "decode", "energy_draws", "kept_states"]
-
-LANES = 16  # trips run side by side
 
 
 class Decoded(NamedTuple):
@@ -29,32 +27,6 @@ class Decoded(NamedTuple):
     same: Float[np.ndarray, "row state"]
     moves: Float[np.ndarray, "row load before after"]
     log_likelihood: float
-
-
-class _Lanes(NamedTuple):
-    """Where each row is: whole trips one after the other in a few lanes of about the same length."""
-
-    lane: np.ndarray
-    place: np.ndarray
-    shape: tuple[int, int]
-    starts: np.ndarray  # rows that begin a trip
-
-    @classmethod
-    def of(cls, trip: np.ndarray) -> "_Lanes":
-        slices = [s for _, s in trip_slices(trip)]
-        filled = np.zeros(min(LANES, len(slices)), dtype=int)
-        lane, place = np.empty(len(trip), dtype=int), np.empty(len(trip), dtype=int)
-        for s in sorted(slices, key=lambda s: s.start - s.stop):
-            k = int(np.argmin(filled))
-            lane[s], place[s] = k, filled[k] + np.arange(s.stop - s.start)
-            filled[k] += s.stop - s.start
-        return cls(lane, place, (padded_rows(int(filled.max())), len(filled)), np.array([s.start for s in slices]))
-
-    def spread(self, values: np.ndarray, fill: Any) -> np.ndarray:
-        out = np.empty((*self.shape, *values.shape[1:]))
-        out[...] = fill
-        out[self.place, self.lane] = values
-        return out
 
 
 def kept_states(model: Switching, rows: StateRows) -> Float[np.ndarray, "row load"]:
@@ -115,8 +87,8 @@ def _on_in(model: Switching, pairs: _Pairs) -> Float[np.ndarray, "row state stat
     return (1.0 - way) * model.on[:, None, :] + way * model.on[None, :, :]
 
 
-def _posed(model: Switching, rows: StateRows) -> tuple[_Lanes, np.ndarray, np.ndarray, _Pairs]:
-    lanes = _Lanes.of(rows.trip)
+def _posed(model: Switching, rows: StateRows) -> tuple[Lanes, np.ndarray, np.ndarray, _Pairs]:
+    lanes = Lanes.of(rows.trip)
     moves = lanes.spread(_moves(model, rows), np.eye(len(model.on)))
     pairs = _pairs(model, rows, lanes.starts)
     return lanes, moves, lanes.spread(np.logaddexp(pairs.whole, pairs.partly), 0.0), pairs
