@@ -60,7 +60,7 @@ def one_step_ahead(
     rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
     decoded = decode(model, rows)
     per_watt = as_watts(problem.target, np.ones(len(seconds)), seconds)
-    width = float(stats.t.ppf(0.5 + 0.5 * level, model.freedom)) * model.scale_w[rows.standing]
+    width = float(stats.t.ppf(0.5 + 0.5 * level, model.freedom)) * model.scale_w[rows.standing] * rows.wide
     open_w = stats.norm.ppf(0.5 + 0.5 * level) * np.sqrt(
         np.sum(model.power_w**2 * decoded.ahead * (1.0 - decoded.ahead), axis=1)
     )

@@ -260,7 +260,7 @@ def _stability(
     """Share of resampled sets of trips in which the load explains more than it costs."""
     alone = _alone(rows, model, decoded, k).residual_w
     with_it = model.base_w + decoded.on[:, k] * model.power_w[k]
-    each = (np.abs(alone - np.median(alone)) - np.abs(alone - with_it)) / model.scale_w[rows.standing]
+    each = (np.abs(alone - np.median(alone)) - np.abs(alone - with_it)) / (model.scale_w[rows.standing] * rows.wide)
     gains = np.array([np.sum(each[s]) for _, s in trip_slices(rows.trip)])
     drawn = rng.integers(0, len(gains), (settings.resamples, len(gains)))
     return float(np.mean(np.sum(gains[drawn], axis=1) > settings.size_cost))

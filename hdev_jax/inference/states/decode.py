@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from hdev_jax.inference.states.chain import draw, smooth
 from hdev_jax.inference.states.lanes import Lanes
-from hdev_jax.inference.states.model import Switching, kept_errors, log_t
+from hdev_jax.inference.states.model import Switching, kept_errors, log_t, scales
 from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.segments import trip_slices
 
@@ -62,7 +62,7 @@ class _Pairs(NamedTuple):
 def _pairs(model: Switching, rows: StateRows, starts: np.ndarray) -> _Pairs:
     """Densities about the levels, the errors being an autoregression: of a share, flat between the two levels."""
     levels, kept = model.base_w + model.on @ model.power_w, kept_errors(model, rows, starts)
-    scale = model.scale_w[rows.standing][:, None, None]
+    scale = scales(model, rows, starts)[:, None, None]
     before = np.r_[0.0, rows.residual_w[:-1]][:, None] - levels  # error of the row before, by the state before
     x = (rows.residual_w[:, None] - kept[:, None] * before)[:, :, None]
     first = np.zeros(len(rows.trip), dtype=bool)

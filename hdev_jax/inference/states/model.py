@@ -12,7 +12,7 @@ from scipy.special import gammaln
 from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.physics.states import COVARIATES, KNOTS_C
 
-__all__ = ["LEAST_MEMORY_S", "MOST_MEMORY_S", "Switching", "kept_errors", "log_t"]
+__all__ = ["LEAST_MEMORY_S", "MOST_MEMORY_S", "Switching", "kept_errors", "log_t", "scales"]
 
 LEAST_MEMORY_S = 30.0  # contactors and compressors are not switched faster; what is faster counts as an error
 MOST_MEMORY_S = 7200.0
@@ -21,9 +21,9 @@ MOST_MEMORY_S = 7200.0
 @dataclass(frozen=True)
 class Switching:
     """Parameters of on/off loads: the power of each [W], what is left with all off [W], the scale of the errors'
-    innovations in motion and at standstill [W], each load's share of time on at `KNOTS_C` and its memory [s]; the
-    memory of the errors [s], 0 where they are independent, and the degrees of freedom of their innovations; the
-    log-odds of being on by each of `COVARIATES`."""
+    innovations in motion and at standstill [W] (where energies are measured: in a row of `USUAL_S`), each load's share
+    of time on at `KNOTS_C` and its memory [s]; the memory of the errors [s], 0 where they are independent, and the
+    degrees of freedom of their innovations; the log-odds of being on by each of `COVARIATES`."""
 
     power_w: Float[np.ndarray, " load"]
     base_w: float
@@ -75,10 +75,17 @@ class Switching:
 
 
 def kept_errors(model: Switching, rows: StateRows, starts: np.ndarray) -> Float[np.ndarray, " row"]:
-    """How much of the error of the row before a row's error keeps; none of it in a trip's first row."""
-    kept = np.exp(-rows.duration_s / max(model.error_s, 1e-9))
+    """How much of the error of the row before a row's error keeps [W/W]; none of it in a trip's first row."""
+    kept = np.exp(-rows.forgets_s / max(model.error_s, 1e-9)) * rows.wide / np.r_[1.0, rows.wide[:-1]]
     kept[starts] = 0.0
     return kept
+
+
+def scales(model: Switching, rows: StateRows, starts: np.ndarray) -> Float[np.ndarray, " row"]:
+    """Scale of each row's error given the row before [W]; of a trip's first row, which has none, of all its errors."""
+    out = model.scale_w[rows.standing] * rows.wide
+    out[starts] /= np.sqrt(-np.expm1(-2.0 * rows.forgets_s[starts] / max(model.error_s, 1e-9)))
+    return out
 
 
 def log_t(x: Any, freedom: float) -> Any:
