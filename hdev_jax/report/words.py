@@ -35,6 +35,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _DASH = "–"
 MOST_SUSPECTS = 3
+MOST_CHANGES = 3  # of a mode, that are dated
 LEANING = 1.5  # one side of an interval over the other
 
 
@@ -178,6 +179,22 @@ def _contrast(c: Mapping[str, Any]) -> str:
     return f"more often {where} ({more} against {less} {elsewhere})"
 
 
+def _modes(effect: Mapping[str, Any]) -> str:
+    """`; the second mode from 2022-01-06 05:02 (trip B183) on, until 2022-03-09 05:25 (trip B190)`."""
+    changes = effect.get("modes", {}).get("changes", [])
+    if not changes:
+        return ""
+    if len(changes) > MOST_CHANGES:
+        there = [x > 0.5 for x in effect["modes"]["probability"].values()]
+        return f"; the second mode in {sum(there)} of {count(len(there), 'trip')}"
+    said = []
+    for c in changes:
+        when = c["start"][:16].replace("T", " ") if c["start"] else ""
+        where = f"{when} (trip {c['trip']})" if when else f"trip {c['trip']}"
+        said.append(f"from {where} on" if c["to"] == "second" else f"until {where}")
+    return f"; the second mode {', '.join(said)}"
+
+
 def known_errors(summary: Mapping[str, Any], unit: str) -> list[str]:
     """A line for the errors that know measured power, beside the free run's; none where no load has a state."""
     after = summary.get("after", {})
@@ -196,7 +213,7 @@ def _missing(effects: list[dict[str, Any]]) -> str:
         twins = [names.effect(t) for t in e.get("indistinguishable_from") or []]
         alike = f" or {names.verbose_join(twins, 'or')}, which this log cannot distinguish," if twins else ""
         said = f" ({switching(e)})" if "state" in e else _sizes(e)
-        items.append(f"\x02{names.effect(e['id'])}\x03{said}{alike}")
+        items.append(f"\x02{names.effect(e['id'])}\x03{said}{_modes(e)}{alike}")
     if len(effects) > 4:
         items.append(f"{len(effects) - 4} more")
     return names.verbose_join(items).rstrip(",")

@@ -290,6 +290,21 @@ def test_what_is_left_is_shown_with_what_it_grows_with(scale, said, tmp_path):
     assert "Grows with" not in plain(written(fake("nothing_missing"), tmp_path / "bare"))
 
 
+def test_a_mode_is_dated_where_the_log_has_times():
+    data = fake()
+    for effect in data.summary["effects"]:
+        effect["modes"] = {
+            "probability": {"T01": 0.01, "T02": 0.99, "T03": 0.98, "T04": 0.02},
+            "changes": [
+                {"trip": "T02", "to": "second", "start": "2022-01-06T05:02:00", "after": "T01"},
+                {"trip": "T04", "to": "first", "start": None, "after": "T03"},
+            ],
+        }
+    assert "; the second mode from 2022-01-06 05:02 (trip T02) on, until trip T04" in answer(data)
+    data.summary["effects"][0]["modes"]["changes"] *= 2
+    assert "; the second mode in 2 of 4 trips" in answer(data)
+
+
 def test_what_drifts_is_shown_with_its_energy(tmp_path):
     data = fake("nothing_missing")
     minute = np.arange(12.0)

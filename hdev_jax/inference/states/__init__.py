@@ -13,6 +13,7 @@ from hdev_jax.inference.states.course import course
 from hdev_jax.inference.states.decode import Decoded, decode, energy_draws
 from hdev_jax.inference.states.fit import errors_alone, fit_switching, shares_of
 from hdev_jax.inference.states.model import Switching
+from hdev_jax.inference.states.modes import probability_of_modes
 from hdev_jax.inference.states.rows import StateRows, rows_of
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "energy_draws",
     "errors_alone",
     "fit_switching",
+    "probability_of_modes",
     "rows_of",
     "shares_of",
     "what_it_depends_on",
