@@ -108,7 +108,7 @@ def test_trips_are_sequences_of_their_own():
 def test_energy_drawn_is_about_the_energy_decoded():
     rows, _ = residual((6000.0, 15000.0))
     model, decoded = fit_switching(start(6000.0, 15000.0), rows, 6)
-    drawn = energy_draws(model, rows, key=jax.random.key(0), draws=30)
+    drawn = energy_draws(model, rows, seed=0, draws=30)
     mean = np.stack([(decoded.on[rows.trip == t] * model.power_w).sum(axis=0) / 3600.0 for t in range(TRIPS)], axis=1)
     assert drawn.shape == (30, 2, TRIPS)
     assert np.all(np.abs(drawn.mean(axis=0) - mean) < 5 * drawn.std(axis=0) / np.sqrt(30) + 0.01 * mean + 5.0)

@@ -8,7 +8,6 @@ power, this row's included: it explains and does not predict.
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 from scipy import stats
 
@@ -92,7 +91,7 @@ def _kwh(
 ) -> list[dict[str, list[float]]]:
     """Energy of each load in each trip [kWh]: mean, 5 % and 95 % over draws of its states and of its power, which is
     off by Student's t of `relative` errors."""
-    drawn = energy_draws(model, rows, key=jax.random.key(seed), draws=DRAWS) / 1e3
+    drawn = energy_draws(model, rows, seed=seed, draws=DRAWS) / 1e3
     freedom = max(cluster_rows(problem.segments.take(problem.rows(split.train))).count - 1, 1)
     off = stats.t.ppf((np.arange(DRAWS) + 0.5) / DRAWS, freedom)
     out = []

@@ -52,11 +52,13 @@ def _moves(model: Switching, rows: StateRows) -> Float[np.ndarray, "row state st
 
 class _Pairs(NamedTuple):
     """Of each row, for each pair of states before and after it: the log-likelihood of its residual where it is at the
-    level after it (`whole`), or holds any share of the step alike (`partly`), and the share as measured (`way`)."""
+    level after it (`whole`), or holds any share of the step alike (`partly`), the share as measured (`way`) and its
+    standard deviation (`way_sd`)."""
 
     whole: Float[np.ndarray, "row state state"]
     partly: Float[np.ndarray, "row state state"]
     way: Float[np.ndarray, "row state state"]
+    way_sd: Float[np.ndarray, "row state state"]
 
 
 def _pairs(model: Switching, rows: StateRows, starts: np.ndarray) -> _Pairs:
@@ -76,7 +78,8 @@ def _pairs(model: Switching, rows: StateRows, starts: np.ndarray) -> _Pairs:
     step = levels[None, :] - levels[:, None]
     way = np.clip((x - levels[:, None]) / np.where(step == 0, 1.0, step), 0.0, 1.0)
     sure = step**2 / (step**2 + 12.0 * scale**2)  # variance of a uniform share over that with the error's
-    return _Pairs(whole, partly, np.where(first, 1.0, 0.5 + sure * (way - 0.5)))
+    way_sd = np.where(~first & (step != 0), np.sqrt((1.0 - sure) / 12.0), 0.0)
+    return _Pairs(whole, partly, np.where(first, 1.0, 0.5 + sure * (way - 0.5)), way_sd)
 
 
 def _on_in(model: Switching, pairs: _Pairs) -> Float[np.ndarray, "row state state load"]:
@@ -113,19 +116,22 @@ def decode(model: Switching, rows: StateRows) -> Decoded:
     return Decoded(on, 0.5 * (before + ahead), error, same, each_moves, float(np.sum(np.asarray(found.log_likelihood))))
 
 
-def energy_draws(
-    model: Switching, rows: StateRows, *, key: jax.Array, draws: int
-) -> Float[np.ndarray, "draw load trip"]:
+def energy_draws(model: Switching, rows: StateRows, *, seed: int, draws: int) -> Float[np.ndarray, "draw load trip"]:
     """Energy of each load in each trip [Wh] over draws of the state sequence from its posterior."""
     lanes, moves, fits, each = _posed(model, rows)
-    filtered, where = smooth(moves, fits).filtered, _on_in(model, each)
-    which, at = [s for _, s in trip_slices(rows.trip)], np.arange(len(rows.trip))
-    hours = rows.duration_s / 3600.0
+    filtered, at, rng = smooth(moves, fits).filtered, np.arange(len(rows.trip)), np.random.default_rng(seed)
+    which, hours = [s for _, s in trip_slices(rows.trip)], rows.duration_s / 3600.0
+    partly = np.exp(each.partly - np.logaddexp(each.whole, each.partly))
     out = np.empty((draws, len(model.power_w), len(which)))
-    for k, one in enumerate(jax.random.split(key, draws)):
+    for k, one in enumerate(jax.random.split(jax.random.key(seed), draws)):
         after = np.asarray(draw(filtered, moves, fits, key=one))[lanes.place, lanes.lane]
         before = np.r_[after[:1], after[:-1]]
         before[lanes.starts] = after[lanes.starts]
-        energy = where[at, before, after] * hours[:, None] * model.power_w
+        pair = at, before, after
+        # a row in which a load switches holds a share of it, as well as that is measured
+        way = np.clip(each.way[pair] + each.way_sd[pair] * rng.standard_normal(len(at)), 0.0, 1.0)
+        way = np.where(rng.random(len(at)) < partly[pair], way, 1.0)[:, None]
+        on = (1.0 - way) * model.on[before] + way * model.on[after]
+        energy = on * hours[:, None] * model.power_w
         out[k] = np.stack([energy[s].sum(axis=0) for s in which], axis=1)
     return out
