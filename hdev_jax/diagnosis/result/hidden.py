@@ -76,27 +76,27 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
     where = known(decoded.on)
     error = decoded.error_w / as_watts(problem.target, np.ones(len(seconds)), seconds)
     errors = {c.path: float(e) for c, e in zip(fit.table.free, fit.errors, strict=True)}
-    power = [float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids]
-    relative = np.array(
-        [errors.get(f"effects.{i}.power_w", 0.0) / max(p, 1e-9) for i, p in zip(ids, power, strict=True)]
-    )
+    power = {i: float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids}
+    both = [(power[i], errors.get(f"effects.{i}.power_w", 0.0)) for i in ids]
     return Given(
         where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, known(decoded.ahead)) + error, ids,
-        model, dict(zip(ids, power, strict=True)), _kwh(problem, split, rows, model, decoded, relative, seed),
+        model, power, _kwh(problem, split, rows, model, decoded, both, seed),
     )  # fmt: skip
 
 
 def _kwh(
-    problem: Problem, split: Split, rows: StateRows, model: Switching, decoded: Decoded, relative: np.ndarray, seed: int
-) -> list[dict[str, list[float]]]:
-    """Energy of each load in each trip [kWh]: mean, 5 % and 95 % over draws of its states and of its power, which is
-    off by Student's t of `relative` errors."""
+    problem: Problem, split: Split, rows: StateRows, model: Switching, decoded: Decoded,
+    fitted: list[tuple[float, float]], seed: int,
+) -> list[dict[str, list[float]]]:  # fmt: skip
+    """Energy of each load in each trip [kWh], with 5 % and 95 % over draws of its states and of its power: that of the
+    model or the one `fitted` with all else, as likely, either off by Student's t of the fitted one's error."""
     drawn = energy_draws(model, rows, seed=seed, draws=DRAWS) / 1e3
     freedom = max(cluster_rows(problem.segments.take(problem.rows(split.train))).count - 1, 1)
     off = stats.t.ppf((np.arange(DRAWS) + 0.5) / DRAWS, freedom)
     out = []
-    for k, x in enumerate(relative):
-        each = np.maximum(drawn[:, None, k, :] * (1.0 + x * off[None, :, None]), 0.0)
+    for k, (power, error) in enumerate(fitted):
+        factor = np.concatenate([1.0 + error / power * off, (power + error * off) / model.power_w[k]])
+        each = np.maximum(drawn[:, None, k, :] * factor[None, :, None], 0.0)
         low, high = np.quantile(each.reshape(-1, each.shape[-1]), (0.05, 0.95), axis=0)
         trips = {}
         for j, (t, s) in enumerate(trip_slices(rows.trip)):
