@@ -111,7 +111,7 @@ def remainder(
         sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
     if learned:
         depends += list(order)
-        how = f"{100 * share:.0f} % of its variance depends on {', '.join(order)}"
+        how = f"{100 * share:.0f} % of its variance depends on {', '.join(order) or 'several channels'}"
         parts.append(f"{how} in a form that no effect of the library has")
     if period is not None:
         seconds, amplitude = period.period_s, period.amplitude

@@ -1,13 +1,13 @@
 """Hidden states of what a vehicle's prediction leaves: on/off loads, what drifts, the mode of each trip.
 
-On/off loads are a hidden Markov model. Each load is a two-state chain in continuous time, so rows may have any length:
-over a row of Δt it keeps its state with the weight e^(−Δt/memory) and otherwise takes one by its share of time on. A row
-in which it switches holds some share of its power. About the levels the residual is an autoregression of first order
-with Student-t innovations, whose degrees of freedom are estimated and whose scale differs between standstill and
-motion; where energies are measured, an error is a small power in a long row. Parameters by expectation-maximisation
-(Rabiner, Proc. IEEE 77, 1989; Hamilton, Econometrica 57, 1989; Lange, Little and Taylor, JASA 84, 1989), trips as
-separate sequences. What drifts is a Gauss-Markov process (`course`), the mode of a trip a chain from trip to trip
-(`probability_of_modes`).
+On/off loads are a hidden Markov model. Each load is a two-state chain in continuous time, so rows may have any
+length: over a row of Δt it keeps its state with the weight e^(−Δt/memory) and otherwise takes one by its share of
+time on. A row in which it switches holds some share of its power. About the levels the residual is an autoregression
+of first order with Student-t innovations, whose degrees of freedom are estimated and whose scale differs between
+standstill and motion; where energies are measured, an error is a small power in a long row. Parameters by
+expectation-maximisation (Rabiner, Proc. IEEE 77, 1989; Hamilton, Econometrica 57, 1989; Lange, Little and Taylor,
+JASA 84, 1989), trips as separate sequences. What drifts is a Gauss-Markov process (`course`), the mode of a trip a
+chain from trip to trip (`probability_of_modes`).
 """
 
 from hdev_jax.inference.states.chances import contrasts, what_it_depends_on

@@ -19,7 +19,8 @@ LEAST_SHARE, MOST_SHARE = 0.005, 0.995  # of time on: a state that is never take
 SHRINK_S = 300.0  # of time at a temperature, worth as much as the mean over all temperatures
 WANDERS = 0.9999  # share that errors keep from row to row, at most: a random walk
 FEW_ROWS = 100.0  # of the errors of all rows, mixed with those at standstill and in motion
-MOST_ERROR = 0.5  # of a load's memory: errors that last longer are not told from its levels
+MOST_ERROR = 0.2  # of a load's memory: errors that last longer are not told from its levels
+FEW_STEPS = 4.0  # rows that errors may last in any case: of long rows a load's memory has not many more
 SWEEPS = 4  # of reweighted least squares for the levels
 
 
@@ -62,7 +63,8 @@ def _updated(model: Switching, rows: StateRows, decoded: Decoded, coloured: bool
         alike_w = last * (rows.wide / np.r_[1.0, rows.wide[:-1]])[:, None]
         share_kept = float(np.sum(weight * error * alike_w) / (np.sum(weight * alike_w**2) + 1e-12))
         memory = _memory_of(share_kept, rows)
-        new = replace(new, error_s=min(memory, MOST_ERROR * float(np.min(new.memory_s))))
+        most = max(MOST_ERROR * float(np.min(new.memory_s)), FEW_STEPS * float(np.median(rows.forgets_s)))
+        new = replace(new, error_s=min(memory, most))
     innovation = error - kept_errors(new, rows, starts)[:, None] * last
     inner = same.copy()
     inner[starts] = 0.0  # a first row's error is no innovation
