@@ -11,6 +11,7 @@ from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.problem import LAST_THIRD
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
+from hdev_jax.report.states import contrast, modes
 
 __all__ = [
     "NBSP",
@@ -35,7 +36,6 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
 _DASH = "–"
 MOST_SUSPECTS = 3
-MOST_CHANGES = 3  # of a mode, that are dated
 LEANING = 1.5  # one side of an interval over the other
 
 
@@ -167,32 +167,9 @@ def switching(effect: Mapping[str, Any]) -> str:
     shares = [(c, x) for c, x, *_ in state["share_on"]] or [(None, state["mean_share_on"])]
     at = [f"{100 * x:.0f}{NBSP}%{'' if c is None else f' at {c:.0f}{NBSP}°C'}" for c, x in shares]
     parts.append(f"{at[0].replace('%', '% of the time', 1)}{''.join(f', {a}' for a in at[1:])}")
-    text = " ".join(parts) + "".join(f", {_contrast(c)}" for c in state.get("depends_on", ()))
+    text = " ".join(parts) + "".join(f", {contrast(c)}" for c in state.get("depends_on", ()))
     share = state.get("share_of_test_energy")
     return text + (f"; {100 * share:.0f}{NBSP}% of the energy of the test trips" if _finite(share) else "")
-
-
-def _contrast(c: Mapping[str, Any]) -> str:
-    """`more often at standstill (61 % against 30 % in motion)`."""
-    ends = sorted((("share_high", "high"), ("share_low", "low")), key=lambda k: -c[k[0]])
-    (more, where), (less, elsewhere) = ((f"{100 * c[share]:.0f}{NBSP}%", c[said]) for share, said in ends)
-    return f"more often {where} ({more} against {less} {elsewhere})"
-
-
-def _modes(effect: Mapping[str, Any]) -> str:
-    """`; the second mode from 2022-01-06 05:02 (trip B183) on, until 2022-03-09 05:25 (trip B190)`."""
-    changes = effect.get("modes", {}).get("changes", [])
-    if not changes:
-        return ""
-    if len(changes) > MOST_CHANGES:
-        there = [x > 0.5 for x in effect["modes"]["probability"].values()]
-        return f"; the second mode in {sum(there)} of {count(len(there), 'trip')}"
-    said = []
-    for c in changes:
-        when = c["start"][:16].replace("T", " ") if c["start"] else ""
-        where = f"{when} (trip {c['trip']})" if when else f"trip {c['trip']}"
-        said.append(f"from {where} on" if c["to"] == "second" else f"until {where}")
-    return f"; the second mode {', '.join(said)}"
 
 
 def known_errors(summary: Mapping[str, Any], unit: str) -> list[str]:
@@ -213,7 +190,7 @@ def _missing(effects: list[dict[str, Any]]) -> str:
         twins = [names.effect(t) for t in e.get("indistinguishable_from") or []]
         alike = f" or {names.verbose_join(twins, 'or')}, which this log cannot distinguish," if twins else ""
         said = f" ({switching(e)})" if "state" in e else _sizes(e)
-        items.append(f"\x02{names.effect(e['id'])}\x03{said}{_modes(e)}{alike}")
+        items.append(f"\x02{names.effect(e['id'])}\x03{said}{modes(e)}{alike}")
     if len(effects) > 4:
         items.append(f"{len(effects) - 4} more")
     return names.verbose_join(items).rstrip(",")
