@@ -165,6 +165,6 @@ def drift_course(data: ReportData) -> Any | None:
     ax.set_title(f"What drifts, in {short(c['trip'], 30)}")
     ax.set_xlabel(axis_label("time since start of the trip", "min"))
     ax.set_ylabel("power [kW]")
-    ax.legend(loc="upper right", ncols=3)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)  # beside the title
     tidy(ax)
     return fig
