@@ -136,6 +136,34 @@ def test_means_over_rows_keep_time_and_energy(seconds, seed):
         np.testing.assert_allclose(np.sum(b.duration_s * b.residual_w), np.sum(a.duration_s * a.residual_w))
 
 
+def test_trips_of_one_row_give_numbers():
+    rng = np.random.default_rng(0)
+    rows = StateRows(
+        rng.normal(0, 1e3, 200), np.arange(200), np.full(200, 7.0), np.full(200, 15.0), np.zeros(200, int), energy=True
+    )
+    model, decoded = fit_switching(start(1000.0), rows, 3)
+    assert np.all(np.isfinite(decoded.on))
+    assert np.isfinite(decoded.log_likelihood)
+    assert np.all(np.isfinite(model.scale_w))
+
+
+def test_an_energy_has_the_same_error_in_a_row_of_any_length():
+    """The same energies as powers of rows as short and as long: their errors are as wide, and decoded alike."""
+    rng = np.random.default_rng(3)
+    n, seconds = 2000, rng.choice([4.0, 8.0, 16.0], 2000)
+    on = (np.cumsum(rng.random(n) < 0.1) % 2).astype(float)
+    power = 8000.0 * on + rng.normal(0.0, 2000.0, n) * 10.0 / seconds
+    rows = StateRows(power, np.repeat(np.arange(4), n // 4), seconds, np.full(n, 15.0), np.zeros(n, int), energy=True)
+    right = []
+    for each in (rows, replace(rows, energy=False)):
+        model, decoded = fit_switching(start(6000.0), each, 6)
+        right.append(np.mean((decoded.on[:, 0] > 0.5) == on))
+        if each.energy:
+            np.testing.assert_allclose(model.scale_w[0], 2000.0, rtol=0.15)
+            np.testing.assert_allclose(model.power_w, 8000.0, rtol=0.05)
+    assert right[0] > right[1] > 0.7
+
+
 @pytest.mark.parametrize("value", [0.0, 5000.0])
 def test_a_constant_residual_gives_numbers(value):
     n = 500

@@ -67,7 +67,8 @@ def _updated(model: Switching, rows: StateRows, decoded: Decoded, coloured: bool
         new = replace(new, error_s=min(memory, most))
     innovation = error - kept_errors(new, rows, starts)[:, None] * last
     inner = same.copy()
-    inner[starts] = 0.0  # a first row's error is no innovation
+    if len(starts) < len(inner):
+        inner[starts] = 0.0  # a first row's error is no innovation
     return _with_errors(new, innovation / rows.wide[:, None], inner, rows.standing)
 
 
