@@ -98,6 +98,7 @@ def diagnose(
 
     # 5. Sizes with their intervals, classes, and the drives that separate the members of a class
     leeway = {f.id: left_open(training, named, f.score, steps[-1]) for f in named.found}
+    leeway |= {} if given is None else given.left_open
     summary = summarise(problem, split, named, steps, predicted, left, leeway, settings, given)
     summary["excluded"] = excluded
     twins = [(f.id, library[t]) for f in named.found for t in f.alike[: settings.most_in_class] if t in library]

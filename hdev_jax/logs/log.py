@@ -1,7 +1,7 @@
 """`Log`: what a reader hands on. Segments for the kernel, measurements for the residual, the ledger for the user."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,7 +27,8 @@ class Log:
     **Fields:** `segments`; `measured`, what is positive out of the battery and kept out of the channels
     (`battery_power_w`, `energy_wh`); `trip_names[trip[i]]` and `vehicle_names[segments.vehicle[i]]` name row i;
     `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from; `part`,
-    where one trip is split into several: the part that each row is in, in the place of its trip among the names.
+    where one trip is split into several: the part that each row is in, in the place of its trip among the names;
+    `started_s`, when trips began, in seconds since 1970 by the log's clock, of those whose clock has a date.
     """
 
     segments: Segments
@@ -39,6 +40,7 @@ class Log:
     sampled: bool = False
     files: tuple[str, ...] = ()
     part: np.ndarray | None = None
+    started_s: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_frame(cls, frame: Any, *, name: str = "frame", adapter: Any = None) -> "Log":

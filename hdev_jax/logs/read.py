@@ -10,6 +10,7 @@ import numpy as np
 from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
+from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
 from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.limits import MAX_GRADE_RAD
@@ -199,7 +200,15 @@ def _log(
         columns=columns,
         sampled=sampled,
         files=files,
+        started_s=_started(rows) if "time_s" in data else {},
     )
+
+
+def _started(rows: Rows) -> dict[str, float]:
+    """When each trip began, where that is a date: in seconds since 1970."""
+    at = np.flatnonzero(starts(rows.trip))
+    began = {rows.trip_names[int(rows.trip[i])]: float(rows.origin_s[i]) for i in at}
+    return {name: x for name, x in began.items() if FIRST_DATE_S <= x <= LAST_DATE_S}
 
 
 def _intervals(rows: Rows, sampled: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,16 +1,55 @@
 """Effects with a state that no channel of the log shows: a load that is on or off."""
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
+from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.physics.parameter import Choice, Size
 
-__all__ = ["KNOTS_C", "SWITCHING_LOADS", "SecondSwitchingLoad", "SwitchingLoad", "expected_share", "state_channel"]
+__all__ = [
+    "COVARIATES",
+    "KNOTS_C",
+    "SWITCHING_LOADS",
+    "Covariate",
+    "SecondSwitchingLoad",
+    "SwitchingLoad",
+    "covariates_of",
+    "expected_share",
+    "state_channel",
+]
 
 KNOTS_C = (0.0, 10.0, 20.0, 30.0)  # ambient temperatures at which the share of time on is given
 USUAL_C = 15.0  # where the log has no temperature; the shares are one number then
+START_S = 600.0  # in which the start of a trip fades: cabins and batteries of buses warm up in 10 to 20 minutes
+HALF = 0.5  # state of charge at which the shares are given
+
+
+class Covariate(NamedTuple):
+    """What the share of time on may depend on beside the outside temperature: the parameter that holds its log-odds,
+    the value in a row, and in words where that is highest and lowest."""
+
+    name: str
+    value: Callable[[Any], Any]
+    high: str
+    low: str
+
+
+COVARIATES = (
+    Covariate("by_standstill", lambda row: jnp.where(row.speed_mps < STANDSTILL_MPS, 1.0, 0.0),
+              "at standstill", "in motion"),
+    Covariate("by_start", lambda row: jnp.exp(-row.time_s / START_S), "at the start of a trip", "later"),
+    Covariate("by_soc", lambda row: row.get("soc", HALF) - HALF, "with the fullest battery", "with the emptiest"),
+    Covariate("by_door", lambda row: row.get("door_open", 0.0) * 1.0, "with doors open", "with doors closed"),
+)  # fmt: skip
+
+
+def covariates_of(row: Any) -> Any:
+    """`COVARIATES` in a row, or in all rows of segments, along the last axis; 0 where the log has no such channel."""
+    like = row.speed_mps
+    return jnp.stack([jnp.broadcast_to(jnp.asarray(c.value(row), like.dtype), like.shape) for c in COVARIATES], axis=-1)
 
 
 def state_channel(effect_id: str) -> str:
@@ -18,10 +57,15 @@ def state_channel(effect_id: str) -> str:
     return f"derived:{effect_id}"
 
 
-def expected_share(temp_c: Any, shares: Any) -> Any:
-    """Share of time on at an ambient temperature [°C], linear between `KNOTS_C` and constant beyond; any shape."""
+def expected_share(temp_c: Any, shares: Any, log_odds: Any = 0.0) -> Any:
+    """Share of time on at an ambient temperature [°C], linear between `KNOTS_C` and constant beyond; any shape.
+
+    `log_odds` by other covariates multiply the odds of being on by e^log_odds; shares of 0 and 1 stay.
+    """
     shares = jnp.asarray(shares)
-    return jnp.interp(jnp.asarray(temp_c, shares.dtype), jnp.asarray(KNOTS_C, shares.dtype), shares)
+    share = jnp.interp(jnp.asarray(temp_c, shares.dtype), jnp.asarray(KNOTS_C, shares.dtype), shares)
+    odds = jnp.exp(jnp.asarray(log_odds, shares.dtype))
+    return share * odds / (share * odds + 1.0 - share)
 
 
 class SwitchingLoad(Effect):
@@ -29,8 +73,9 @@ class SwitchingLoad(Effect):
 
     Where the state has been decoded from measured power, it is the channel `derived:switching_load`. Where it has not
     (a prediction without measured power), the load is its expected value, by the share of time on at the ambient
-    temperature. It forgets its state within `memory_s`: the rates of switching on and off are share/memory and
-    (1 − share)/memory, so that it stays on for memory/(1 − share) on average.
+    temperature. The odds of being on may depend on `COVARIATES` too: the shares are those in motion, long after the
+    trip's start, with half a charge and closed doors. It forgets its state within `memory_s`: the rates of switching on
+    and off are share/memory and (1 − share)/memory, so that it stays on for memory/(1 − share) on average.
     """
 
     id: ClassVar[str] = "switching_load"
@@ -46,6 +91,10 @@ class SwitchingLoad(Effect):
         Choice("share_20c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 20 °C"),
         Choice("share_30c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 30 °C"),
         Choice("memory_s", "s", 60.0, 30.0, 1.0, 7200.0, label="memory"),
+        Choice("by_standstill", "1", 0.0, 1.0, -10.0, 10.0, label="log-odds of being on at standstill"),
+        Choice("by_start", "1", 0.0, 1.0, -10.0, 10.0, label="log-odds of being on at the trip's start"),
+        Choice("by_soc", "1", 0.0, 2.0, -20.0, 20.0, label="log-odds of being on by the state of charge"),
+        Choice("by_door", "1", 0.0, 1.0, -10.0, 10.0, label="log-odds of being on with doors open"),
     )
     searched: ClassVar[str] = "states"
     mistaken_for: ClassVar[Names] = (
@@ -62,16 +111,25 @@ class SwitchingLoad(Effect):
     share_20c: Any
     share_30c: Any
     memory_s: Any
+    by_standstill: Any
+    by_start: Any
+    by_soc: Any
+    by_door: Any
 
     def shares(self) -> Real:
         """Share of time on at each of `KNOTS_C`."""
         return jnp.stack([jnp.asarray(x) for x in (self.share_0c, self.share_10c, self.share_20c, self.share_30c)])
 
+    def by(self) -> Real:
+        """Log-odds of being on by each of `COVARIATES`."""
+        return jnp.stack([jnp.asarray(getattr(self, c.name)) for c in COVARIATES])
+
     def power(self, row: Row, car: Car, point: Point) -> Real:
         channel = state_channel(self.id)
         if row.has(channel):
             return self.power_w * row.channels[channel]
-        return self.power_w * expected_share(row.get("ambient_temp_c", USUAL_C), self.shares())
+        log_odds = jnp.sum(self.by() * covariates_of(row))
+        return self.power_w * expected_share(row.get("ambient_temp_c", USUAL_C), self.shares(), log_odds)
 
 
 class SecondSwitchingLoad(SwitchingLoad):

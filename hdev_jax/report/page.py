@@ -21,7 +21,7 @@ from hdev_jax.report.figures import (
     trip_errors,
 )
 from hdev_jax.report.posterior import prior_likelihood_posterior
-from hdev_jax.report.residuals import panels, residual_by_channel, residual_in_time
+from hdev_jax.report.residuals import drift_course, panels, residual_by_channel, residual_in_time
 from hdev_jax.report.statistics import blocks, row_seconds
 from hdev_jax.report.switching import loads, switching_loads
 
@@ -51,6 +51,7 @@ def write_report(data: ReportData, directory: Path) -> None:
             "residual_channels": residual_by_channel(data, shown),
             "residual_time": residual_in_time(data),
             "switching_loads": switching_loads(data),
+            "drift_course": drift_course(data),
             "energy_by_effect": energy_by_effect(data),
             "trips": trip_errors(data),
         }
@@ -67,6 +68,7 @@ def write_report(data: ReportData, directory: Path) -> None:
         "excluded": [{**e, "name": names.effect(e["id"])} for e in summary.get("excluded", [])],
         "unexplained": {**_NO_UNEXPLAINED, **summary.get("unexplained", {})},
         "loads": [_load(e, summary) for e in loads(data)],
+        "drift_kwh": _drift_kwh(summary),
         "depends_on": [(c, names.channel(c).label) for c in summary.get("unexplained", {}).get("depends_on") or []],
         "nothing_added": same_model(data),
         "dependence": [p for p in shown if p.name[0] != "\x00"],
@@ -244,6 +246,12 @@ def _load(e: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:
         "off_s": words.number(state["dwell_off_s"], 2, "s"),
         "kwh": [(t, *(words.number(x) for x in state["kwh_by_trip"][t])) for t in test if t in state["kwh_by_trip"]],
     }
+
+
+def _drift_kwh(summary: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Energy of what drifts in each test trip, with its interval."""
+    kwh = (summary.get("unexplained", {}).get("course") or {}).get("kwh_by_trip", {})
+    return [(t, *(words.number(x) for x in kwh[t])) for t in summary["split"]["test_trips"] if t in kwh]
 
 
 def _candidates(summary: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:

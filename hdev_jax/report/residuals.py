@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hdev_jax.report import names
-from hdev_jax.report.canvas import GREY, axis_label, figure, plain_log, tidy
+from hdev_jax.report.canvas import AFTER, GREY, MEASURED, axis_label, figure, plain_log, tidy
 from hdev_jax.report.data import ReportData, test_rows
 from hdev_jax.report.figures import WIDTH, legend, models, short
 from hdev_jax.report.statistics import (
@@ -19,7 +19,7 @@ from hdev_jax.report.statistics import (
     variance_by_period,
 )
 
-__all__ = ["Panel", "panels", "residual_by_channel", "residual_in_time"]
+__all__ = ["Panel", "drift_course", "panels", "residual_by_channel", "residual_in_time"]
 
 PANELS = 12
 # what the target is made from, and columns that say nothing about driving
@@ -147,4 +147,24 @@ def residual_in_time(data: ReportData) -> Any | None:
         right.set_axis_off()
         right.text(0.5, 0.5, "trips too short for a spectrum", ha="center", color=GREY, transform=right.transAxes)
     legend(fig, data)
+    return fig
+
+
+def drift_course(data: ReportData) -> Any | None:
+    """The smoothed course of what drifts, in one test trip; None where nothing does."""
+    if not (c := data.summary.get("unexplained", {}).get("course")):
+        return None
+    fig = figure(WIDTH, 2.4)
+    ax = fig.add_subplot(1, 1, 1)
+    minutes = np.asarray(c["time_s"]) / 60.0
+    left, mean, low, high = (np.asarray(c[k]) / 1e3 for k in ("left_w", "power_w", "lower_w", "upper_w"))
+    ax.plot(minutes, left, ".", color=MEASURED, markersize=4, label="measured less predicted, by minute")
+    ax.fill_between(minutes, low, high, color=AFTER, alpha=0.25, linewidth=0, label="90 % interval")
+    ax.plot(minutes, mean, color=AFTER, label="smoothed")
+    ax.axhline(0, color=GREY, linewidth=0.6)
+    ax.set_title(f"What drifts, in {short(c['trip'], 30)}")
+    ax.set_xlabel(axis_label("time since start of the trip", "min"))
+    ax.set_ylabel("power [kW]")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3)  # beside the title
+    tidy(ax)
     return fig

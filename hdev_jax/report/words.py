@@ -11,6 +11,7 @@ from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.problem import LAST_THIRD
 from hdev_jax.report import names
 from hdev_jax.report.data import ReportData, total_name
+from hdev_jax.report.states import contrast, modes
 
 __all__ = [
     "NBSP",
@@ -166,7 +167,7 @@ def switching(effect: Mapping[str, Any]) -> str:
     shares = [(c, x) for c, x, *_ in state["share_on"]] or [(None, state["mean_share_on"])]
     at = [f"{100 * x:.0f}{NBSP}%{'' if c is None else f' at {c:.0f}{NBSP}°C'}" for c, x in shares]
     parts.append(f"{at[0].replace('%', '% of the time', 1)}{''.join(f', {a}' for a in at[1:])}")
-    text = " ".join(parts)
+    text = " ".join(parts) + "".join(f", {contrast(c)}" for c in state.get("depends_on", ()))
     share = state.get("share_of_test_energy")
     return text + (f"; {100 * share:.0f}{NBSP}% of the energy of the test trips" if _finite(share) else "")
 
@@ -189,7 +190,7 @@ def _missing(effects: list[dict[str, Any]]) -> str:
         twins = [names.effect(t) for t in e.get("indistinguishable_from") or []]
         alike = f" or {names.verbose_join(twins, 'or')}, which this log cannot distinguish," if twins else ""
         said = f" ({switching(e)})" if "state" in e else _sizes(e)
-        items.append(f"\x02{names.effect(e['id'])}\x03{said}{alike}")
+        items.append(f"\x02{names.effect(e['id'])}\x03{said}{modes(e)}{alike}")
     if len(effects) > 4:
         items.append(f"{len(effects) - 4} more")
     return names.verbose_join(items).rstrip(",")

@@ -47,6 +47,7 @@ def one_step_ahead(
         np.array([float(np.asarray(e.power_w)) for e in effects]), float(states["base_w"]),
         np.asarray(states["scale_w"], dtype=float), np.stack([np.asarray(e.shares()) for e in effects]),
         np.array([float(np.asarray(e.memory_s)) for e in effects]), float(states["error_s"]), float(states["freedom"]),
+        np.stack([np.asarray(e.by()) for e in effects]),
     )  # fmt: skip
     seconds = np.asarray(problem.segments.duration_s)
 
@@ -59,7 +60,7 @@ def one_step_ahead(
     rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
     decoded = decode(model, rows)
     per_watt = as_watts(problem.target, np.ones(len(seconds)), seconds)
-    width = float(stats.t.ppf(0.5 + 0.5 * level, model.freedom)) * model.scale_w[rows.standing]
+    width = float(stats.t.ppf(0.5 + 0.5 * level, model.freedom)) * model.scale_w[rows.standing] * rows.wide
     open_w = stats.norm.ppf(0.5 + 0.5 * level) * np.sqrt(
         np.sum(model.power_w**2 * decoded.ahead * (1.0 - decoded.ahead), axis=1)
     )

@@ -15,6 +15,7 @@ from hdev_jax.diagnosis.competition.cycle import _fitted, _left_out_gain, _Rows,
 from hdev_jax.diagnosis.competition.mode import LASTING, _against, _alone, _p, _split, _stability, add_mode
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.noise.noise import Noise
+from hdev_jax.diagnosis.result.modes import mode_block
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.physics.battery import ModeChange
@@ -213,6 +214,23 @@ def test_one_odd_trip_is_no_mode_of_resampled_trips():
     assert _stability(grams[None], [True], *NOTHING, 0.05, np.random.default_rng(0), SETTINGS) < 0.1
 
 
+def _dated(problem, state):
+    """The modes of all trips, those of the fit as they were found; each change has the start of its first trip."""
+    found = state.found[0].score.candidate.by_trip["in_mode"]
+    started = {name: 1.7e9 + 86400.0 * k for k, name in enumerate(problem.log.trip_names)}
+    modes = mode_block(replace(problem, log=replace(problem.log, started_s=started)), state.fit)
+    names = problem.log.trip_names
+    assert list(modes["probability"]) == list(names)
+    assert {t: float(modes["probability"][names[t]] > 0.5) for t in found} == found
+    high = [x > 0.5 for x in modes["probability"].values()]
+    first = [k for k in range(1, len(high)) if high[k] != high[k - 1]]
+    assert [(c["trip"], c["to"]) for c in modes["changes"]] == [(names[k], ("first", "second")[high[k]]) for k in first]
+    assert all(
+        c["start"].startswith(f"2023-{11 + (14 + k) // 31}-") for c, k in zip(modes["changes"], first, strict=True)
+    )
+    assert all(c["start"] is None for c in mode_block(problem, state.fit)["changes"])
+
+
 @pytest.mark.parametrize("left_out", [200.0, 1.0])
 @pytest.mark.parametrize(("effect", "rows", "add"), [("mode_change", 80, add_mode), ("periodic_load", 160, add_cycle)])
 def test_what_trips_left_out_do_not_confirm_is_not_added(effect, rows, add, left_out, tmp_path, monkeypatch):
@@ -225,6 +243,8 @@ def test_what_trips_left_out_do_not_confirm_is_not_added(effect, rows, add, left
     if left_out > SETTINGS.ahead:
         assert state is not None, verdict
         assert state.ids == (effect,)
+        if effect == "mode_change":
+            _dated(problem, state)
     else:
         assert verdict is not None
         assert verdict.rejection.kind is Kind.NOT_CONFIRMED

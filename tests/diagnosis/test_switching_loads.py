@@ -5,17 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted import breaches, diagnosed, named, training
+from planted import breaches, declared, diagnosed, named, training
 
 import hdev_jax
 from hdev_jax.diagnosis.competition.levels import level_test
+from hdev_jax.diagnosis.competition.switching import add_switching
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.switching import Load, with_loads
 from hdev_jax.inference.sheet import read_sheet
-from hdev_jax.inference.states import StateRows
-from hdev_jax.logs import read_log
+from hdev_jax.inference.states import StateRows, Switching, decode, rows_of
+from hdev_jax.logs import Log, read_log
 from hdev_jax.physics import LIBRARY
 from hdev_jax.problem import prepare, split_trips
 from hdev_jax.report.build import answer_text, of_diagnosis
@@ -53,6 +54,15 @@ def some(tmp_path_factory):
     """Any training rows: the test of levels reads the settings and the kind of clusters of them."""
     _, problem, _ = log_with(tmp_path_factory.mktemp("some"))
     return training(problem, ("auxiliary_power",))
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A short log with a load, as a table, and its sheet."""
+    synthetic = synthetic_log(seed=3, trips=5, rows_per_trip=200, entry="shaft", mode="samples", effects={})
+    synthetic = with_loads(synthetic, [LOAD], seed=3)
+    files = synthetic.write(tmp_path_factory.mktemp("short"), truth=False)
+    return synthetic.frame, read_sheet(files["sheet"])
 
 
 def test_it_is_named_with_its_power_and_its_share(found):
@@ -149,6 +159,56 @@ def test_a_power_that_is_missing_constant_or_short_gives_no_load(some):
         n = len(residual)
         rows = StateRows(residual, np.zeros(n, int), np.ones(n), np.full(n, 15.0), np.ones(n, int))
         assert level_test(rows, some, rng) is None
+
+
+def _clipped(power):
+    return np.minimum(power, np.quantile(power, 0.7))
+
+
+def _held(power):
+    return np.where(np.arange(len(power)) // 200 == 1, power[199], power)  # one trip of five stands still
+
+
+@pytest.mark.parametrize(
+    "spoilt", [lambda p: np.full_like(p, 5.0), _clipped, _held], ids=["constant", "clipped", "held"]
+)
+def test_a_power_that_is_no_measurement_gives_no_load(spoilt, short):
+    frame, sheet = short
+    spoilt_too = frame.assign(battery_power_kw=spoilt(frame["battery_power_kw"].to_numpy()))
+    log = Log.from_frame(spoilt_too)
+    problem = prepare(log, sheet)
+    rows = training(problem, ("switching_load", "second_switching_load"))
+    state, verdict = add_switching(rows, declared(rows, problem), np.random.default_rng(0))
+    assert state is None
+    assert np.isfinite(verdict.q_value)
+    assert "nan" not in str(verdict.rejection)
+
+
+def test_power_that_is_missing_for_minutes_is_refused_in_one_line_or_dropped(short):
+    frame, _ = short
+    power = frame["battery_power_kw"].to_numpy().copy()
+    power[240:360] = np.nan
+    with pytest.raises(InputError, match="120 with battery_power_w missing") as error:
+        Log.from_frame(frame.assign(battery_power_kw=power))
+    assert "\n" not in str(error.value)
+    power[280:360] = frame["battery_power_kw"].to_numpy()[280:360]  # 4 % of the rows are dropped: a gap in a trip
+    log = Log.from_frame(frame.assign(battery_power_kw=power))
+    assert len(log) == len(frame) - 40
+    assert len(log.trip_names) == 6  # the rows after the gap are a trip of their own
+    rows = rows_of(log.segments, log.measured["battery_power_w"], samples=True)
+    decoded = decode(Switching(np.array([9e3]), 0.0, np.full(2, 4e3), np.full((1, 4), 0.4), np.full(1, 60.0)), rows)
+    assert np.all(np.isfinite(decoded.on))
+    assert np.isfinite(decoded.log_likelihood)
+
+
+def test_two_rows_at_standstill_have_no_load(short):
+    frame, sheet = short
+    two = frame.iloc[:2].assign(**{c: 0.0 for c in frame if c.startswith(("speed", "motor", "distance"))})
+    problem = prepare(Log.from_frame(two), sheet)
+    rows = training(problem, ("switching_load", "second_switching_load"))
+    state, verdict = add_switching(rows, declared(rows, problem), np.random.default_rng(0))
+    assert state is None
+    assert verdict is None or "nan" not in str(verdict.rejection)
 
 
 def test_predicting_online_filters_along_the_log(tmp_path):

@@ -9,7 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from hdev_jax.inference.states import StateRows, Switching, decode, energy_draws, errors_alone, fit_switching, shares_of
+from hdev_jax.inference.states import (
+    StateRows,
+    Switching,
+    contrasts,
+    decode,
+    energy_draws,
+    errors_alone,
+    fit_switching,
+    rows_of,
+    shares_of,
+    what_it_depends_on,
+)
+from hdev_jax.physics.states import SwitchingLoad, expected_share
+from hdev_jax.segments import Segments
 
 TRIPS, SECONDS = 6, 1800
 
@@ -95,7 +108,7 @@ def test_trips_are_sequences_of_their_own():
 def test_energy_drawn_is_about_the_energy_decoded():
     rows, _ = residual((6000.0, 15000.0))
     model, decoded = fit_switching(start(6000.0, 15000.0), rows, 6)
-    drawn = energy_draws(model, rows, key=jax.random.key(0), draws=30)
+    drawn = energy_draws(model, rows, seed=0, draws=30)
     mean = np.stack([(decoded.on[rows.trip == t] * model.power_w).sum(axis=0) / 3600.0 for t in range(TRIPS)], axis=1)
     assert drawn.shape == (30, 2, TRIPS)
     assert np.all(np.abs(drawn.mean(axis=0) - mean) < 5 * drawn.std(axis=0) / np.sqrt(30) + 0.01 * mean + 5.0)
@@ -123,6 +136,34 @@ def test_means_over_rows_keep_time_and_energy(seconds, seed):
         np.testing.assert_allclose(np.sum(b.duration_s * b.residual_w), np.sum(a.duration_s * a.residual_w))
 
 
+def test_trips_of_one_row_give_numbers():
+    rng = np.random.default_rng(0)
+    rows = StateRows(
+        rng.normal(0, 1e3, 200), np.arange(200), np.full(200, 7.0), np.full(200, 15.0), np.zeros(200, int), energy=True
+    )
+    model, decoded = fit_switching(start(1000.0), rows, 3)
+    assert np.all(np.isfinite(decoded.on))
+    assert np.isfinite(decoded.log_likelihood)
+    assert np.all(np.isfinite(model.scale_w))
+
+
+def test_an_energy_has_the_same_error_in_a_row_of_any_length():
+    """The same energies as powers of rows as short and as long: their errors are as wide, and decoded alike."""
+    rng = np.random.default_rng(3)
+    n, seconds = 2000, rng.choice([4.0, 8.0, 16.0], 2000)
+    on = (np.cumsum(rng.random(n) < 0.1) % 2).astype(float)
+    power = 8000.0 * on + rng.normal(0.0, 2000.0, n) * 10.0 / seconds
+    rows = StateRows(power, np.repeat(np.arange(4), n // 4), seconds, np.full(n, 15.0), np.zeros(n, int), energy=True)
+    right = []
+    for each in (rows, replace(rows, energy=False)):
+        model, decoded = fit_switching(start(6000.0), each, 6)
+        right.append(np.mean((decoded.on[:, 0] > 0.5) == on))
+        if each.energy:
+            np.testing.assert_allclose(model.scale_w[0], 2000.0, rtol=0.15)
+            np.testing.assert_allclose(model.power_w, 8000.0, rtol=0.05)
+    assert right[0] > right[1] > 0.7
+
+
 @pytest.mark.parametrize("value", [0.0, 5000.0])
 def test_a_constant_residual_gives_numbers(value):
     n = 500
@@ -131,3 +172,70 @@ def test_a_constant_residual_gives_numbers(value):
     assert np.all(np.isfinite(decoded.on))
     assert np.all(np.isfinite(model.power_w))
     assert all(np.isfinite(errors_alone(rows)))
+
+
+def with_covariates(seed, by, trips=10, n=1500):
+    """Rows with a load whose log-odds of being on depend on standstill, the trip's start and the state of charge."""
+    rng = np.random.default_rng(seed)
+    standing = (np.cumsum(rng.random((trips, n)) < 1 / 60, axis=1) % 2).astype(float)
+    clock = np.tile(np.arange(float(n)), (trips, 1))
+    charge = np.linspace(0.4, -0.3, trips)[:, None] - 1e-5 * clock
+    beside = np.stack([standing, np.exp(-clock / 600.0), charge, np.zeros_like(clock)], axis=-1)
+    share = 1.0 / (1.0 + np.exp(0.85 - beside @ np.asarray(by)))
+    keep, drawn, on = np.exp(-1 / 40.0), rng.random((trips, n)), np.zeros((trips, n))
+    for t in range(1, n):
+        on[:, t] = drawn[:, t] < keep * on[:, t - 1] + (1 - keep) * share[:, t]
+    count = trips * n
+    return StateRows(
+        6000.0 * on.ravel() + rng.normal(0.0, 1500.0, count), np.repeat(np.arange(trips), n), np.ones(count),
+        np.full(count, 15.0), standing.ravel().astype(int), 0.1, beside.reshape(count, -1),
+    )  # fmt: skip
+
+
+# standard errors of log-odds p: 1/√(n·p·(1 − p)), n the time at each over twice the memory
+@pytest.mark.parametrize(
+    ("by", "error"),
+    [((0.0, 0, 0, 0), 0.0), ((3.0, 0, 0, 0), 0.42), ((0, 0, 7.0, 0), 0.8)],
+    ids=["nothing", "standstill", "charge"],
+)
+def test_what_the_chances_depend_on_is_found_and_nothing_else(by, error):
+    rows = with_covariates(1, by)
+    model, decoded = fit_switching(start(5000.0), rows, 4)
+    model = what_it_depends_on(model, rows, decoded, rows.trip, cost=3.0, level=0.05)
+    assert [bool(b) for b in model.by[0]] == [bool(b) for b in by]
+    again, after = fit_switching(model, rows, 2)
+    np.testing.assert_allclose(again.by[0], by, atol=3.0 * error)
+    np.testing.assert_allclose(again.share[0], 0.3, atol=0.14)
+    plain, before = fit_switching(replace(model, by=np.zeros_like(model.by)), rows, 2)
+    said = contrasts(again, rows, 0)
+    if any(by):
+        assert after.log_likelihood > before.log_likelihood + 3.0
+        assert said[0]["share_high"] > said[0]["share_low"] + 0.2
+    else:
+        assert said == []
+    assert np.all(plain.by == 0)
+
+
+def test_the_chances_gain_no_less_than_their_moves_say():
+    rows = with_covariates(2, (2.0, 0, 0, 0))
+    model, decoded = fit_switching(start(5000.0), rows, 4)
+    named = what_it_depends_on(model, rows, decoded, rows.trip, cost=3.0, level=0.05)
+    assert decode(named, rows).log_likelihood > decoded.log_likelihood + 3.0
+
+
+def test_the_effect_expects_what_the_chain_expects():
+    effect = SwitchingLoad(1.0, 0.8, 0.5, 0.2, 0.1, 60.0, by_standstill=1.5, by_start=0.0, by_soc=-2.0, by_door=0.0)
+    rng = np.random.default_rng(0)
+    n = 50
+    segments = Segments.from_arrays(
+        duration_s=np.ones(n), speed_start_mps=np.where(rng.random(n) < 0.5, 0.0, 9.0),
+        speed_end_mps=np.where(rng.random(n) < 0.5, 0.0, 9.0), ambient_temp_c=rng.uniform(-5, 35, n), soc=rng.random(n),
+    )  # fmt: skip
+    rows = rows_of(segments, np.zeros(n), samples=True)
+    by = np.array([[1.5, 0.0, -2.0, 0.0]])
+    model = replace(start(1.0), share=np.asarray(effect.shares())[None], by=by)
+    power = jax.vmap(lambda row: effect.power(row, None, None))(jax.tree.map(np.asarray, segments))
+    np.testing.assert_allclose(power, model.expected(rows)[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(
+        replace(model, by=0.0 * by).expected(rows)[:, 0], expected_share(rows.temp_c, model.share[0])
+    )

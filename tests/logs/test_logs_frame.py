@@ -37,6 +37,19 @@ def test_a_table_is_read_as_its_file(made, frame, tmp_path):
     assert [c.name for c in from_memory.columns] == [c.name for c in from_file.columns]
 
 
+def test_when_trips_began_is_known_where_the_clock_has_a_date(frame):
+    assert Log.from_frame(frame).started_s == {}
+    of_trip = np.repeat(["2022-01-06T05:02:00", "2022-03-09T05:25:00"], N // 2)
+    stamps = pd.to_datetime(of_trip) + pd.to_timedelta(frame["time_s"].to_numpy(), unit="s")
+    unix = (stamps - pd.Timestamp(0)).total_seconds()
+    began = {"a": pd.Timestamp("2022-01-06T05:02:00").timestamp(), "b": pd.Timestamp("2022-03-09T05:25:00").timestamp()}
+    bare = frame.drop(columns="time_s")
+    for clock in ({"timestamp": stamps}, {"timestamp": stamps.strftime("%Y-%m-%dT%H:%M:%S")}, {"time_unix": unix}):
+        log = Log.from_frame(bare.assign(**clock))
+        assert log.started_s == pytest.approx(began)
+        np.testing.assert_allclose(log.segments.time_s[: N // 2], np.arange(N // 2), atol=1e-6)
+
+
 def test_an_index_is_no_row_number(frame):
     shuffled = frame.set_index(np.arange(100, 100 + N))
     assert Log.from_frame(shuffled).fingerprint() == Log.from_frame(frame).fingerprint()

@@ -290,6 +290,36 @@ def test_what_is_left_is_shown_with_what_it_grows_with(scale, said, tmp_path):
     assert "Grows with" not in plain(written(fake("nothing_missing"), tmp_path / "bare"))
 
 
+def test_a_mode_is_dated_where_the_log_has_times():
+    data = fake()
+    for effect in data.summary["effects"]:
+        effect["modes"] = {
+            "probability": {"T01": 0.01, "T02": 0.99, "T03": 0.98, "T04": 0.02},
+            "changes": [
+                {"trip": "T02", "to": "second", "start": "2022-01-06T05:02:00", "after": "T01"},
+                {"trip": "T04", "to": "first", "start": None, "after": "T03"},
+            ],
+        }
+    assert "; the second mode from 2022-01-06 05:02 (trip T02) on, until trip T04" in answer(data)
+    data.summary["effects"][0]["modes"]["changes"] *= 2
+    assert "; the second mode in 2 of 4 trips" in answer(data)
+
+
+def test_what_drifts_is_shown_with_its_energy(tmp_path):
+    data = fake("nothing_missing")
+    minute = np.arange(12.0)
+    data.summary["unexplained"]["course"] = {
+        "kwh_by_trip": {t: [1.234, 0.5, 1.9] for t in data.trip_names}, "trip": "T03",
+        "time_s": (60.0 * minute + 30.0).tolist(), "left_w": (2e3 * np.sin(minute)).tolist(),
+        **{k: (1.5e3 * np.sin(minute) + x).tolist() for k, x in (("power_w", 0), ("lower_w", -400), ("upper_w", 400))},
+    }  # fmt: skip
+    text = written(data, tmp_path / "drifts")
+    assert "kWh of what drifts" in text
+    assert plain(text).count("1.23") == len(data.summary["split"]["test_trips"])
+    assert (tmp_path / "drifts" / "figures" / "drift_course.png").stat().st_size > 5_000
+    assert "what drifts" not in written(fake("nothing_missing"), tmp_path / "bare")
+
+
 @pytest.mark.parametrize(
     ("confirmed", "share", "doubt"), [(True, 0.12, False), (False, 0.12, True), (False, 0.01, False)]
 )

@@ -37,7 +37,7 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
     if len(rows.trip) < LEAST_ROWS or np.ptp(rows.residual_w) <= 0 or not np.all(np.isfinite(rows.residual_w)):
         return None
     model, gain = _best(rows)
-    noise = estimate_noise(rows.residual_w, rows.trip, rows.duration_s, levels=False)
+    noise = estimate_noise(rows.residual_w / rows.wide, rows.trip, rows.duration_s, levels=False)
     others = []
     for _ in range(training.settings.shifts):
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
@@ -107,9 +107,9 @@ def _surrogate(rows: StateRows, noise: Noise, rng: np.random.Generator) -> np.nd
     """Noise of the residual's own colour: its innovations with random signs, coloured again, trip by trip."""
     out = np.empty(len(rows.trip))
     whiten = np.r_[1.0, -noise.coefficients[-1]]
-    left = rows.residual_w - np.median(rows.residual_w)
+    left = (rows.residual_w - np.median(rows.residual_w)) / rows.wide
     for _, s in trip_slices(rows.trip):
         innovations = np.asarray(signal.lfilter(whiten, [1.0], left[s]))
         signs = rng.choice((-1.0, 1.0), len(innovations))
         out[s] = signal.lfilter([1.0], whiten, innovations * signs)
-    return out
+    return out * rows.wide

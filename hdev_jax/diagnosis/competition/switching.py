@@ -28,9 +28,10 @@ from hdev_jax.inference.states import (
     decode,
     fit_switching,
     rows_of,
+    what_it_depends_on,
 )
 from hdev_jax.physics import SwitchingLoad, Vehicle
-from hdev_jax.physics.states import KNOTS_C, SWITCHING_LOADS, state_channel
+from hdev_jax.physics.states import COVARIATES, KNOTS_C, SWITCHING_LOADS, state_channel
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TARGETS, as_watts
 
@@ -98,6 +99,9 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         return no(Kind.IMPLAUSIBLE, f"a load of {model.power_w[k] / 1e3:.3g} kW, but {why[k]}", q)
     if why:
         model, decoded = fit_switching(model.only(kept), rows, ROUNDS)
+    model = what_it_depends_on(model, rows, decoded, training.clusters.ids, cost=settings.size_cost, level=settings.fdr)
+    if np.any(model.by):
+        model, decoded = fit_switching(model, rows, FIRST_ROUNDS)
     ids = (*held, *(e.id for e in able))[: len(kept)]
     new = replace(without(training, state, *beside) if beside else state, hidden=Hidden(ids, model, decoded.on))
     there = with_states(training, new)
@@ -141,9 +145,10 @@ def _sought(
 
 
 def _shapes(model: Switching, k: int) -> tuple[tuple[str, float], ...]:
-    """Shares and memory of a load as the effect has them."""
+    """Shares, memory and what else the chances depend on, as the effect has them."""
     shares = [(f"share_{c:.0f}c", float(x)) for c, x in zip(KNOTS_C, model.share[k], strict=True)]
-    return (*shares, ("memory_s", float(model.memory_s[k])))
+    by = [(c.name, float(b)) for c, b in zip(COVARIATES, model.by[k], strict=True) if b]
+    return (*shares, ("memory_s", float(model.memory_s[k])), *by)
 
 
 def decoded_again(training: Training, state: State) -> State:
@@ -178,7 +183,8 @@ def _as_decoded(state: State) -> Vehicle:
     for k, id_ in enumerate(state.hidden.ids if state.hidden else ()):
         now = vehicle.effect(id_)
         assert state.hidden is not None
-        vehicle = vehicle.minus(id_).plus(type(now)(now.power_w, **dict(_shapes(state.hidden.model, k))))
+        shapes = {**{c.name: 0.0 for c in COVARIATES}, **dict(_shapes(state.hidden.model, k))}
+        vehicle = vehicle.minus(id_).plus(type(now)(now.power_w, **shapes))
     return vehicle
 
 
@@ -254,7 +260,7 @@ def _stability(
     """Share of resampled sets of trips in which the load explains more than it costs."""
     alone = _alone(rows, model, decoded, k).residual_w
     with_it = model.base_w + decoded.on[:, k] * model.power_w[k]
-    each = (np.abs(alone - np.median(alone)) - np.abs(alone - with_it)) / model.scale_w[rows.standing]
+    each = (np.abs(alone - np.median(alone)) - np.abs(alone - with_it)) / (model.scale_w[rows.standing] * rows.wide)
     gains = np.array([np.sum(each[s]) for _, s in trip_slices(rows.trip)])
     drawn = rng.integers(0, len(gains), (settings.resamples, len(gains)))
     return float(np.mean(np.sum(gains[drawn], axis=1) > settings.size_cost))

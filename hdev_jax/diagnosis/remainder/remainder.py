@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
-from hdev_jax.diagnosis.remainder.drift import Drift, drift_of
+from hdev_jax.diagnosis.remainder.drift import Drift, Slow, drift_of
 from hdev_jax.diagnosis.remainder.learner import curve, learn, share_of
 from hdev_jax.diagnosis.remainder.rows import features, side
 from hdev_jax.diagnosis.remainder.structure import (
@@ -50,6 +50,7 @@ class Remainder:
     behaves_like: str = "none"  # what is slow in it: a load, a force, a gain
     sd: float | None = None  # of that: W, N, share of the power
     memory_s: float | None = None
+    course: Mapping[str, Any] | None = None  # of what is slow: kWh by trip, and its power in one of the test trips
     confirmed: bool = False  # whether cross-validation over training clusters confirms the learner's share
 
 
@@ -110,7 +111,7 @@ def remainder(
         sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
     if learned:
         depends += list(order)
-        how = f"{100 * share:.0f} % of its variance depends on {', '.join(order)}"
+        how = f"{100 * share:.0f} % of its variance depends on {', '.join(order) or 'several channels'}"
         parts.append(f"{how} in a form that no effect of the library has")
     if period is not None:
         seconds, amplitude = period.period_s, period.amplitude
@@ -141,7 +142,7 @@ def remainder(
     grows = scales_with(train, settings) if parts else None
     if grows is not None:
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
-    drift = _drift(problem, problem.rows(split.train), given, settings)
+    drift, course = _drift(problem, split, given, settings)
     if drift.words:
         parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
@@ -154,15 +155,21 @@ def remainder(
         scales_with=grows,
         correction=curve(correction, test, list(names), order[0], problem.unit) if learned and order else None,
         behaves_like=drift.like, sd=drift.sd if np.isfinite(drift.sd) else None, memory_s=drift.memory_s or None,
+        course=course,
         expression=formula.words if formula is not None else None, confirmed=learned,
     )  # fmt: skip
 
 
-def _drift(problem: Problem, rows: np.ndarray, given: np.ndarray, settings: Settings) -> Drift:
-    """What is slow in the residual of some rows of a battery's target; nothing of another target."""
+def _drift(
+    problem: Problem, split: Split, given: np.ndarray, settings: Settings
+) -> tuple[Drift, dict[str, Any] | None]:
+    """What is slow in the training rows' residual of a battery's target, and its course in all trips; nothing of
+    another target."""
     if not TARGETS[problem.target].of_battery:
-        return Drift("none", float("nan"), 0.0)
+        return Drift("none", float("nan"), 0.0), None
     s = problem.segments
-    seconds = np.asarray(s.duration_s)[rows]
-    residual, predicted = (as_watts(problem.target, x[rows], seconds) for x in (problem.measured - given, given))
-    return drift_of(residual, predicted, np.asarray(s.speed_mps)[rows], seconds, np.asarray(s.trip)[rows], settings)
+    seconds, trip = np.asarray(s.duration_s), np.asarray(s.trip)
+    residual, predicted = (as_watts(problem.target, x, seconds) for x in (problem.measured - given, given))
+    slow = Slow.of(residual, predicted, np.asarray(s.speed_mps), seconds, trip)
+    drift = drift_of(slow.take(np.isin(slow.trip, split.train)), settings)
+    return drift, drift.course(slow, problem.log.trip_names, split.test)

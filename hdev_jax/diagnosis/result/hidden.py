@@ -5,16 +5,26 @@ ahead* knows the rows before: the filtered state, carried on by one row. *Given 
 power, this row's included: it explains and does not predict.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.competition.state import State
-from hdev_jax.inference import Calibration
-from hdev_jax.inference.states import Switching, decode, energy_draws, fit_switching, rows_of, shares_of
+from hdev_jax.diagnosis.result.intervals import Open
+from hdev_jax.inference import Calibration, cluster_rows
+from hdev_jax.inference.states import (
+    Decoded,
+    StateRows,
+    Switching,
+    contrasts,
+    decode,
+    energy_draws,
+    fit_switching,
+    rows_of,
+    shares_of,
+)  # fmt: skip
 from hdev_jax.physics.states import KNOTS_C, state_channel
 from hdev_jax.problem import Problem, Split, metrics
 from hdev_jax.segments import Segments, trip_slices
@@ -23,6 +33,8 @@ from hdev_jax.targets import TARGETS, as_watts
 __all__ = ["Given", "errors_by_knowledge", "given_states", "state_block"]
 
 DRAWS = 40
+# quantiles between so few draws lie further inside than those of the distribution: of a normal by so much
+FEW = float(stats.norm.ppf(0.05) / stats.norm.ppf((0.05 * (DRAWS - 1) + 1.0) / (DRAWS + 1)))
 NEAR_C = 5.0  # a temperature is reported where the training trips have one as near
 LEAST_S = 600.0  # of time there
 
@@ -30,14 +42,23 @@ LEAST_S = 600.0  # of time there
 @dataclass(frozen=True)
 class Given:
     """The log's rows with the decoded states (`segments`), predictions given them and one step ahead, the model that
-    decoded them, and the energy of each load in each trip [kWh]: mean, 5 % and 95 %."""
+    decoded them, the power of each load as fitted with all else in the vehicle [W], and the energy of each in each trip
+    [kWh]: mean, 5 % and 95 %."""
 
     segments: Segments
     predicted: np.ndarray
     ahead: np.ndarray
     ids: tuple[str, ...]
     model: Switching
-    kwh: dict[str, dict[str, list[float]]]
+    power_w: dict[str, float]
+    kwh: list[dict[str, list[float]]]
+
+    @property
+    def left_open(self) -> dict[str, dict[str, Open]]:
+        """The power of each load by expectation-maximisation, which knows that states are uncertain, is as likely as
+        that by least squares, which knows all else in the vehicle."""
+        away = {i: float(p) - self.power_w[i] for i, p in zip(self.ids, self.model.power_w, strict=True)}
+        return {i: {"power_w": Open(np.array([0.0, x]), np.full(2, 0.5))} for i, x in away.items()}
 
 
 def given_states(problem: Problem, split: Split, state: State, fit: Calibration, seed: int) -> Given | None:
@@ -52,28 +73,40 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
     off = known(np.zeros((len(seconds), len(ids))))
     left = as_watts(problem.target, problem.measured - problem.predict(fit.vehicle, off), seconds)
     rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
-    power = np.array([float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids])
     model, _ = fit_switching(state.hidden.model, rows.take(problem.rows(split.train)), 1)
     decoded = decode(model, rows)
     where = known(decoded.on)
     error = decoded.error_w / as_watts(problem.target, np.ones(len(seconds)), seconds)
-    kwh: dict[str, dict[str, list[float]]] = {i: {} for i in ids}
-    drawn = energy_draws(replace(model, power_w=power), rows, key=jax.random.key(seed), draws=DRAWS) / 1e3
     errors = {c.path: float(e) for c, e in zip(fit.table.free, fit.errors, strict=True)}
-    rng = np.random.default_rng(seed)
-    trips = [problem.log.trip_names[t] for t, _ in trip_slices(rows.trip)]
-    for k, i in enumerate(ids):
-        wide = 1.0 + rng.standard_normal(DRAWS) * errors.get(f"effects.{i}.power_w", 0.0) / max(power[k], 1e-9)
-        each = drawn[:, k, :] * wide[:, None]
-        low, high = np.quantile(each, (0.05, 0.95), axis=0)
-        kwh[i] = {
-            t: [float(m), float(a), float(b)]
-            for t, m, a, b in zip(trips, drawn[:, k].mean(axis=0), low, high, strict=True)
-        }
+    power = {i: float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids}
+    both = [(power[i], errors.get(f"effects.{i}.power_w", 0.0)) for i in ids]
     return Given(
         where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, known(decoded.ahead)) + error, ids,
-        model, kwh,
+        model, power, _kwh(problem, split, rows, model, decoded, both, seed),
     )  # fmt: skip
+
+
+def _kwh(
+    problem: Problem, split: Split, rows: StateRows, model: Switching, decoded: Decoded,
+    fitted: list[tuple[float, float]], seed: int,
+) -> list[dict[str, list[float]]]:  # fmt: skip
+    """Energy of each load in each trip [kWh], with 5 % and 95 % over draws of its states and of its power: that of the
+    model or the one `fitted` with all else, as likely, either off by Student's t of the fitted one's error."""
+    drawn = energy_draws(model, rows, seed=seed, draws=DRAWS) / 1e3
+    drawn = drawn.mean(axis=0) + FEW * (drawn - drawn.mean(axis=0))
+    freedom = max(cluster_rows(problem.segments.take(problem.rows(split.train))).count - 1, 1)
+    off = stats.t.ppf((np.arange(DRAWS) + 0.5) / DRAWS, freedom)
+    out = []
+    for k, (power, error) in enumerate(fitted):
+        factor = np.concatenate([1.0 + error / power * off, (power + error * off) / model.power_w[k]])
+        each = np.maximum(drawn[:, None, k, :] * factor[None, :, None], 0.0)
+        low, high = np.quantile(each.reshape(-1, each.shape[-1]), (0.05, 0.95), axis=0)
+        trips = {}
+        for j, (t, s) in enumerate(trip_slices(rows.trip)):
+            mean = float(model.power_w[k] * np.sum(decoded.on[s, k] * rows.duration_s[s])) / 3.6e6
+            trips[problem.log.trip_names[t]] = [mean, min(float(low[j]), mean), max(float(high[j]), mean)]
+        out.append(trips)
+    return out
 
 
 def state_block(problem: Problem, split: Split, given: Given, effect_id: str) -> dict[str, Any]:
@@ -92,10 +125,11 @@ def state_block(problem: Problem, split: Split, given: Given, effect_id: str) ->
         "power_w": float(model.power_w[k]),
         "share_on": _shares(rows.take(train), on[train], share),
         "mean_share_on": share,
+        "depends_on": contrasts(model, rows.take(train), k),
         "dwell_on_s": memory / max(1.0 - share, 1e-3),
         "dwell_off_s": memory / max(share, 1e-3),
-        "kwh_by_trip": given.kwh[effect_id],
-        "share_of_test_energy": float(sum(given.kwh[effect_id][t][0] for t in split.names(split.test)) / total)
+        "kwh_by_trip": given.kwh[k],
+        "share_of_test_energy": float(sum(given.kwh[k][t][0] for t in split.names(split.test)) / total)
         if abs(total) > 0
         else None,
     }

@@ -11,9 +11,10 @@ from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.remainder.remainder import Remainder
 from hdev_jax.diagnosis.result.hidden import Given, errors_by_knowledge, state_block
 from hdev_jax.diagnosis.result.intervals import Open
+from hdev_jax.diagnosis.result.modes import mode_block
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Calibration, cluster_rows
-from hdev_jax.physics import Choice, Parameter, StepChange
+from hdev_jax.physics import Choice, ModeChange, Parameter, StepChange
 from hdev_jax.problem import Problem, Split, metrics
 
 __all__ = ["baseline_block", "parameters_of", "summarise"]
@@ -151,6 +152,7 @@ def summarise(
             **_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count, settings.most_in_class),
             "order": k + 1,
             **({"state": state_block(problem, split, given, f.id)} if given and f.id in given.ids else {}),
+            **({"modes": mode_block(problem, steps[-1])} if f.id == ModeChange.id else {}),
         }
         for k, f in enumerate(state.found)
     ]
@@ -193,6 +195,7 @@ def summarise(
             "behaves_like": left.behaves_like,
             "sd": left.sd,
             "memory_s": left.memory_s,
+            "course": left.course,
         },
         "not_decidable": _not_decidable(state.verdicts, left, settings),
         "verdict": verdict,

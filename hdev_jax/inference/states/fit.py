@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from hdev_jax.inference.states.chances import chances
 from hdev_jax.inference.states.decode import Decoded, decode
-from hdev_jax.inference.states.model import Switching, kept_errors, log_t
+from hdev_jax.inference.states.model import LEAST_MEMORY_S, MOST_MEMORY_S, Switching, kept_errors, log_t, scales
 from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.physics.states import KNOTS_C
 from hdev_jax.segments import trip_slices
@@ -19,7 +20,7 @@ SHRINK_S = 300.0  # of time at a temperature, worth as much as the mean over all
 WANDERS = 0.9999  # share that errors keep from row to row, at most: a random walk
 FEW_ROWS = 100.0  # of the errors of all rows, mixed with those at standstill and in motion
 MOST_ERROR = 0.2  # of a load's memory: errors that last longer are not told from its levels
-LEAST_MEMORY_S = 30.0  # contactors and compressors are not switched faster; what is faster counts as an error
+FEW_STEPS = 4.0  # rows that errors may last in any case: of long rows a load's memory has not many more
 SWEEPS = 4  # of reweighted least squares for the levels
 
 
@@ -42,29 +43,38 @@ def _updated(model: Switching, rows: StateRows, decoded: Decoded, coloured: bool
     before, same = np.r_[0.0, rows.residual_w[:-1]], decoded.same
     kept = kept_errors(model, rows, starts)
     y, z = rows.residual_w - kept * before, np.column_stack([np.ones(len(model.on)), model.on])
-    beta, scale = np.r_[model.base_w, model.power_w], model.scale_w[rows.standing][:, None]
+    beta, scale = np.r_[model.base_w, model.power_w], scales(model, rows, starts)[:, None]
     for _ in range(SWEEPS):
         off = y[:, None] - (1.0 - kept)[:, None] * (z @ beta)
         weight = same * (model.freedom + 1.0) / (model.freedom + (off / scale) ** 2) / scale**2
         gram = (z.T * ((1.0 - kept) ** 2 @ weight)) @ z
         gram += 1e-9 * np.trace(gram) * np.eye(len(gram))
         beta = np.linalg.solve(gram, z.T @ (((1.0 - kept) * y) @ weight))
+    new = replace(model, power_w=beta[1:], base_w=float(beta[0]))
+    if np.any(model.by):
+        new = chances(new, rows, decoded)
+    alike = ~np.any(model.by, axis=1)  # by moments, where there are no covariates: faster
     share = np.stack([shares_of(rows, decoded.on[:, k]) for k in range(len(model.power_w))])
-    new = replace(model, power_w=beta[1:], base_w=float(beta[0]), share=share)
-    new = replace(new, memory_s=_memories(new, rows, decoded.on))
+    new = replace(new, share=np.where(alike[:, None], share, new.share))
+    new = replace(new, memory_s=np.where(alike, _memories(new, rows, decoded.on), new.memory_s))
     error, last = (x[:, None] - z @ beta for x in (rows.residual_w, before))
     if coloured:
         weight[starts] = 0.0
-        share_kept = float(np.sum(weight * error * last) / (np.sum(weight * last**2) + 1e-12))
+        alike_w = last * (rows.wide / np.r_[1.0, rows.wide[:-1]])[:, None]
+        share_kept = float(np.sum(weight * error * alike_w) / (np.sum(weight * alike_w**2) + 1e-12))
         memory = _memory_of(share_kept, rows)
-        new = replace(new, error_s=min(memory, MOST_ERROR * float(np.min(new.memory_s))))
+        most = max(MOST_ERROR * float(np.min(new.memory_s)), FEW_STEPS * float(np.median(rows.forgets_s)))
+        new = replace(new, error_s=min(memory, most))
     innovation = error - kept_errors(new, rows, starts)[:, None] * last
-    return _with_errors(new, innovation, same, rows.standing)
+    inner = same.copy()
+    if len(starts) < len(inner):
+        inner[starts] = 0.0  # a first row's error is no innovation
+    return _with_errors(new, innovation / rows.wide[:, None], inner, rows.standing)
 
 
 def _memory_of(kept: float, rows: StateRows) -> float:
     """Memory [s] of errors that keep such a share from row to row; 0 where they keep none."""
-    return -float(np.median(rows.duration_s)) / np.log(min(kept, WANDERS)) if kept > 0.01 else 0.0
+    return -float(np.median(rows.forgets_s)) / np.log(min(kept, WANDERS)) if kept > 0.01 else 0.0
 
 
 def _with_errors(
@@ -103,15 +113,15 @@ def errors_alone(rows: StateRows) -> tuple[float, float]:
     middle = float(np.median(rows.residual_w))
     error = rows.residual_w - middle
     starts = np.array([s.start for _, s in trip_slices(rows.trip)])
-    inside = np.diff(rows.trip) == 0
-    kept = float(np.sum((error[1:] * error[:-1])[inside]) / (np.sum((error[:-1] ** 2)[inside]) + 1e-12))
+    inside, own = np.diff(rows.trip) == 0, error / rows.wide
+    kept = float(np.sum((own[1:] * own[:-1])[inside]) / (np.sum((own[:-1] ** 2)[inside]) + 1e-12))
     memory = _memory_of(kept, rows)
     model = Switching(
-        np.zeros(1), middle, np.full(2, float(np.std(error)) + 1e-9), np.full((1, len(KNOTS_C)), 0.5),
-        np.full(1, 7200.0), memory,
+        np.zeros(1), middle, np.full(2, float(np.std(own)) + 1e-9), np.full((1, len(KNOTS_C)), 0.5),
+        np.full(1, MOST_MEMORY_S), memory,
     )  # fmt: skip
     innovation = error - np.r_[0.0, error[:-1]] * kept_errors(model, rows, starts)
-    model = _with_errors(model, innovation[:, None], np.ones((len(error), 1)), rows.standing)
+    model = _with_errors(model, (innovation / rows.wide)[:, None], np.ones((len(error), 1)), rows.standing)
     return decode(model, rows).log_likelihood, memory
 
 
@@ -129,8 +139,8 @@ def shares_of(rows: StateRows, on: Float[np.ndarray, " row"]) -> Float[np.ndarra
 
 def _memories(model: Switching, rows: StateRows, on: np.ndarray) -> np.ndarray:
     """The memory that makes as many switches as there are: they come at a rate of 2·share·(1 − share)/memory."""
-    share = model.expected(rows.temp_c)
+    share = model.expected(rows)
     expected = np.sum(2.0 * share * (1.0 - share) * rows.duration_s[:, None], axis=0)
     inside = np.diff(rows.trip) == 0
     switches = np.sum(np.abs(np.diff(on, axis=0))[inside], axis=0)
-    return np.clip(expected / np.maximum(switches, 1.0), LEAST_MEMORY_S, 7200.0)
+    return np.clip(expected / np.maximum(switches, 1.0), LEAST_MEMORY_S, MOST_MEMORY_S)

@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hdev_jax.physics.loads import STANDSTILL_MPS
-from hdev_jax.physics.states import USUAL_C
+from hdev_jax.physics.states import COVARIATES, USUAL_C, covariates_of
 from hdev_jax.segments import Segments, starts_of_runs
 
 __all__ = ["StateRows", "rows_of"]
 
 SAMPLES, MEANS = 0.1, 0.9  # chance that a row in which a load switches holds a share of its power
+USUAL_S, MOST_RATIO = 10.0, 10.0  # 100 m at 36 km/h: an energy's errors are given as the power of a row as long
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,27 @@ class StateRows:
     temp_c: Float[np.ndarray, " row"]
     standing: Int[np.ndarray, " row"]  # 1 at standstill, else 0
     partly: float = MEANS
+    others: Float[np.ndarray, "row covariate"] | None = None  # `COVARIATES` in each row; None: of no interest
+    energy: bool = False  # whether energies are measured: an error of one is a small power in a long row
+
+    @property
+    def beside(self) -> Float[np.ndarray, "row covariate"]:
+        """`COVARIATES` in each row; 0 where they are not known."""
+        return np.zeros((len(self.trip), len(COVARIATES))) if self.others is None else self.others
+
+    @property
+    def wide(self) -> Float[np.ndarray, " row"]:
+        """How large the errors of each row are, as a power, over those of a row of `USUAL_S`; 1 where a power is
+        measured."""
+        if not self.energy:
+            return np.ones(len(self.trip))
+        return np.clip(USUAL_S / self.duration_s, 1.0 / MOST_RATIO, MOST_RATIO)
+
+    @property
+    def forgets_s(self) -> Float[np.ndarray, " row"]:
+        """The time in which a row's error forgets that before it: of a power, the row's; of energies, of any row
+        alike."""
+        return np.full(len(self.trip), USUAL_S) if self.energy else self.duration_s
 
     @property
     def has_temperature(self) -> bool:
@@ -36,7 +58,8 @@ class StateRows:
         """Rows by mask, index or slice."""
         columns = (self.residual_w, self.trip, self.duration_s, self.temp_c, self.standing)
         residual, trip, seconds, temp, standing = (x[rows] for x in columns)
-        return StateRows(residual, trip, seconds, temp, standing, self.partly)
+        others = None if self.others is None else self.others[rows]
+        return StateRows(residual, trip, seconds, temp, standing, self.partly, others, self.energy)
 
     def coarse(self, seconds: float) -> "StateRows":
         """Means over runs of rows of at least so many seconds in a trip; the rows themselves where they are long."""
@@ -58,4 +81,5 @@ def rows_of(segments: Segments, residual_w: Float[np.ndarray, " row"], *, sample
     return StateRows(
         np.asarray(residual_w, dtype=float), np.asarray(segments.trip)[:n], np.asarray(segments.duration_s)[:n],
         np.array(temp), standing, SAMPLES if samples else MEANS,
+        np.asarray(covariates_of(segments))[:n].astype(float), not samples,
     )  # fmt: skip

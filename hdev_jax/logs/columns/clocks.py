@@ -12,13 +12,14 @@ from hdev_jax.logs.columns.numbers import MISSING, numbers
 from hdev_jax.logs.columns.stamps import DAY_S, HOUR_S, seconds_of, stamps
 from hdev_jax.logs.readers.raw import Raw
 
-__all__ = ["Clock", "Note", "read_clock", "unix_scale"]
+__all__ = ["FIRST_DATE_S", "LAST_DATE_S", "Clock", "Note", "read_clock", "unix_scale"]
 
 Note = Callable[[str, int], None]
 
 # Seconds since 1970 that a vehicle's log can have: September 2001 to 2039; as ms, µs and ns no other clock comes near.
 _UNIX = ((1e9, 1.0, "s"), (1e12, 1e-3, "ms"), (1e15, 1e-6, "µs"), (1e18, 1e-9, "ns"))
 _UNIX_SPAN = 2.2
+FIRST_DATE_S, LAST_DATE_S = _UNIX[0][0], _UNIX_SPAN * _UNIX[0][0]
 _SLOWEST_S = 60.0  # of samples; a counter of ms that is read as s has steps of a hundred and more
 
 
@@ -44,7 +45,7 @@ def unix_scale(x: np.ndarray) -> tuple[float, str] | None:
 
 
 def read_clock(raw: Raw, headers: tuple[str, ...], trip: np.ndarray, how: Clock, note: Note) -> np.ndarray:
-    """Times `[row]` in seconds: numbers as they are, dates and times of day counted from the first.
+    """Times `[row]` in seconds: numbers as they are, dates since 1970, times of day since midnight.
 
     **Arguments:** `headers`, of one column, or of a date and a time; `trip`, codes by row, in which time runs forward;
     `note(reason, count)` gets what was assumed. **Raises:** `InputError` naming row and column.
@@ -53,7 +54,7 @@ def read_clock(raw: Raw, headers: tuple[str, ...], trip: np.ndarray, how: Clock,
     where = " ".join(f"'{h}'" for h in headers)
     if getattr(series.dtype, "kind", "O") == "M" or isinstance(series.dtype, pd.DatetimeTZDtype):
         stamp, naive = pd.to_datetime(series), getattr(series.dt, "tz", None) is None
-        x = _since_first(stamp if not naive else stamp.dt.tz_localize("UTC"))
+        x = seconds_of(stamp if not naive else stamp.dt.tz_localize("UTC"))
     elif len(headers) == 1 and how.format is None and _numeric(series):
         x, naive = numbers(raw, headers[0], True, note), False
         assert x is not None
@@ -92,10 +93,6 @@ def _numeric(series: Any) -> bool:
             and ":" not in str(sample.iloc[0])
             and str(sample.iloc[0]).count(".") < 2
         )
-
-
-def _since_first(stamp: Any) -> np.ndarray:
-    return np.asarray((stamp - stamp.min()).dt.total_seconds().to_numpy(), dtype=np.float64)
 
 
 def _local(x: np.ndarray, trip: np.ndarray, how: Clock, note: Note) -> np.ndarray:
