@@ -1,0 +1,165 @@
+"""SUMO's electric vehicles in traffic (package `eclipse-sumo`, extra `truth`).
+
+`netgenerate` makes a grid with traffic lights on hills, `sumo` drives other traffic and the observed vehicle through
+it, `emissionsDrivingCycle` gives its electric power second by second by SUMO's energy model. The way of a second is its
+end speed (SUMO's Euler steps). A headwind, which SUMO does not know, is driven as the slope of the same force; what is
+not recovered below a speed is taken off the braking seconds' electric power.
+"""
+
+import os
+import subprocess
+import tempfile
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from experiments.simulators.drives import Drive
+from experiments.simulators.vehicles import Simulated, Vehicle, headwind_force_n, slope_with_force
+
+__all__ = ["VEHICLES", "drives", "simulate"]
+
+VEHICLES = {
+    "car": lambda: Vehicle("car", "sumo", 1830.0, 0.010, 0.69, 40.0, 250.0, 0.32, 0.88, 0.85, top_mps=33.0),
+    "van": lambda: Vehicle("van", "sumo", 3200.0, 0.010, 1.8, 80.0, 400.0, 0.34, 0.88, 0.85, top_mps=30.0),
+    "truck": lambda: Vehicle("truck", "sumo", 22000.0, 0.0065, 5.2, 600.0, 1500.0, 0.5, 0.88, 0.85, top_mps=24.0),
+    "bus": lambda: Vehicle("bus", "sumo", 17500.0, 0.0075, 5.0, 400.0, 3000.0, 0.48, 0.88, 0.85, top_mps=24.0),
+}
+# SUMO's class, and how the driver accelerates and brakes [m/s²]
+_CLASSES = {
+    "car": ("passenger", 1.8, 2.0), "van": ("delivery", 1.5, 1.8), "truck": ("truck", 0.5, 1.2), "bus": ("bus", 0.7, 1.3),
+}  # fmt: skip
+_SIGMA = 0.3  # how far the driver is from perfect
+_DENSITY = 1.2041  # kg/m³, of SUMO's energy model
+_GRID, _STREET_M, _LIMIT_MPS = 5, 900.0, 25.0
+_HILL_M = 10.0  # standard deviation of the height of a junction
+_OTHERS = 160  # vehicles beside the observed one's trips
+_APART_S = 60  # between departures of the observed trips
+
+
+def _run(tool: str, *arguments: str, folder: Path) -> None:
+    """One of SUMO's programs. Raises `RuntimeError` with what it said."""
+    import sumo
+
+    home = Path(sumo.SUMO_HOME)
+    environment = {**os.environ, "SUMO_HOME": str(home)}
+    done = subprocess.run(
+        [str(home / "bin" / tool), *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(f"{tool} {' '.join(arguments)}: {done.stderr.strip()[-400:]}")
+
+
+def drives(vehicle: Vehicle, rng: np.random.Generator, trips: int, seconds: float) -> list[Drive]:
+    """The observed vehicle's trips through the net, from standstill on; slope as SUMO gives it at each second."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        seed = int(rng.integers(1, 2**31 - 1))
+        _run(
+            "netgenerate", "--grid", f"--grid.number={_GRID}", f"--grid.length={_STREET_M}", "--seed", str(seed),
+            f"--default.speed={_LIMIT_MPS}", f"--perturb-z=norm(0,{_HILL_M})", "--perturb-x=norm(0,150)",
+            "--perturb-y=norm(0,150)", "--default-junction-type=traffic_light", "--default.lanenumber=2",
+            "-o", "net.xml", folder=folder,
+        )  # fmt: skip
+        _write_routes(folder, vehicle, rng, trips, seconds)
+        _run(
+            "sumo", "-n", "net.xml", "-r", "routes.xml", "--seed", str(seed), "--no-step-log", "--no-warnings",
+            "--time-to-teleport", "300", "--fcd-output", "fcd.xml", "--fcd-output.attributes", "speed,slope", "--precision", "6",
+            "--device.fcd.explicit", ",".join(f"own{k}" for k in range(trips)), "--device.fcd.probability", "0",
+            "--end", "7200", folder=folder,
+        )  # fmt: skip
+        own: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        for _, e in ET.iterparse(folder / "fcd.xml"):
+            if e.tag == "timestep":
+                for v in e:
+                    own[v.get("id", "")].append((float(v.get("speed", 0)), float(v.get("slope", 0))))
+                e.clear()
+    out = []
+    for k in range(trips):
+        speed, slope = np.array(own[f"own{k}"]).T
+        rest = np.zeros(int(rng.integers(3, 15)))
+        out.append(
+            Drive(np.r_[rest, speed, rest], np.tan(np.radians(np.r_[0 * rest + slope[0], slope, 0 * rest + slope[-1]])))
+        )
+    return out
+
+
+def _write_routes(folder: Path, vehicle: Vehicle, rng: np.random.Generator, trips: int, seconds: float) -> None:
+    """Trips over random streets: the observed vehicle's one after another, and other traffic all the time."""
+    edges = [e.get("id", "") for e in ET.parse(folder / "net.xml").getroot().iter("edge") if e.get("function") is None]
+    lasts = trips * _APART_S + seconds
+    ways = max(2, round(seconds / 75.0))  # streets to go by: one takes about this long
+
+    def some(n: int) -> list[str]:
+        return [str(e) for e in rng.choice(edges, n, replace=False)]
+
+    every = [(float(t), f"other{k}", "passenger", some(4)) for k, t in enumerate(np.sort(rng.uniform(0, lasts, _OTHERS)))]
+    every += [(60.0 + _APART_S * k, f"own{k}", "own", some(max(3, ways // 2))) for k in range(trips)]
+    own, accel, decel = _CLASSES[vehicle.name]
+    lines = [
+        "<routes>", '<vType id="passenger" vClass="passenger"/>',
+        f'<vType id="own" vClass="{own}" maxSpeed="{vehicle.top_mps}" accel="{accel}" decel="{decel}" sigma="{_SIGMA}"/>',
+    ]  # fmt: skip
+    for depart, id_, kind, (first, *via, last) in sorted(every):
+        lines.append(
+            f'<trip id="{id_}" type="{kind}" depart="{depart:.0f}" departSpeed="0" arrivalSpeed="0" '
+            f'from="{first}" to="{last}" via="{" ".join(via)}"/>'
+        )
+    (folder / "routes.xml").write_text("\n".join([*lines, "</routes>"]), encoding="utf-8")
+
+
+def simulate(vehicle: Vehicle, drives: list[Drive]) -> list[Simulated]:
+    """Each trip's power by SUMO's energy model."""
+    v1 = [d.speed_mps[1:] for d in drives]
+    v0 = [d.speed_mps[:-1] for d in drives]
+    grade = [np.arctan(d.grade[1:]) for d in drives]
+    driven = [
+        slope_with_force(g, headwind_force_n(vehicle, v, _DENSITY), vehicle.mass_kg)
+        for g, v in zip(grade, v1, strict=True)
+    ]
+    everything = (np.concatenate(x) for x in (v0, v1, driven))
+    start, end, slope = everything
+    ideal = replace(vehicle, driving=1.0, regenerating=1.0, auxiliary_w=0.0)
+    electric, wheel = (_power_w(v, start, end, slope) for v in (vehicle, ideal))
+    lost = (wheel < 0) & (0.5 * (start + end) < vehicle.cutoff_mps)
+    electric = np.where(lost, vehicle.auxiliary_w, electric)
+    cuts = np.cumsum([len(x) for x in v1])[:-1]
+    return [
+        Simulated(*rows[:3], *rows[3:], density_kgpm3=_DENSITY)  # fmt: skip
+        for rows in zip(
+            v0, v1, v1, grade, np.split(wheel, cuts), [np.full(len(x), np.nan) for x in v1], np.split(electric, cuts),
+            strict=True,
+        )
+    ]  # fmt: skip
+
+
+def _power_w(vehicle: Vehicle, start: np.ndarray, end: np.ndarray, slope_rad: np.ndarray) -> np.ndarray:
+    """Electric power of each second [W]; friction brakes are a lower efficiency of recuperation."""
+    values = {
+        "airDragCoefficient": vehicle.cda_m2, "frontSurfaceArea": 1.0, "rollDragCoefficient": vehicle.c_rr,
+        "radialDragCoefficient": 0.0, "constantPowerIntake": vehicle.auxiliary_w,
+        "propulsionEfficiency": vehicle.driving, "recuperationEfficiency": vehicle.regenerating * vehicle.recovered,
+        "rotatingMass": vehicle.rotating_kg,
+    }  # fmt: skip
+    keys = "".join(f'<param key="{k}" value="{v!r}"/>' for k, v in values.items())
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "type.xml").write_text(
+            f'<additional><vType id="own" mass="{vehicle.mass_kg!r}" emissionClass="Energy/unknown">'
+            f'<param key="has.battery.device" value="true"/>{keys}</vType></additional>',
+            encoding="utf-8",
+        )
+        rows = zip(end, end - start, np.degrees(slope_rad), strict=True)
+        text = "".join(f"{t};{v:.9f};{a:.9f};{s:.9f}\n" for t, (v, a, s) in enumerate(rows))
+        (folder / "drive.csv").write_text(text, encoding="utf-8")
+        _run(
+            "emissionsDrivingCycle", "-t", "drive.csv", "-e", "Energy/unknown", "--additional-files", "type.xml",
+            "--vtype", "own", "--have-slope", "--precision", "9", "-o", "power.csv", folder=folder,
+        )  # fmt: skip
+        lines = (folder / "power.csv").read_text(encoding="utf-8").splitlines()
+    found = np.array([float(line.rsplit(";", 1)[1]) for line in lines if line.count(";") >= 10])
+    if len(found) != len(end):
+        raise RuntimeError(f"emissionsDrivingCycle gave {len(found)} of {len(end)} seconds")
+    return found * 3600.0  # Wh of one second
