@@ -26,7 +26,8 @@ SEGMENT_M = 100.0
 class SimulatedLog:
     """A log by the contract and what only the simulator knows of each of its rows.
 
-    `noise` and `free`, what the battery gave without it, are in the target's unit: kW, of segments Wh.
+    `noise` and `free`, what the battery gave without it, are in the target's unit: kW, of segments Wh; `recovered` is
+    the share of the braking power, where it is measured, that came into the battery.
     """
 
     frame: pd.DataFrame
@@ -34,6 +35,7 @@ class SimulatedLog:
     free: np.ndarray
     noise: np.ndarray
     density_kgpm3: float
+    recovered: float
 
 
 def simulated_log(
@@ -64,7 +66,16 @@ def simulated_log(
         table["motor_torque_nm"] = shaft / ratio
         table["motor_speed_radps"] = table.pop("mean_mps") * ratio
     table = table.drop(columns=["mean_mps", missing], errors="ignore")
-    return SimulatedLog(table, sheet(vehicle, measured), free, ar, trips[0].density_kgpm3)
+    recovered = _recovered(trips, vehicle.auxiliary_w, measured)
+    return SimulatedLog(table, sheet(vehicle, measured), free, ar, trips[0].density_kgpm3, recovered)
+
+
+def _recovered(trips: Sequence[Simulated], auxiliary_w: float, measured: Measured) -> float:
+    """Battery's power without auxiliaries over the wheels' (the shaft's where that is measured), in braking."""
+    battery = np.concatenate([t.battery_w for t in trips]) - auxiliary_w
+    power = np.concatenate([t.shaft_w if measured == "torque" else t.wheel_w for t in trips])
+    braking = power < 0
+    return float(np.sum(battery[braking]) / np.sum(power[braking]))
 
 
 def _autoregressive(rng: np.random.Generator, rows: int, coefficient: float) -> np.ndarray:
@@ -120,7 +131,8 @@ def _segments(trip: Simulated, noise_w: np.ndarray) -> pd.DataFrame:
         "speed_start_mps": trip.speed_start_mps[first], "speed_end_mps": trip.speed_end_mps[last],
         "grade_rad": np.arcsin(np.divide(rise, metres, out=np.zeros_like(rise), where=metres > STANDS_MPS)),
         "mean_mps": metres / seconds,
-        "wheel_n": _per_metre(total(trip.wheel_w), 1.0, metres), "shaft_n": _per_metre(total(trip.shaft_w), 1.0, metres),
+        "wheel_n": _per_metre(total(trip.wheel_w), 1.0, metres),
+        "shaft_n": _per_metre(total(trip.shaft_w), 1.0, metres),
         "free": total(trip.battery_w) / 3600.0, "noise": total(noise_w) / 3600.0,
     })  # fmt: skip
 

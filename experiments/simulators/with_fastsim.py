@@ -123,7 +123,7 @@ def _trip(vehicle: Vehicle, drive: Drive) -> Simulated:
         h = simulation.to_dataframe()
     column = {k: h[k].to_numpy(dtype=float)[1:] for k in h.columns}
     if np.max(np.abs(column["veh.history.speed_ach_meters_per_second"] - v1[1:])) > 1e-6:
-        raise ValueError(f"{vehicle.name}: FASTSim's machine of {vehicle.power_w / 1e3:.0f} kW cannot follow the speeds")
+        raise ValueError(f"{vehicle.name}: its machine of {vehicle.power_w / 1e3:.0f} kW cannot follow the speeds")
     v0, v1, mean, grade_rad = v0[1:], v1[1:], mean[1:], grade_rad[1:]
     drivetrain = "veh.pt_type.BEV"
     electric = column[f"{drivetrain}.em.history.pwr_elec_prop_in_watts"]

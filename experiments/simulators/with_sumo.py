@@ -1,9 +1,10 @@
 """SUMO's electric vehicles in traffic (package `eclipse-sumo`, extra `truth`).
 
 `netgenerate` makes a grid with traffic lights on hills, `sumo` drives other traffic and the observed vehicle through
-it, `emissionsDrivingCycle` gives its electric power second by second by SUMO's energy model. The way of a second is its
-end speed (SUMO's Euler steps). A headwind, which SUMO does not know, is driven as the slope of the same force; what is
-not recovered below a speed is taken off the braking seconds' electric power.
+it, `emissionsDrivingCycle` gives its electric power by SUMO's energy model, in ten steps a second between which speed
+is linear: the model takes a step's end speed for all of it, which over a whole second no vehicle does. A headwind is
+driven as the slope of the same force, for SUMO knows none; what is not recovered below a speed is taken off the braking
+steps' electric power.
 """
 
 import os
@@ -29,13 +30,15 @@ VEHICLES = {
 }
 # SUMO's class, and how the driver accelerates and brakes [m/s²]
 _CLASSES = {
-    "car": ("passenger", 1.8, 2.0), "van": ("delivery", 1.5, 1.8), "truck": ("truck", 0.5, 1.2), "bus": ("bus", 0.7, 1.3),
+    "car": ("passenger", 1.8, 2.0), "van": ("delivery", 1.5, 1.8), "truck": ("truck", 0.5, 0.8),
+    "bus": ("bus", 0.7, 1.0),
 }  # fmt: skip
 _SIGMA = 0.3  # how far the driver is from perfect
 _DENSITY = 1.2041  # kg/m³, of SUMO's energy model
 _GRID, _STREET_M, _LIMIT_MPS = 5, 900.0, 25.0
 _HILL_M = 10.0  # standard deviation of the height of a junction
 _OTHERS = 160  # vehicles beside the observed one's trips
+_STEPS = 10  # of the energy model in a second
 _APART_S = 60  # between departures of the observed trips
 
 
@@ -66,7 +69,9 @@ def drives(vehicle: Vehicle, rng: np.random.Generator, trips: int, seconds: floa
         _write_routes(folder, vehicle, rng, trips, seconds)
         _run(
             "sumo", "-n", "net.xml", "-r", "routes.xml", "--seed", str(seed), "--no-step-log", "--no-warnings",
-            "--time-to-teleport", "300", "--fcd-output", "fcd.xml", "--fcd-output.attributes", "speed,slope", "--precision", "6",
+            "--time-to-teleport", "300", "--step-method.ballistic",
+            "--fcd-output", "fcd.xml", "--fcd-output.attributes", "speed,slope",
+            "--precision", "6",
             "--device.fcd.explicit", ",".join(f"own{k}" for k in range(trips)), "--device.fcd.probability", "0",
             "--end", "7200", folder=folder,
         )  # fmt: skip
@@ -95,12 +100,15 @@ def _write_routes(folder: Path, vehicle: Vehicle, rng: np.random.Generator, trip
     def some(n: int) -> list[str]:
         return [str(e) for e in rng.choice(edges, n, replace=False)]
 
-    every = [(float(t), f"other{k}", "passenger", some(4)) for k, t in enumerate(np.sort(rng.uniform(0, lasts, _OTHERS)))]
+    every = [
+        (float(t), f"other{k}", "passenger", some(4)) for k, t in enumerate(np.sort(rng.uniform(0, lasts, _OTHERS)))
+    ]
     every += [(60.0 + _APART_S * k, f"own{k}", "own", some(max(3, ways // 2))) for k in range(trips)]
     own, accel, decel = _CLASSES[vehicle.name]
     lines = [
         "<routes>", '<vType id="passenger" vClass="passenger"/>',
-        f'<vType id="own" vClass="{own}" maxSpeed="{vehicle.top_mps}" accel="{accel}" decel="{decel}" sigma="{_SIGMA}"/>',
+        f'<vType id="own" vClass="{own}" maxSpeed="{vehicle.top_mps}" accel="{accel}" decel="{decel}" '
+        f'sigma="{_SIGMA}"/>',
     ]  # fmt: skip
     for depart, id_, kind, (first, *via, last) in sorted(every):
         lines.append(
@@ -112,36 +120,44 @@ def _write_routes(folder: Path, vehicle: Vehicle, rng: np.random.Generator, trip
 
 def simulate(vehicle: Vehicle, drives: list[Drive]) -> list[Simulated]:
     """Each trip's power by SUMO's energy model."""
-    v1 = [d.speed_mps[1:] for d in drives]
-    v0 = [d.speed_mps[:-1] for d in drives]
-    grade = [np.arctan(d.grade[1:]) for d in drives]
-    driven = [
-        slope_with_force(g, headwind_force_n(vehicle, v, _DENSITY), vehicle.mass_kg)
-        for g, v in zip(grade, v1, strict=True)
-    ]
-    everything = (np.concatenate(x) for x in (v0, v1, driven))
-    start, end, slope = everything
-    ideal = replace(vehicle, driving=1.0, regenerating=1.0, auxiliary_w=0.0)
-    electric, wheel = (_power_w(v, start, end, slope) for v in (vehicle, ideal))
-    lost = (wheel < 0) & (0.5 * (start + end) < vehicle.cutoff_mps)
+    v0, v1, grade = ([f(d) for d in drives] for f in (_starts, _ends, _slopes))
+    start, end, slope = (np.concatenate(x) for x in (v0, v1, grade))
+    part = (np.arange(_STEPS) + 1) / _STEPS
+    fine_end = (start[:, None] + part * (end - start)[:, None]).ravel()
+    fine_start = fine_end - np.repeat((end - start) / _STEPS, _STEPS)
+    slope = slope_with_force(np.repeat(slope, _STEPS), headwind_force_n(vehicle, fine_end, _DENSITY), vehicle.mass_kg)
+    ideal = replace(vehicle, driving=1.0, regenerating=1.0, recovered=1.0, auxiliary_w=0.0)
+    electric, wheel = (_power_w(v, fine_start, fine_end, slope) for v in (vehicle, ideal))
+    lost = (wheel < 0) & (fine_end < vehicle.cutoff_mps)
     electric = np.where(lost, vehicle.auxiliary_w, electric)
     cuts = np.cumsum([len(x) for x in v1])[:-1]
+    seconds = (np.split(x.reshape(-1, _STEPS).mean(axis=1), cuts) for x in (wheel, electric))
     return [
-        Simulated(*rows[:3], *rows[3:], density_kgpm3=_DENSITY)  # fmt: skip
-        for rows in zip(
-            v0, v1, v1, grade, np.split(wheel, cuts), [np.full(len(x), np.nan) for x in v1], np.split(electric, cuts),
-            strict=True,
-        )
-    ]  # fmt: skip
+        Simulated(a, b, 0.5 * (a + b), g, w, np.full(len(a), np.nan), e, _DENSITY)
+        for a, b, g, w, e in zip(v0, v1, grade, *seconds, strict=True)
+    ]
+
+
+def _starts(drive: Drive) -> np.ndarray:
+    return drive.speed_mps[:-1]
+
+
+def _ends(drive: Drive) -> np.ndarray:
+    return drive.speed_mps[1:]
+
+
+def _slopes(drive: Drive) -> np.ndarray:
+    return np.arctan(drive.grade[1:])
 
 
 def _power_w(vehicle: Vehicle, start: np.ndarray, end: np.ndarray, slope_rad: np.ndarray) -> np.ndarray:
-    """Electric power of each second [W]; friction brakes are a lower efficiency of recuperation."""
+    """Electric power of each step [W]. The program's steps are of a second: what changes kinetic energy over a step of
+    1/n s is n times as much in power, so its mass is, by the rotating one."""
     values = {
         "airDragCoefficient": vehicle.cda_m2, "frontSurfaceArea": 1.0, "rollDragCoefficient": vehicle.c_rr,
         "radialDragCoefficient": 0.0, "constantPowerIntake": vehicle.auxiliary_w,
         "propulsionEfficiency": vehicle.driving, "recuperationEfficiency": vehicle.regenerating * vehicle.recovered,
-        "rotatingMass": vehicle.rotating_kg,
+        "rotatingMass": _STEPS * vehicle.rotating_kg + (_STEPS - 1) * vehicle.mass_kg,
     }  # fmt: skip
     keys = "".join(f'<param key="{k}" value="{v!r}"/>' for k, v in values.items())
     with tempfile.TemporaryDirectory() as name:
