@@ -40,15 +40,14 @@ class SimulatedLog:
 
 def simulated_log(
     vehicle: Vehicle, trips: Sequence[Simulated], rng: np.random.Generator, *, rows: Rows, measured: Measured,
-    noise: float, ar_coefficient: float, missing: str = "",
+    noise: float, ar_coefficient: float,
 ) -> SimulatedLog:  # fmt: skip
     """The log of a vehicle that the sheet declares as `vehicle`, whatever drove the trips.
 
     **Arguments:** `rows`: the simulator's seconds as intervals with two end speeds; as samples, which are the mean of
     the second that ends there, as data loggers write them; or gathered to segments of about 100 m, standstill apart.
     `measured`: traction force, or torque and speed of the machine's shaft, besides the battery's power. `noise`: its
-    RMS over that of the power, second by second, each second `ar_coefficient` of the one before. `missing`: a column
-    that is left out.
+    RMS over that of the power, second by second, each second `ar_coefficient` of the one before.
     """
     rms = np.sqrt(np.mean(np.concatenate([t.battery_w for t in trips]) ** 2))
     frames = []
@@ -65,7 +64,7 @@ def simulated_log(
     elif measured == "torque":
         table["motor_torque_nm"] = shaft / ratio
         table["motor_speed_radps"] = table.pop("mean_mps") * ratio
-    table = table.drop(columns=["mean_mps", missing], errors="ignore")
+    table = table.drop(columns="mean_mps", errors="ignore")
     recovered = _recovered(trips, vehicle.auxiliary_w, measured)
     return SimulatedLog(table, sheet(vehicle, measured), free, ar, trips[0].density_kgpm3, recovered)
 
@@ -138,7 +137,8 @@ def _segments(trip: Simulated, noise_w: np.ndarray) -> pd.DataFrame:
 
 
 def sheet(vehicle: Vehicle, measured: Measured) -> str:
-    """The vehicle sheet as the simulator's parameters say, with one efficiency for everything."""
+    """The vehicle sheet as the simulator's parameters say, with one efficiency for everything; nothing of what effects
+    stand for: regeneration that is not recovered, wind."""
     head = f'name = "{vehicle.name} ({vehicle.simulator}, synthetic)"\nmass_kg = {vehicle.mass_kg!r}\n'
     tail = f"[battery]\nauxiliary_w = {vehicle.auxiliary_w!r}\n"
     if measured != "none":

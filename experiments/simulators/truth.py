@@ -18,16 +18,16 @@ SIMULATORS: Mapping[str, Any] = {"fastsim": with_fastsim, "sumo": with_sumo}
 def make(task: Mapping[str, Any]) -> tuple[SimulatedLog, Vehicle, Vehicle]:
     """The log, the vehicle as it is declared, and as it was.
 
-    A seed draws vehicle and trips, whatever is changed. Raises `ValueError` where the vehicle cannot drive them.
+    A seed draws vehicle and trips, whatever is changed; a channel to be missing is still there. Raises `ValueError`
+    where the vehicle cannot drive them.
     """
     simulator = SIMULATORS[task["simulator"]]
     own, roads, noises = (np.random.default_rng(s) for s in np.random.SeedSequence(task["seed"]).spawn(3))
     declared = drawn(own, simulator.VEHICLES[task["vehicle"]]())
-    plant = PLANTS[task["plant"]]
-    true = declared.planted(task["plant"], plant.size)
+    true = declared.planted(task["plant"], PLANTS[task["plant"]].size)
     trips = simulator.simulate(true, simulator.drives(declared, roads, task["trips"], task["seconds"]))
     log = simulated_log(
         declared, trips, noises, rows=task["rows"], measured=task["measured"], noise=task["noise"],
-        ar_coefficient=task["ar_coefficient"], missing=plant.missing,
+        ar_coefficient=task["ar_coefficient"],
     )  # fmt: skip
     return log, declared, true
