@@ -3,7 +3,7 @@
 One task is one log: a vehicle of a simulator, one of its parameters changed and the sheet as before, driven, written
 and read as a customer's log, diagnosed, and given to the rivals. Its result keeps what was said; `scores` scores it.
 
-Its error is compared with that of a refit that knows the cause (`refit`), and with the noise.
+Its error is compared with that of a refit that knows the cause (`refit`).
 """
 
 import tempfile
@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from experiments.planted.rivals import run_rivals
@@ -26,7 +25,7 @@ from experiments.simulators.vehicles import Vehicle
 from hdev_jax.diagnosis.diagnose import Outcome, diagnose
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.sheet import read_sheet
-from hdev_jax.logs import read_log
+from hdev_jax.logs import by_distance, read_log
 from hdev_jax.physics import LIBRARY
 from hdev_jax.problem import Problem, Split, prepare, split_trips
 from hdev_jax.units import AIR_DENSITY_KGPM3
@@ -62,9 +61,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     """One log through the whole loop."""
     made, _, true = make(task)
     missing = PLANTS[task["plant"]].missing
-    problem, split = _read(made.frame.drop(columns=missing or []), made.sheet)
-    if len(problem.measured) != len(made.free):
-        raise ValueError(f"{len(made.free)} rows were written and {len(problem.measured)} read")
+    problem, split = _read(task["rows"], made.frame.drop(columns=missing or []), made.sheet)
     started = time.perf_counter()
     outcome = diagnose(problem, split, LIBRARY, settings=Settings(fdr=task["fdr"]), seed=0)
     seconds = time.perf_counter() - started
@@ -83,21 +80,21 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         "two_efficiencies": task["measured"] != "none",
         **_truths(task, made, true, outcome),
         "test_rmse": {k: summary[k]["test"]["rmse"] for k in ("before", "after")},
-        "refit_rmse": refit_rmse(*_read(made.frame, known_sheet(task, true))),
-        "noise_rmse": float(np.sqrt(np.mean(made.noise[problem.rows(split.test)] ** 2))),
-        "rows": len(made.frame),
+        "refit_rmse": refit_rmse(*_read(task["rows"], made.frame, known_sheet(task, true))),
+        "rows": len(problem.measured),
         "seconds": seconds,
         "rivals": run_rivals(task["rivals"], problem, split),
     }  # fmt: skip
 
 
-def _read(frame: pd.DataFrame, sheet: str) -> tuple[Problem, Split]:
-    """The log and the sheet as files, read as a customer's would be."""
+def _read(rows: str, frame: pd.DataFrame, sheet: str) -> tuple[Problem, Split]:
+    """The log and the sheet as files, read as a customer's would be; segments of 100 m put together."""
     with tempfile.TemporaryDirectory() as folder:
         log, vehicle = Path(folder) / "log.parquet", Path(folder) / "vehicle.toml"
         frame.to_parquet(log)
         vehicle.write_text(sheet, encoding="utf-8")
-        split = split_trips(read_log([log]))
+        read = read_log([log])
+        split = split_trips(by_distance(read) if rows == "segments" else read)
         return prepare(split.log, read_sheet(vehicle)), split
 
 

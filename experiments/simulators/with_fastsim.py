@@ -8,6 +8,7 @@ from its powers.
 
 import warnings
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,14 @@ _TRUCK_WHEELS, _TRUCK_INERTIA = 10, 12.0  # kg·m² each: twin tyres of 22.5 inc
 _DENSITY = 1.1728  # kg/m³: of its drag, whatever its record of the density says
 
 
-def _bundled(file: str) -> Any:
-    import fastsim
+def _fastsim() -> Any:
+    return import_module("fastsim")  # by name: it is in an extra of its own
 
+
+def _bundled(file: str) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return fastsim.Vehicle.from_resource(file).to_dict()
+        return _fastsim().Vehicle.from_resource(file).to_dict()
 
 
 def _vehicle(name: str, file: str) -> Vehicle:
@@ -63,9 +66,7 @@ VEHICLES = {
 
 @cache
 def _cycle(file: str) -> np.ndarray:
-    import fastsim
-
-    return np.asarray(fastsim.Cycle.from_resource(file).to_dict()["speed_meters_per_second"])
+    return np.asarray(_fastsim().Cycle.from_resource(file).to_dict()["speed_meters_per_second"])
 
 
 def drives(vehicle: Vehicle, rng: np.random.Generator, trips: int, seconds: float) -> list[Drive]:
@@ -86,8 +87,6 @@ def simulate(vehicle: Vehicle, drives: list[Drive]) -> list[Simulated]:
 
 
 def _own(vehicle: Vehicle) -> Any:
-    import fastsim
-
     data, base = _bundled(_ZOE), _bundled(vehicle.base)
     data["mass_kilograms"] = vehicle.mass_kg
     data["pwr_aux_base_watts"] = vehicle.auxiliary_w
@@ -102,12 +101,11 @@ def _own(vehicle: Vehicle) -> Any:
     drivetrain["res"]["pwr_out_max_watts"] = 10 * vehicle.power_w
     drivetrain["res"]["energy_capacity_joules"] *= max(1.0, vehicle.mass_kg / 1600.0)
     drivetrain["res"]["state"]["soc"] = 0.6
-    return fastsim.Vehicle.from_dict(data)
+    return _fastsim().Vehicle.from_dict(data)
 
 
 def _trip(vehicle: Vehicle, drive: Drive) -> Simulated:
-    import fastsim
-
+    fastsim = _fastsim()
     v0, v1 = np.r_[0.0, drive.speed_mps[:-1]], drive.speed_mps
     mean = 0.5 * (v0 + v1)
     grade_rad = np.arctan(drive.grade)

@@ -13,6 +13,7 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections import defaultdict
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +45,7 @@ _APART_S = 60  # between departures of the observed trips
 
 def _run(tool: str, *arguments: str, folder: Path) -> None:
     """One of SUMO's programs. Raises `RuntimeError` with what it said."""
-    import sumo
-
-    home = Path(sumo.SUMO_HOME)
+    home = Path(import_module("sumo").SUMO_HOME)  # by name: it is in an extra of its own
     environment = {**os.environ, "SUMO_HOME": str(home)}
     done = subprocess.run(
         [str(home / "bin" / tool), *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
