@@ -6,8 +6,9 @@ from typing import Any
 
 from experiments.simulators.plants import FORMS, INSTRUMENTS, PAYLOAD, PLANTS
 
-__all__ = ["MOST", "PLAUSIBLE", "blamed", "false", "implausible", "named", "right", "sized", "told"]
+__all__ = ["MOST", "PLAUSIBLE", "blamed", "covered", "false", "implausible", "named", "right", "sized", "told"]
 
+NINETY = 1.645  # standard deviations of a normal distribution to each side that hold 90 %
 MOST = 3  # names of a class that still is an answer
 Result = Mapping[str, Any]
 Entry = Mapping[str, Any]  # `id`, `class` (as printed), `class_size`, `parameters`
@@ -47,10 +48,20 @@ def named(task: Mapping[str, Any], result: Result) -> bool:
 
 def told(task: Mapping[str, Any], result: Result) -> bool:
     """Whether a declared coefficient that may take the change says so: its 90 % interval is beyond the sheet's value
-    on the right side."""
+    on the right side, and where the truth is a number, it is nearer to that than to the sheet's."""
     plant = PLANTS[task["plant"]]
-    found = [result["coefficients"][k] for k in plant.coefficients if k in result["coefficients"]]
-    return any(plant.sign * (c["value"] - c["prior_value"]) > 1.645 * c["sd"] for c in found)
+    for k in plant.coefficients:
+        if (c := result["coefficients"].get(k)) and plant.sign * (c["value"] - c["prior_value"]) > NINETY * c["sd"]:
+            truth = result["truth"].get(k, c["value"])
+            if abs(c["value"] - truth) < abs(c["value"] - c["prior_value"]):
+                return True
+    return False
+
+
+def covered(result: Result) -> list[bool]:
+    """Of each coefficient whose truth is a number: does its 90 % interval hold it?"""
+    pairs = [(c, result["truth"][k]) for k, c in result["coefficients"].items() if k in result["truth"]]
+    return [abs(c["value"] - truth) <= NINETY * c["sd"] for c, truth in pairs]
 
 
 def false(task: Mapping[str, Any], named: Sequence[Entry]) -> list[str]:
@@ -97,7 +108,7 @@ def sized(task: Mapping[str, Any], result: Result) -> dict[str, float] | None:
             low, high = p["interval_90"]
             return {"true": truth, "found": p["value"], "low": low, "high": high}
     if plant.share and (c := result["coefficients"].get(plant.coefficients[0])):
-        half = 1.645 * c["sd"]
+        half = NINETY * c["sd"]
         truth = result["truth"][plant.coefficients[0]]
         return {"true": truth, "found": c["value"], "low": c["value"] - half, "high": c["value"] + half}
     return None

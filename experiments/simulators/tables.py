@@ -27,7 +27,8 @@ NOTES = (
     "payload. Impossible: a size or a coefficient that no vehicle has",
     "Error over refit: test RMSE over that of a refit that knows the cause: the kernel with the simulator's true "
     "parameters, the change and the form of the efficiency, calibrated on the same training trips; median. Covered: "
-    "90 % intervals that hold the true size. Segments of 100 m lose what happens within them, for the refit too",
+    "90 % intervals that hold the true size; coefficients covered: those of rolling resistance and drag area that hold "
+    "the truth, whatever was changed. Segments of 100 m lose what happens within them, for the refit too",
     "A headwind is driven as the slope of the same force, regeneration that is not recovered is taken off the "
     "electric power, for neither simulator knows a wind and FASTSim no share of friction braking",
     "Rivals get the declared model's residual and every effect's column; a name is right where it is the change, false "
@@ -46,6 +47,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     write_tables(run, "table", _shown(rows), head)
     by_line = [
         change_row(config, f"{key}, {'nothing' if plant == 'nothing' else 'one change'}", g)
+        | {"coefficients_covered": _mean([ok for _, r in g for ok in scores.covered(r)])}
         for key, of_line in _by(results, lambda t: t["line"])
         for plant, g in _by(of_line, lambda t: "nothing" if t["plant"] == "nothing" else "changed")
     ]

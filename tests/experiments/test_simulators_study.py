@@ -73,6 +73,7 @@ LOSS, REGEN = entry("inverter_loss", per_nm_w=(0.1, 0.1)), entry("regen_efficien
         (task("payload"), result(MASS, entry("crosswind")), True, ["crosswind"], []),
         (task("rolling"), result(coefficients={"road.c_rr": coefficient(0.012, 0.001, 0.01)}), True, [], []),
         (task("rolling"), result(coefficients={"road.c_rr": coefficient(0.011, 0.001, 0.01)}), False, [], []),
+        (task("rolling"), result(coefficients={"road.c_rr": coefficient(0.0105, 0.0001, 0.01)}), False, [], []),
         (task("rolling"), result(coefficients={"road.c_rr": coefficient(0.008, 0.001, 0.01)}), False, [], []),
         (task("slope"), result(unexplained=True), True, [], []),
         (task("slope"), result(missing=["grade_rad"]), True, [], []),
@@ -96,6 +97,11 @@ def test_sizes_are_compared_with_what_was_changed():
     assert scores.sized(task("rolling"), moved)["true"] == 0.012  # pyright: ignore
     assert scores.sized(task("payload"), result(GAIN)) is None
     assert scores.sized(task("nothing"), result(LOSS)) is None
+
+
+def test_coefficients_hold_the_truth_or_not():
+    tight, wide = (result(coefficients={"road.c_rr": coefficient(0.01, sd, 0.01)}) for sd in (0.0005, 0.0015))
+    assert (scores.covered(tight), scores.covered(wide), scores.covered(result())) == ([False], [True], [])
 
 
 def test_a_size_that_no_vehicle_has_is_counted():
