@@ -26,9 +26,10 @@ NOTES = (
     "direction and SUMO by direction, while the sheet declares one number. Blamed: of these, an instrument or the "
     "payload. Impossible: a size or a coefficient that no vehicle has",
     "Error over refit: test RMSE over that of a refit that knows the cause: the kernel with the simulator's true "
-    "parameters, the change and the form of the efficiency, calibrated on the same training trips; median. Covered: "
-    "90 % intervals that hold the true size; coefficients covered: those of rolling resistance and drag area that hold "
-    "the truth, whatever was changed. Segments of 100 m lose what happens within them, for the refit too",
+    "parameters, the change and the form of the efficiency, calibrated on the same training trips; median, logs "
+    "without the slope left out, for the refit has it. Covered: 90 % intervals that hold the true size; coefficients "
+    "covered: those of rolling resistance and drag area that hold the truth, whatever was changed. Segments of 100 m "
+    "lose what happens within them, for the refit too",
     "A headwind is driven as the slope of the same force, regeneration that is not recovered is taken off the "
     "electric power, for neither simulator knows a wind and FASTSim no share of friction braking",
     "Rivals get the declared model's residual and every effect's column; a name is right where it is the change, false "
@@ -92,7 +93,8 @@ def change_row(config: Config, name: str, group: Group) -> dict[str, Any]:
     blamed = float(np.mean([bool(scores.blamed(t, r["named"])) for t, r in group]))
     sizes = [s for t, r in group if (s := scores.sized(t, r))]
     covered = float(np.mean([s["low"] <= s["true"] <= s["high"] for s in sizes])) if sizes else None
-    error = float(np.median([r["test_rmse"]["after"] / r["refit_rmse"] for _, r in group]))
+    ratios = [r["test_rmse"]["after"] / r["refit_rmse"] for t, r in group if not PLANTS[t["plant"]].missing]
+    error = float(np.median(ratios)) if ratios else None
     impossible = float(np.mean([bool(scores.implausible(r)) for _, r in group]))
     nothing = all(t["plant"] == "nothing" for t, _ in group)
     checks = (
@@ -100,7 +102,7 @@ def change_row(config: Config, name: str, group: Group) -> dict[str, Any]:
         ("false", false, *_at_most(false, config.wanted_false if nothing else config.wanted_beside)),
         ("blamed", blamed, *_at_most(blamed, 0.0 if nothing else 1.0)),
         ("covered", covered, config.wanted_covered, covered is None or covered >= config.wanted_covered),
-        ("error over refit", error, *_at_most(error, config.wanted_error)),
+        ("error over refit", error, config.wanted_error, error is None or error <= config.wanted_error),
         ("impossible", impossible, *_at_most(impossible, 0.0)),
     )
     return {
