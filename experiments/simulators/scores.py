@@ -37,7 +37,7 @@ def _ids(entry: Entry) -> set[str]:
 
 def _forms(task: Mapping[str, Any]) -> frozenset[str]:
     """What is not false in any log of this simulator: the form of its efficiency, and of its rows."""
-    late = frozenset({"time_skew", "sampling_filter"}) if task["rows"] == "samples" else frozenset()
+    late = frozenset({"grade_lag", "sampling_filter", "time_skew"}) if task["rows"] == "samples" else frozenset()
     return FORMS[task["simulator"]] | late
 
 

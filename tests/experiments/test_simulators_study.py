@@ -65,7 +65,7 @@ LOSS, REGEN = entry("inverter_loss", per_nm_w=(0.1, 0.1)), entry("regen_efficien
         (task("nothing", "sumo"), result(LOSS), False, ["inverter_loss"], []),
         (task("nothing", "sumo"), result(REGEN), True, [], []),
         (task("nothing"), result(MASS), False, ["mass_scale"], ["mass_scale"]),
-        (task("nothing", rows="samples"), result(REGEN, entry("time_skew")), True, [], []),
+        (task("nothing", rows="samples"), result(REGEN, entry("time_skew"), entry("grade_lag")), True, [], []),
         (task("payload"), result(MASS, LOSS), True, [], []),
         (task("payload"), result(entry("power_gain", "mass_scale")), True, [], []),
         (task("payload"), result(entry("power_gain", "mass_scale", size=5)), False, ["power_gain"], ["power_gain"]),
