@@ -1,7 +1,8 @@
 """What a model that knows the cause makes of a log: its error on the same test trips, from the same training trips.
 
 The kernel with the simulator's true parameters, the changed one too, and the form of its efficiency; what the sheet
-declares with an sd is fitted, and so are the sizes of what was put in. Where a channel was left out, it has it.
+declares with an sd is fitted, and so are the sizes of what was put in. Where a channel was left out, it has it; where
+samples are of the past second, it reads them as that.
 """
 
 from collections.abc import Mapping
@@ -28,8 +29,6 @@ def known_sheet(task: Mapping[str, Any], true: Vehicle) -> str:
     text = sheet(true, task["measured"]) + _BY_DIRECTION
     if task["simulator"] == "fastsim":
         text += _BY_LOAD
-    if task["rows"] == "samples":  # a sample is the mean of the second before, and stands for the one around it
-        text += "[effects.time_skew]\nskew_s = { value = 0.5, sd = 0.5 }\n"
     if true.cutoff_mps:
         text += f"[effects.regen_cutoff]\nspeed_mps = {true.cutoff_mps!r}\n"
     if true.headwind_mps:

@@ -60,6 +60,7 @@ def together(task: Mapping[str, Any]) -> str:
 def run(task: dict[str, Any]) -> dict[str, Any]:
     """One log through the whole loop."""
     made, _, true = make(task)
+    known = make({**task, "rows": "intervals"})[0].frame if task["rows"] == "samples" else made.frame
     missing = PLANTS[task["plant"]].missing
     problem, split = _read(task["rows"], made.frame.drop(columns=missing or []), made.sheet)
     started = time.perf_counter()
@@ -80,7 +81,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         "two_efficiencies": task["measured"] != "none",
         **_truths(task, made, true, outcome),
         "test_rmse": {k: summary[k]["test"]["rmse"] for k in ("before", "after")},
-        "refit_rmse": refit_rmse(*_read(task["rows"], made.frame, known_sheet(task, true))),
+        "refit_rmse": refit_rmse(*_read(task["rows"], known, known_sheet(task, true))),
         "rows": len(problem.measured),
         "seconds": seconds,
         "rivals": run_rivals(task["rivals"], problem, split),
