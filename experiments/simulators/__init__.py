@@ -1,3 +1,3 @@
 """Truth from simulators that were not written here: FASTSim and SUMO drive, the diagnosis names what was changed."""
 
-__all__: list[str] = []
+__all__ = []
