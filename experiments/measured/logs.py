@@ -1,10 +1,11 @@
 """The diagnosis on measured logs: `python -m experiments.measured.logs [PART …] --work DIR`, from a checkout.
 
 Parts: niro (trained on each trip in turn), road (the Niro's force balance), ztbus (three folds of missions), withheld
-(a known channel of ZTBus taken out of the log). Each run is one `hdev diagnose`; a run that is there already is read,
-not repeated, one that was cut off goes on where it was, and one of other code, sheet or adapter is made again. With
---write the page docs/real_logs.md and its figures are made from all runs that are kept in DIR; with --kept nothing is
-run. HDEV_DATA names the data (default ../shared/data).
+(a known channel of ZTBus taken out of the log), load (road load with the force as target, and without any force).
+Each run is one `hdev diagnose`; a run that is there already is read, not repeated, one that was cut off goes on where
+it was, and one of other code, sheet or adapter is made again. With --write the page docs/real_logs.md and its figures
+are made from all runs that are kept in DIR; with --kept nothing is run. HDEV_DATA names the data (default
+../shared/data).
 """
 
 import argparse
@@ -15,7 +16,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 
 import hdev_jax
 from experiments.measured import page as pages
+from experiments.measured.road_load import PAIRS
 from experiments.measured.withheld import WITHHELD, compare_logs, write_adapter
 from experiments.runner.store import sources_of
 from hdev_jax.verbs.opening import digest
@@ -31,7 +33,7 @@ from hdev_jax.verbs.predict import strongly_correlated
 __all__ = ["Job", "jobs", "kept", "main"]
 
 DATA = Path(os.environ.get("HDEV_DATA", "../shared/data"))
-PARTS = ("niro", "road", "ztbus", "withheld")
+PARTS = ("niro", "road", "ztbus", "withheld", "load")
 TRIPS = ("1", "2", "3", "4")
 FOLDS = (1, 2, 3)
 # Which channel is withheld in which fold. The warmth of the passengers is small: the fold decides whether it is found.
@@ -92,7 +94,9 @@ def main(argv: list[str] | None = None) -> int:
     todo = [j for part in PARTS for j in everything[part] if part in asked and kept(j, options.work) is None]
     if not options.kept:
         for what, (_, columns) in WITHHELD.items():
-            write_adapter(ZTBUS, columns, _adapter(what, options.work))
+            write_adapter(ZTBUS, columns, _adapter(f"ztbus_no_{what}", options.work))
+        for pair in PAIRS:
+            write_adapter(pair.adapter, pair.columns, _adapter(pair.power, options.work), drop_others=True)
         for k, job in enumerate(todo, 1):
             _run(job, options.work, f"{k} of {len(todo)}")
         if "withheld" in asked:
@@ -118,6 +122,7 @@ def jobs(work: Path, missions: int | None = None) -> dict[str, list[Job]]:
     names = [p.name[:24] for p in files]
     sheet = "configs/vehicles/ztbus.toml"
     folds = {k: Job(f"ztbus_{k}", tuple(files), sheet, ZTBUS, test=tuple(names[k - 1 :: 3])) for k in FOLDS}
+    power = {p.power: p.sheet for p in PAIRS}
     return {
         "niro": [Job(f"niro_{t}", niro, "configs/vehicles/kia_niro.toml", adapter, train=(t,)) for t in TRIPS],
         "road": [
@@ -125,14 +130,19 @@ def jobs(work: Path, missions: int | None = None) -> dict[str, list[Job]]:
         ],
         "ztbus": list(folds.values()),
         "withheld": [
-            Job(f"ztbus_{k}_no_{what}", tuple(files), sheet, _adapter(what, work), test=folds[k].test)
+            replace(folds[k], name=f"ztbus_{k}_no_{what}", adapter=_adapter(f"ztbus_no_{what}", work))
             for what, k in HELD
+        ],
+        "load": [
+            Job("niro_power", niro, power["niro_power"], _adapter("niro_power", work), ("1",)),
+            Job("ztbus_road", tuple(files), power["ztbus_power"], ZTBUS, test=folds[1].test, target="traction_force_n"),
+            Job("ztbus_power", tuple(files), power["ztbus_power"], _adapter("ztbus_power", work), test=folds[1].test),
         ],
     }
 
 
-def _adapter(what: str, work: Path) -> Path:
-    return work / "adapters" / f"ztbus_no_{what}.toml"
+def _adapter(name: str, work: Path) -> Path:
+    return work / "adapters" / f"{name}.toml"
 
 
 def kept(job: Job, work: Path) -> dict[str, Any] | None:
@@ -155,7 +165,17 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     if covariance is None:
         raise SystemExit(f"{out} lacks predictive.json: remove the folder, and the run is made again")
     together = strongly_correlated(covariance["names"], np.array(covariance["matrix"]))
-    return {**result, "cost": cost, "ran": ran, "together": together}
+    return {**result, "cost": cost, "ran": ran, "together": together, "coefficients": _coefficients(out)}
+
+
+def _coefficients(out: Path) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation of each declared coefficient at the end, effects added."""
+    sheet = tomllib.loads((out / "augmented_vehicle.toml").read_text(encoding="utf-8"))
+    sections = {k: v for k, v in sheet.items() if isinstance(v, dict) and k != "effects"}
+    return {
+        f"{section}.{key}": (v["value"], v["sd"])
+        for section, keys in sections.items() for key, v in keys.items() if isinstance(v, dict) and "sd" in v
+    }  # fmt: skip
 
 
 def _begun(job: Job, work: Path) -> bool:
@@ -192,7 +212,7 @@ def _same_rest(withheld: list[Job], work: Path) -> None:
     made_of = sorted({j.made_of for j in withheld})
     if _json(path).get("made_of") != made_of:
         print(f"{time.strftime('%H:%M:%S')}  comparing the logs with and without …", file=sys.stderr, flush=True)
-        rest = {what: compare_logs(withheld[0].logs, ZTBUS, _adapter(what, work)) for what in WITHHELD}
+        rest = {what: compare_logs(withheld[0].logs, ZTBUS, _adapter(f"ztbus_no_{what}", work)) for what in WITHHELD}
         path.write_text(json.dumps({"made_of": made_of, "rest": rest}, indent=1), encoding="utf-8")
 
 

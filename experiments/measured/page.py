@@ -3,6 +3,7 @@
 Only the numbers of the paper that ours stand beside, with their source, are written here.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from experiments.measured import figures
 from experiments.measured.compared import changes, fold_and_what, new_names, withheld
+from experiments.measured.road_load import road_load
 from experiments.measured.switching import loads_section
 from experiments.measured.tables import (
     Runs,
@@ -62,8 +64,8 @@ def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]
     **Arguments:** `results`, diagnosis.json by the name of the run; `warm`, mean outside temperature [°C] by mission;
     `rest`, by withheld channel, what the two logs have in common.
     """
-    niro = {k.removeprefix("niro_"): r for k, r in results.items() if k.startswith("niro_") and k != "niro_road"}
-    folds = {k.removeprefix("ztbus_"): r for k, r in results.items() if k.startswith("ztbus_") and "_no_" not in k}
+    niro = {k.removeprefix("niro_"): r for k, r in results.items() if re.fullmatch(r"niro_\d", k)}
+    folds = {k.removeprefix("ztbus_"): r for k, r in results.items() if re.fullmatch(r"ztbus_\d", k)}
     held = {k: r for k, r in results.items() if "_no_" in k and k.partition("_no_")[0] in results}
     lines, drawn = [HEAD], {}
     if short := _short(niro, folds, held):
@@ -73,6 +75,7 @@ def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]
         _road(results["niro_road"]) if "niro_road" in results else None,
         _ztbus(folds, warm) if folds else None,
         withheld(folds, held, rest, f"{FOLDER}/ztbus_withheld.png") if held else None,
+        (load, {}) if (load := road_load(results)) else None,
     ):
         if section:
             lines += ["", *section[0]]

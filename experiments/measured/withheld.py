@@ -41,9 +41,13 @@ def without_columns(adapter: Mapping[str, Any], names: Iterable[str]) -> dict[st
     return {**adapter, "columns": {k: r for k, r in adapter["columns"].items() if raw(k) not in gone}}
 
 
-def write_adapter(base: Path, names: Sequence[str], out: Path) -> Path:
-    """The base adapter without these columns, as a file. Written only where it differs, so that a run can resume."""
-    table = without_columns(tomllib.loads(base.read_text(encoding="utf-8")), names)
+def write_adapter(base: Path, names: Sequence[str], out: Path, *, drop_others: bool = False) -> Path:
+    """The base adapter without these columns, as a file. Written only where it differs, so that a run can resume.
+
+    `drop_others`: columns that no rule names go too, where the base adapter keeps them.
+    """
+    adapter = tomllib.loads(base.read_text(encoding="utf-8"))
+    table = without_columns({**adapter, "others": "drop"} if drop_others else adapter, names)
     text = f"# {base.name} without {', '.join(names)} and what is made from the same source.\n" + tomli_w.dumps(table)
     if not out.exists() or out.read_text(encoding="utf-8") != text:
         out.parent.mkdir(parents=True, exist_ok=True)

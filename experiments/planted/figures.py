@@ -14,7 +14,7 @@ from hdev_jax.physics import LIBRARY
 from hdev_jax.report.canvas import figure, tidy
 from hdev_jax.rundir import Run
 
-__all__ = ["confusion_figure", "false_figure", "power_figure"]
+__all__ = ["confusion_figure", "false_figure", "power_figure", "share_figure"]
 
 COLOURS = {
     "ours": "#1b4f8a",
@@ -130,14 +130,23 @@ def confusion_figure(run: Run, done: Group) -> None:
         for r in logs:
             for name in {right[p] if right[p] in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
-    fig = figure(max(0.32 * len(columns) + 2.5, 4.9), 0.3 * len(planted) + 1.8)  # the title's at least
+    share_figure(
+        run, "confusion", rows, columns, share, ylabel="planted (logs)", title="Synthetic logs: what was named [%]"
+    )
+
+
+def share_figure(
+    run: Run, name: str, rows: Sequence[str], columns: Sequence[str], share: np.ndarray, *, ylabel: str, title: str
+) -> None:
+    """What was named (columns), in per cent of the logs of each row: a table in shades."""
+    fig = figure(max(0.32 * len(columns) + 2.5, 4.9), 0.3 * len(rows) + 1.8)  # the title's at least
     axes = fig.add_subplot()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(planted)), rows, fontsize=7)
+    axes.set_yticks(range(len(rows)), rows, fontsize=7)
     for i, k in zip(*np.nonzero(share >= 0.5), strict=True):
         axes.text(k, i, f"{share[i, k]:.0f}", ha="center", va="center", fontsize=6,
                   color="white" if share[i, k] > 55 else "#222")  # fmt: skip
-    axes.set(xlabel="named", ylabel="planted (logs)", title="Synthetic logs: what was named [%]")
+    axes.set(xlabel="named", ylabel=ylabel, title=title)
     fig.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
-    save_figure(run, fig, "confusion")
+    save_figure(run, fig, name)

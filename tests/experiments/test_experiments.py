@@ -179,7 +179,7 @@ RUN = (
     "paper1/table1", "paper1/fig5", "paper1/table2", "studies/pinn_buses", "studies/pinn_data",
     "studies/pinn_weights", "paper2/table2", "paper2/fig12", "paper2/selection", "paper2/table8", "paper2/pedal",
     "paper2/online", "studies/coverage", "studies/linearity", "studies/maps", "studies/mass", "studies/ranks",
-    "studies/switching",
+    "studies/switching", "studies/simulators",
 )  # fmt: skip
 
 
@@ -191,6 +191,8 @@ def test_each_experiment_has_a_config_that_tests_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("path", parameters(CONFIGS / f"{name}.toml" for name in RUN))
 def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept):
+    if path.stem == "simulators":
+        pytest.importorskip("fastsim", reason="fastsim is in the extra truth")
     try:
         runs = run_config(path, out=tmp_path / "out", kept=kept, tiny=True)
     except MissingDataError as e:

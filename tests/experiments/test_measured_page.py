@@ -217,6 +217,23 @@ def test_what_two_runs_do_not_have_in_common_is_said(results):
     assert "The same: sheet, split, seed.\n" in page.page(results, warm={}, rest={})[0]
 
 
+def test_road_load_without_the_force_stands_beside_that_with_it(results):
+    results["niro_road"]["coefficients"] = {"road.c_rr": (0.010, 0.0003), "road.cda_m2": (0.70, 0.01)}
+    results["niro_power"] = {
+        **result([COPPER], 3.0),
+        "coefficients": {
+            "road.c_rr": (0.0104, 0.0004),
+            "road.cda_m2": (0.75, 0.01),
+            "driveline.efficiency": (0.9, 0.01),
+        },
+    }
+    text, _ = page.page(results, warm={}, rest={})
+    assert "## Road load without the force" in text
+    assert "| Kia Niro, trip 1 | `road.c_rr` | 0.01 ± 0.0003 | 0.0104 ± 0.0004 | +0.8 | yes |" in text
+    assert "| Kia Niro, trip 1 | `road.cda_m2` | 0.7 ± 0.01 | 0.75 ± 0.01 | +3.5 | no |" in text
+    assert "2 of 2" in text  # of the Niro's training trips: the run without torque is none of them
+
+
 def test_runs_that_find_nothing_in_common(results):
     results["niro_2"]["effects"] = []
     text, _ = page.page(results, warm={}, rest={})
@@ -297,9 +314,13 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
         (work / name / "config.toml").write_text(tomli_w.dumps(config))
         covariance = {"names": ["iron", "offset"], "matrix": [[1.0, -0.99], [-0.99, 1.0]]}
         (work / f"{name}.begun").write_text(next(j for j in jobs if j.name == name).made_of)
+        (work / name / "augmented_vehicle.toml").write_text(
+            'name = "car"\n[machine]\nmotoring_efficiency = { value = 0.92, sd = 0.01 }\n'
+        )
         (work / name / "predictive.json").write_text(json.dumps({"covariance": covariance}))
     assert logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
     text = (docs / "real_logs.md").read_text()
+    assert logs.kept(jobs[0], work)["coefficients"] == {"machine.motoring_efficiency": (0.92, 0.01)}  # pyright: ignore
     assert "trained on trip" in text
     assert "- 2: iron and offset are strongly correlated (-0.99)" in text
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err

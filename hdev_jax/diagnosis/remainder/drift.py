@@ -1,5 +1,7 @@
 """What drifts: a remainder with a memory, what it behaves like, how large it is and how long it lasts.
 
+A slope that the log lacks is a force too, of a faster kind: of hills.
+
 A load under a controller has no levels and no channel. Means over a minute have little of the rows' own noise. Where
 they are correlated from one minute to the next, their size says what they are: the same at standstill and at any speed
 (a load), in proportion to speed (a force) or to power (a gain). Its course and its energy in each trip are those of a
@@ -18,9 +20,9 @@ from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.states import course
 from hdev_jax.segments import starts_of_runs, trip_slices
 
-__all__ = ["LIKE", "Drift", "Slow", "drift_of"]
+__all__ = ["HILL_S", "LIKE", "MINUTE_S", "Drift", "Slow", "drift_of"]
 
-MINUTE_S = 60.0
+MINUTE_S, HILL_S = 60.0, 10.0
 LEAST_BLOCKS = 30
 LIKE = ("load", "force", "gain", "none")
 LONGEST = 60  # minutes between two means, at most
@@ -28,33 +30,36 @@ LONGEST = 60  # minutes between two means, at most
 
 @dataclass(frozen=True)
 class Slow:
-    """Means over minutes of what a prediction leaves [W], with what it may be in proportion to: 1, the speed [m/s], the
-    predicted power [W]; `seconds` and `trip` of each, and when it begins [s from the trip's first row]."""
+    """Means over minutes, or over `mean_s`, of what a prediction leaves [W], with what it may be in proportion to: 1,
+    the speed [m/s], the predicted power [W]; `seconds` and `trip` of each, and when it begins [s from the trip's first
+    row]."""
 
     left_w: Float[np.ndarray, " minute"]
     forms: dict[str, Float[np.ndarray, " minute"]]
     seconds: Float[np.ndarray, " minute"]
     trip: Int[np.ndarray, " minute"]
     begins_s: Float[np.ndarray, " minute"]
+    mean_s: float = MINUTE_S
 
     @classmethod
     def of(
         cls, residual_w: Float[np.ndarray, " row"], predicted_w: Float[np.ndarray, " row"],
         speed_mps: Float[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"], trip: Int[np.ndarray, " row"],
+        mean_s: float = MINUTE_S,
     ) -> "Slow":  # fmt: skip
         """From rows of whole trips."""
-        at = starts_of_runs(trip, duration_s, MINUTE_S)
+        at = starts_of_runs(trip, duration_s, mean_s)
         seconds = np.add.reduceat(duration_s, at)
         left, speed, power = (
             np.add.reduceat(x * duration_s, at) / seconds for x in (residual_w, np.abs(speed_mps), np.abs(predicted_w))
         )
         begins = np.concatenate([np.cumsum(seconds[s]) - seconds[s] for _, s in trip_slices(trip[at])])
-        return cls(left, {"load": np.ones(len(at)), "force": speed, "gain": power}, seconds, trip[at], begins)
+        return cls(left, {"load": np.ones(len(at)), "force": speed, "gain": power}, seconds, trip[at], begins, mean_s)
 
     def take(self, kept: np.ndarray) -> "Slow":
         """Some of the minutes."""
         forms = {k: x[kept] for k, x in self.forms.items()}
-        return Slow(self.left_w[kept], forms, self.seconds[kept], self.trip[kept], self.begins_s[kept])
+        return Slow(self.left_w[kept], forms, self.seconds[kept], self.trip[kept], self.begins_s[kept], self.mean_s)
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,7 @@ class Drift:
             return None
         g, sd = (slow.forms["load"], self.power_w) if self.like == "none" else (slow.forms[self.like], self.sd)
         found = course(
-            slow.left_w, g, self.own_w * np.sqrt(MINUTE_S / slow.seconds), g * slow.seconds / 3.6e6, slow.seconds,
+            slow.left_w, g, self.own_w * np.sqrt(slow.mean_s / slow.seconds), g * slow.seconds / 3.6e6, slow.seconds,
             slow.trip, sd=sd, memory_s=self.memory_s,
         )  # fmt: skip
         trips = [t for t, _ in trip_slices(slow.trip)]
@@ -109,11 +114,11 @@ class Drift:
 def drift_of(slow: Slow, settings: Settings) -> Drift:
     """What is slow in what a prediction leaves. `like` is "none" with a memory of 0 where nothing is."""
     nothing = Drift("none", float("nan"), 0.0)
-    whole = slow.seconds > 0.5 * MINUTE_S
+    whole = slow.seconds > 0.5 * slow.mean_s
     if np.count_nonzero(whole) < LEAST_BLOCKS:
         return nothing
     left = slow.left_w - np.mean(slow.left_w)
-    memory = _memory(left, slow.trip, settings) if np.any(left) else 0.0
+    memory = slow.mean_s * _memory(left, slow.trip, settings) if np.any(left) else 0.0
     if memory <= 0:
         return nothing
     # the rows' own noise in a mean: what neighbouring means do not share
@@ -126,8 +131,8 @@ def drift_of(slow: Slow, settings: Settings) -> Drift:
     return Drift(like, sd, memory, float(np.sqrt(own)), found["load"][1])
 
 
-def _memory(slow: np.ndarray, trip: np.ndarray, settings: Settings) -> float:
-    """Time after which the correlation of minutes has fallen to 1/e [s]; 0 where neighbours are not correlated."""
+def _memory(slow: np.ndarray, trip: np.ndarray, settings: Settings) -> int:
+    """Means after which the correlation of means has fallen to 1/e; 0 where neighbours are not correlated."""
 
     def correlation(lag: int) -> tuple[float, int]:
         pair = trip[lag:] == trip[:-lag]
@@ -135,14 +140,14 @@ def _memory(slow: np.ndarray, trip: np.ndarray, settings: Settings) -> float:
 
     first, n = correlation(1)
     if n < LEAST_BLOCKS or first < settings.drifts or stats.norm.sf(first * np.sqrt(n)) > settings.level:
-        return 0.0
+        return 0
     for lag in range(2, LONGEST + 1):
         if lag >= len(slow):
             break
         value, pairs = correlation(lag)
         if pairs < LEAST_BLOCKS or value < np.exp(-1):
-            return lag * MINUTE_S
-    return LONGEST * MINUTE_S
+            return lag
+    return LONGEST
 
 
 def _fit(slow: np.ndarray, x: np.ndarray, own: float) -> tuple[float, float]:

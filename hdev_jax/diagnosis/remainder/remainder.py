@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
-from hdev_jax.diagnosis.remainder.drift import Drift, Slow, drift_of
+from hdev_jax.diagnosis.remainder.drift import HILL_S, MINUTE_S, Drift, Slow, drift_of
 from hdev_jax.diagnosis.remainder.learner import curve, learn, share_of
 from hdev_jax.diagnosis.remainder.rows import features, side
 from hdev_jax.diagnosis.remainder.structure import (
@@ -24,6 +24,7 @@ from hdev_jax.diagnosis.remainder.structure import (
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.problem import Problem, Split
 from hdev_jax.targets import TARGETS, as_watts
+from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = ["Formula", "Remainder", "remainder"]
 
@@ -51,6 +52,7 @@ class Remainder:
     sd: float | None = None  # of that: W, N, share of the power
     memory_s: float | None = None
     course: Mapping[str, Any] | None = None  # of what is slow: kWh by trip, and its power in one of the test trips
+    missing_channels: tuple[str, ...] = ()  # what the model needs and the log lacks, where the rest behaves like it
     confirmed: bool = False  # whether cross-validation over training clusters confirms the learner's share
 
 
@@ -142,7 +144,10 @@ def remainder(
     grows = scales_with(train, settings) if parts else None
     if grows is not None:
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
-    drift, course = _drift(problem, split, given, settings)
+    drift, course, slope = _drift(problem, split, given, settings)
+    if slope:
+        parts.insert(0, f"a force that comes and goes like hills, as a slope of {100 * slope:.1f} % (standard deviation) "
+                        "would make: the log has no slope, which is the first thing to add")  # fmt: skip
     if drift.words:
         parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
@@ -155,21 +160,31 @@ def remainder(
         scales_with=grows,
         correction=curve(correction, test, list(names), order[0], problem.unit) if learned and order else None,
         behaves_like=drift.like, sd=drift.sd if np.isfinite(drift.sd) else None, memory_s=drift.memory_s or None,
-        course=course,
+        course=course, missing_channels=("grade_rad",) if slope else (),
         expression=formula.words if formula is not None else None, confirmed=learned,
     )  # fmt: skip
 
 
 def _drift(
     problem: Problem, split: Split, given: np.ndarray, settings: Settings
-) -> tuple[Drift, dict[str, Any] | None]:
-    """What is slow in the training rows' residual of a battery's target, and its course in all trips; nothing of
-    another target."""
+) -> tuple[Drift, dict[str, Any] | None, float]:
+    """What is slow in the training rows' residual of a battery's target, its course in all trips, and the standard
+    deviation of the slope that it behaves like where the log has none (else 0); nothing of another target."""
     if not TARGETS[problem.target].of_battery:
-        return Drift("none", float("nan"), 0.0), None
+        return Drift("none", float("nan"), 0.0), None, 0.0
     s = problem.segments
-    seconds, trip = np.asarray(s.duration_s), np.asarray(s.trip)
+    seconds, trip, speed = np.asarray(s.duration_s), np.asarray(s.trip), np.asarray(s.speed_mps)
     residual, predicted = (as_watts(problem.target, x, seconds) for x in (problem.measured - given, given))
-    slow = Slow.of(residual, predicted, np.asarray(s.speed_mps), seconds, trip)
-    drift = drift_of(slow.take(np.isin(slow.trip, split.train)), settings)
-    return drift, drift.course(slow, problem.log.trip_names, split.test)
+
+    def over(mean_s: float) -> tuple[Slow, Drift]:
+        slow = Slow.of(residual, predicted, speed, seconds, trip, mean_s)
+        return slow, drift_of(slow.take(np.isin(slow.trip, split.train)), settings)
+
+    slow, drift = over(MINUTE_S)
+    if problem.vehicle.entry == "road" and not s.has("grade_rad"):
+        force = drift if drift.like == "force" else over(HILL_S)[1]
+        weight = GRAVITY_MPS2 * float(np.mean(np.asarray(s.get("mass_kg", problem.vehicle.mass_kg))))
+        slope = force.sd / weight if force.like == "force" else 0.0
+    else:
+        slope = 0.0
+    return drift, drift.course(slow, problem.log.trip_names, split.test), slope

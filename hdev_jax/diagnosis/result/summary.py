@@ -197,6 +197,7 @@ def summarise(
             "memory_s": left.memory_s,
             "course": left.course,
         },
+        "missing_channels": list(left.missing_channels),
         "not_decidable": _not_decidable(state.verdicts, left, settings),
         "verdict": verdict,
         "parameters_fitted": _fitted(state),

@@ -1,0 +1,208 @@
+"""Tables and the figure of the study with simulators: what was changed, what was named, and what rivals say."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.planted.figures import share_figure
+from experiments.runner.figures import styled
+from experiments.runner.tables import wilson, write_tables
+from experiments.simulators import scores as scores
+from experiments.simulators.config import Config
+from experiments.simulators.plants import PLANTS
+from hdev_jax.rundir import Run
+
+__all__ = ["Group", "change_row", "collect", "confusion", "rival_rows"]
+
+Group = Sequence[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their results
+ARTEFACT = "studies/simulators"
+NOTES = (
+    "Right: nothing changed, no false name, and the form of the efficiency is named (regenerating efficiency, losses "
+    "by load) or something is called unexplained; one change, an entry or a class of at most three holds it, or a "
+    "declared coefficient that takes it has a 90 % interval beyond the sheet's value, on the right side; no slope in "
+    "the log, no false name, and something is called unexplained or the slope is said to be missing",
+    "False name: an entry that is neither the change nor the form of the efficiency, which FASTSim has by load and "
+    "direction and SUMO by direction, while the sheet declares one number. Blamed: of these, an instrument or the "
+    "payload. Impossible: a size or a coefficient that no vehicle has",
+    "Error over refit: test RMSE over that of a refit that knows the cause: the kernel with the simulator's true "
+    "parameters, the change and the form of the efficiency, calibrated on the same training trips; median, logs "
+    "without the slope left out, for the refit has it. Covered: 90 % intervals that hold the true size; coefficients "
+    "covered: those of rolling resistance and drag area that hold the truth, whatever was changed. Segments of 100 m "
+    "lose what happens within them, for the refit too",
+    "A headwind is driven as the slope of the same force, regeneration that is not recovered is taken off the "
+    "electric power, for neither simulator knows a wind and FASTSim no share of friction braking",
+    "Rivals get the declared model's residual and every effect's column; a name is right where it is the change, false "
+    "where it is neither that nor the form of the efficiency. LightGBM names nothing",
+)
+
+
+def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
+    """Tables, the figure, `metrics.json`."""
+    rows = [change_row(config, PLANTS[plant].words, g) for plant, g in _by(results, lambda t: t["plant"])]
+    changed = [(t, r) for t, r in results if t["plant"] != "nothing"]
+    if changed:
+        rows.append(change_row(config, ANY, changed))
+    drawn = f"seed {config.seed} on, --fdr {config.fdr}"
+    head = f"Vehicles of FASTSim and SUMO: one change in the simulator, none in the sheet; {drawn}"
+    write_tables(run, "table", _shown(rows), head)
+    by_line = [
+        change_row(config, f"{key}, {'nothing' if plant == 'nothing' else 'one change'}", g)
+        | {"coefficients_covered": _mean([ok for _, r in g for ok in scores.covered(r)])}
+        for key, of_line in _by(results, lambda t: t["line"])
+        for plant, g in _by(of_line, lambda t: "nothing" if t["plant"] == "nothing" else "changed")
+    ]
+    write_tables(run, "table_by_log", _shown(by_line), f"The same by kind of log; {drawn}")
+    against = rival_rows(config, results)
+    if against:
+        write_tables(run, "table_rivals", against, "Rivals on the same logs")
+    write_tables(run, "table_said", said_rows(results), "What was said of each log: names with sizes, held-out error")
+    rows_of, columns, share = confusion(results)
+    _figure(run, rows_of, columns, share)
+    missed = [f"{r['name']} ({r['short_of']})" for r in rows if r["name"] in ("nothing", ANY) and r["short_of"]]
+    return {
+        "artefact": ARTEFACT, "data": "FASTSim 3.1, SUMO 1.28", "synthetic": True, "logs": len(results),
+        "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k != "name"}}
+                 for r in (*rows, *by_line, *against)],
+        "better_than_paper": 0, "of": 0, "missed": missed, "notes": list(NOTES),
+    }  # fmt: skip
+
+
+LABELS = {"ours": "hdev_jax", "stlsq": "STLSQ (PySINDy)", "lasso_cv": "LassoCV", "lightgbm": "LightGBM"}
+ANY = "any change"
+UNSHOWN = ("interval_95", "met", "short_of")
+
+
+def _shown(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{k: v for k, v in r.items() if k not in UNSHOWN} for r in rows]
+
+
+def _by(results: Group, key: Callable[[dict[str, Any]], str]) -> list[tuple[str, Group]]:
+    groups: dict[str, list[tuple[dict[str, Any], dict[str, Any]]]] = {}
+    for t, r in results:
+        groups.setdefault(key(t), []).append((t, r))
+    order = [k for k in PLANTS if k in groups]
+    return [(k, groups[k]) for k in (order if len(order) == len(groups) else groups)]
+
+
+def change_row(config: Config, name: str, group: Group) -> dict[str, Any]:
+    """What the first table says of one change: eight columns, and which targets are missed."""
+    n = len(group)
+    hits = sum(scores.right(t, r) for t, r in group)
+    false = float(np.mean([bool(scores.false(t, r["named"])) for t, r in group]))
+    blamed = float(np.mean([bool(scores.blamed(t, r["named"])) for t, r in group]))
+    sizes = [s for t, r in group if (s := scores.sized(t, r))]
+    covered = float(np.mean([s["low"] <= s["true"] <= s["high"] for s in sizes])) if sizes else None
+    ratios = [r["test_rmse"]["after"] / r["refit_rmse"] for t, r in group if not PLANTS[t["plant"]].missing]
+    error = float(np.median(ratios)) if ratios else None
+    impossible = float(np.mean([bool(scores.implausible(r)) for _, r in group]))
+    nothing = all(t["plant"] == "nothing" for t, _ in group)
+    checks = (
+        ("right", hits / n, config.wanted_right, hits / n >= config.wanted_right),
+        ("false", false, *_at_most(false, config.wanted_false if nothing else config.wanted_beside)),
+        ("blamed", blamed, *_at_most(blamed, 0.0 if nothing else 1.0)),
+        ("covered", covered, config.wanted_covered, covered is None or covered >= config.wanted_covered),
+        ("error over refit", error, config.wanted_error, error is None or error <= config.wanted_error),
+        ("impossible", impossible, *_at_most(impossible, 0.0)),
+    )
+    return {
+        "name": name, "n": n, "right": hits / n, "false_name": false, "blamed": blamed, "covered": covered,
+        "error_over_refit": error, "impossible": impossible,
+        "interval_95": list(wilson(hits, n)),
+        "met": all(ok for *_, ok in checks),
+        "short_of": "; ".join(f"{what} {value:.3g}, target {wanted:g}" for what, value, wanted, ok in checks if not ok),
+    }  # fmt: skip
+
+
+def _at_most(value: float, wanted: float) -> tuple[float, bool]:
+    return wanted, value <= wanted
+
+
+def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray]:
+    """Changes with their number of logs, what was named, and its share of each change's logs [%].
+
+    An entry that holds the change is shown as it; so is a declared coefficient that tells it; a log without a name
+    is "nothing", or "unexplained" where it is called so.
+    """
+    groups = _by(results, lambda t: t["plant"])
+    cells: list[dict[str, float]] = []
+    for plant, group in groups:
+        row: dict[str, float] = {}
+        for t, r in group:
+            fine = PLANTS[plant].names
+            said = {next(iter(fine & set(e["class"])), e["id"]) for e in r["named"]}
+            if scores.told(t, r):
+                said |= {k for k in PLANTS[plant].coefficients[:1] if not said & fine}
+            for name in said or {"unexplained" if r["unexplained"] else "nothing"}:
+                row[name] = row.get(name, 0.0) + 100.0 / len(group)
+        cells.append(row)
+    wanted = [k for plant, _ in groups for k in (*sorted(PLANTS[plant].names), *PLANTS[plant].coefficients[:1])]
+    named = {k for row in cells for k in row}
+    ends = [k for k in ("unexplained", "nothing") if k in named]
+    columns = [k for k in dict.fromkeys(wanted) if k in named]
+    columns += [*sorted(named - set(columns) - set(ends)), *ends]
+    share = np.array([[row.get(k, 0.0) for k in columns] for row in cells]).reshape(len(cells), len(columns))
+    return [f"{PLANTS[plant].words} ({len(g)})" for plant, g in groups], columns, share
+
+
+@styled
+def _figure(run: Run, rows: Sequence[str], columns: Sequence[str], share: np.ndarray) -> None:
+    share_figure(run, "confusion", rows, columns, share, ylabel="changed in the simulator (logs)",
+                 title="Vehicles of FASTSim and SUMO: what was named [%]")  # fmt: skip
+
+
+def said_rows(results: Group) -> list[dict[str, Any]]:
+    """A row for each log."""
+    rows = []
+    for t, r in results:
+        names = [f"{' or '.join(e['class'])} ({_sizes(e)})" for e in r["named"]]
+        told = PLANTS[t["plant"]].coefficients[:1] if scores.told(t, r) else ()
+        rows.append({
+            "log": f"{t['line']}, {t['vehicle']}, seed {t['seed']}", "changed": PLANTS[t["plant"]].words,
+            "said": "; ".join([*names, *(f"{k} moved" for k in told)]) or "nothing", "right": scores.right(t, r),
+            "unexplained": r["unexplained"],
+            "before": r["test_rmse"]["before"], "after": r["test_rmse"]["after"], "refit": r["refit_rmse"],
+        })  # fmt: skip
+    return rows
+
+
+def _sizes(entry: dict[str, Any]) -> str:
+    return ", ".join(f"{k} {p['value']:.3g}" for k, p in entry["parameters"].items())
+
+
+def rival_rows(config: Config, results: Group) -> list[dict[str, Any]]:
+    """A row for each method: named, false names, errors, over logs whose change has a name and over those with none."""
+    group = [(t, r) for t, r in results if r["rivals"]]
+    if not group:
+        return []
+    rows = []
+    for method in ("ours", *config.rivals):
+        ours, names = method == "ours", method != "lightgbm"
+
+        def said(r: dict[str, Any], ours: bool = ours, method: str = method) -> list[dict[str, Any]]:
+            if ours:
+                return r["named"]
+            return [{"id": k, "class": [k], "class_size": 1} for k in r["rivals"][method]["named"]]
+
+        able = [(t, said(r)) for t, r in group if PLANTS[t["plant"]].names]
+        calm = [(t, said(r)) for t, r in group if t["plant"] == "nothing"]
+        every = [(t, said(r)) for t, r in group]
+        error = [
+            (r["test_rmse"]["after"] if ours else r["rivals"][method]["test_rmse"]) / r["refit_rmse"] for _, r in group
+        ]
+        took = [r["seconds"] if ours else r["rivals"][method]["seconds"] for _, r in group]
+        rows.append({
+            "name": LABELS[method],
+            "n": len(group),
+            "named": _mean([scores.named(t, {"named": s}) for t, s in able]) if names else None,
+            "false_name": _mean([bool(scores.false(t, s)) for t, s in every]) if names else None,
+            "blamed_when_nothing": _mean([bool(scores.blamed(t, s)) for t, s in calm]) if names else None,
+            "names_per_log": _mean([len(s) for _, s in every]) if names else None,
+            "error_over_refit": float(np.median(error)),
+            "seconds": float(np.median(took)),
+        })  # fmt: skip
+    return rows
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
