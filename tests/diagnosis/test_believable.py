@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from planted import SHORT, diagnosed, named
+from planted import SHORT, diagnosed, named, opened
 
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.gates.rejection import Kind
@@ -114,3 +114,16 @@ def test_gain_on_held_out_trips_is_that_of_the_better_prediction():
     assert held_out_gain(problem, split, wrong, right) > 3.0
     assert held_out_gain(problem, split, right, wrong) < -3.0
     assert held_out_gain(problem, split, right, right) == 0.0
+
+
+@pytest.mark.parametrize("missing", [True, False])
+def test_a_slope_that_the_log_lacks_is_the_first_suspect(missing, tmp_path):
+    def change(frame):
+        if missing:
+            del frame["grade_rad"], frame["altitude_m"]
+
+    _, problem, split = opened(tmp_path, seed=7302, change=change, mode="samples", rows_per_trip=400, trips=9)
+    summary = diagnosed(problem, split, {}).summary
+    assert summary["missing_channels"] == (["grade_rad"] if missing else [])
+    assert ("slope" in summary["unexplained"]["signature"]) is missing
+    assert summary["verdict"] == ("unexplained_structure" if missing else "nothing_missing")

@@ -146,8 +146,10 @@ def remainder(
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
     drift, course, slope = _drift(problem, split, given, settings)
     if slope:
-        parts.insert(0, f"a force that comes and goes like hills, as a slope of {100 * slope:.1f} % (standard deviation) "
-                        "would make: the log has no slope, which is the first thing to add")  # fmt: skip
+        hills = (
+            f"a force that comes and goes as a slope of at least {100 * slope:.1f} % (standard deviation) would make"
+        )
+        parts.insert(0, f"{hills}: the log has no slope, which is the first thing to add")
     if drift.words:
         parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
