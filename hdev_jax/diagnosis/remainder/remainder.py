@@ -185,7 +185,8 @@ def _drift(
     slow, drift = over(MINUTE_S)
     if problem.vehicle.entry == "road" and not s.has("grade_rad"):
         force = drift if drift.like == "force" else over(HILL_S)[1]
-        weight = GRAVITY_MPS2 * float(np.mean(np.asarray(s.get("mass_kg", problem.vehicle.mass_kg))))
+        mass_kg = s.channels["mass_kg"] if s.has("mass_kg") else problem.vehicle.mass_kg
+        weight = GRAVITY_MPS2 * float(np.mean(np.asarray(mass_kg)))
         slope = force.sd / weight if force.like == "force" else 0.0
     else:
         slope = 0.0
