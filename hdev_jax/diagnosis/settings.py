@@ -134,7 +134,7 @@ class Settings:
         60.0, "least time on, and off, in a trip, at standstill or in motion, for a power there", "s", "a minute"
     )
     load_switches: float = _number(
-        8.0, "least number of times that a load switches", "switches", "as for trips as clusters"
+        8.0, "least number of times that a load switches, beyond once a trip", "switches", "as for trips as clusters"
     )
     load_spread: float = _number(
         2.0, "least sd of the gain of a load on noise", "log-likelihood", "sd of half a χ² of 8 free numbers"

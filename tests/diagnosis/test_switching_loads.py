@@ -9,8 +9,9 @@ from planted import breaches, declared, diagnosed, named, training
 
 import hdev_jax
 from hdev_jax.diagnosis.competition.levels import level_test
-from hdev_jax.diagnosis.competition.switching import add_switching
+from hdev_jax.diagnosis.competition.switching import _unlike, add_switching
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.switching import Load, with_loads
@@ -159,6 +160,21 @@ def test_a_power_that_is_missing_constant_or_short_gives_no_load(some):
         n = len(residual)
         rows = StateRows(residual, np.zeros(n, int), np.ones(n), np.full(n, 15.0), np.ones(n, int))
         assert level_test(rows, some, rng) is None
+
+
+def test_what_is_on_once_at_the_start_of_each_trip_is_no_load_that_switches():
+    rng, trips, n = np.random.default_rng(0), 10, 1200
+    clock = np.tile(np.arange(n), trips)
+    model = Switching(np.array([6e3]), 0.0, np.full(2, 1e3), np.full((1, 4), 0.4), np.full(1, 60.0))
+    said = []
+    for on in (clock < 300, clock % 300 < 120):
+        rows = StateRows(
+            6e3 * on + rng.normal(0, 1e3, trips * n), np.repeat(np.arange(trips), n), np.ones(trips * n),
+            np.full(trips * n, 15.0), np.zeros(trips * n, int), 0.1,
+        )  # fmt: skip
+        said.append(_unlike(rows, model, decode(model, rows), 0, SETTINGS))
+    assert "once in a trip" in str(said[0])
+    assert said[1] is None
 
 
 def _clipped(power):

@@ -234,8 +234,10 @@ def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, setting
     size = next(p for p in SwitchingLoad.parameters if p.name == "power_w")
     if not size.least <= power <= size.upper:
         return "its power is out of range"
-    if np.sum(np.abs(np.diff(on))[np.diff(rows.trip) == 0]) < settings.load_switches:
-        return "it switches too seldom to be distinguished from a change that stays"
+    # once in a trip is what begins or fades in it: a change that stays, a cabin that is warm by then
+    switches = [float(np.sum(np.abs(np.diff(on[s])))) for _, s in trip_slices(rows.trip)]
+    if np.sum(np.maximum(np.array(switches) - 1.0, 0.0)) < settings.load_switches:
+        return "it switches too seldom to be distinguished from what changes once in a trip"
     each = [p for _, s in trip_slices(rows.trip) if (p := _power(alone.take(s), on[s], settings.load_s)) is not None]
     if len(each) < min(2, len(np.unique(rows.trip))):
         return "it switches in one trip alone"
