@@ -29,6 +29,17 @@ def _with_shapes() -> list[str]:
     return [".".join(f.relative_to(root).with_suffix("").parts) for f in files]
 
 
+_jaxtyped = jaxtyping.jaxtyped
+
+
+def _once(typechecker: str):
+    """The hook's decorator, for all but functions within functions: they have no shapes, and each call of the outer
+    one would build their checks anew, which takes longer than most of these calls."""
+    decorated = _jaxtyped(typechecker=typechecker)
+    return lambda x: x if "<locals>" in getattr(x, "__qualname__", "") else decorated(x)
+
+
+jaxtyping.jaxtyped = _once
 # Before any module of the package is imported.
 jaxtyping.install_import_hook(_with_shapes(), "beartype.beartype")
 from hdev_jax.compiling import compile_quickly  # noqa: E402
