@@ -30,8 +30,8 @@ from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.maps.prior import Losses, roughness, ties
-from hdev_jax.inference.rows import padded
 from hdev_jax.inference.row_noise import INSTRUMENTS, believed, row_noise, shapes
+from hdev_jax.inference.rows import padded
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
