@@ -29,6 +29,22 @@ def _with_shapes() -> list[str]:
     return [".".join(f.relative_to(root).with_suffix("").parts) for f in files]
 
 
+_jaxtyped = jaxtyping.jaxtyped
+
+
+def _of_shapes(typechecker: str):
+    """The hook's decorator, of what has shapes in its annotations: on all else it would cost more than most calls. What
+    is defined within a function has none, and would have its checks built anew by each call."""
+    decorated = _jaxtyped(typechecker=typechecker)
+
+    def shaped(x) -> bool:
+        x = getattr(x, "fget", None) or getattr(x, "__func__", x)  # of a property, of a class or static method
+        return "<locals>" not in x.__qualname__ and "jaxtyping." in str(x.__annotations__)
+
+    return lambda x: decorated(x) if shaped(x) else x
+
+
+jaxtyping.jaxtyped = _of_shapes
 # Before any module of the package is imported.
 jaxtyping.install_import_hook(_with_shapes(), "beartype.beartype")
 from hdev_jax.compiling import compile_quickly  # noqa: E402

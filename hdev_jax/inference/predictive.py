@@ -228,15 +228,21 @@ def _of_rows(error: np.ndarray, predicted: np.ndarray, open_row: np.ndarray) -> 
     typical = max(float(np.sqrt(np.mean(size**2))), 1e-300)
     error, size, besides = error / unit, size / typical, besides / unit**2
 
-    def loss(z: np.ndarray) -> float:
-        half, square = 0.5 * np.exp(z[2]), np.exp(2.0 * z[0]) + (z[1] * size) ** 2 + besides
+    def loss(z: np.ndarray) -> tuple[float, np.ndarray]:  # and its slopes
+        half, scale, growth = 0.5 * np.exp(z[2]), np.exp(2.0 * z[0]), (z[1] * size) ** 2
+        square = scale + growth + besides
+        ratio = error**2 / square / (2.0 * half)
         constant = special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(2.0 * np.pi * half)
-        tail = (half + 0.5) * np.log1p(error**2 / square / (2.0 * half))
-        return float(np.mean(0.5 * np.log(square) + tail)) - float(constant)
+        share, tail = ratio / (1.0 + ratio), np.log1p(ratio)
+        by_square = (0.5 - (half + 0.5) * share) / square
+        by_half = special.digamma(half + 0.5) - special.digamma(half) - 0.5 / half
+        by_half = float(np.mean(tail - (half + 0.5) / half * share)) - float(by_half)
+        slopes = 2.0 * scale * np.mean(by_square), 2.0 * z[1] * np.mean(by_square * size**2), half * by_half
+        return float(np.mean(0.5 * np.log(square) + (half + 0.5) * tail)) - float(constant), np.array(slopes)
 
     most = 2.0 if np.any(size > 0) else 0.0  # where nothing is predicted nothing grows
     bounds = [(np.log(1e-3), np.log(2.0)), (0.0, most), (np.log(2.1), np.log(MOST_FREEDOM))]
     start = np.array([np.log(0.7), min(0.3, most), np.log(8.0)])
-    best = optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds)
+    best = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds)
     z = best.x
     return unit * float(np.exp(z[0])), float(z[1]) * unit / typical, float(np.exp(z[2])), float(best.fun)

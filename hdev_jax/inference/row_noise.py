@@ -34,7 +34,7 @@ def shapes(
 
     `energy_wh` is the measured: a model that strays would be let stray by a noise in proportion to what it says.
     """
-    climb, kick = (np.abs(np.asarray(x)) for x in _slopes(vehicle, jax.tree.map(jnp.asarray, log)))
+    climb, kick = (np.abs(np.asarray(x)) for x in _slopes(vehicle, log))
     return np.stack([np.ones_like(energy_wh), np.abs(energy_wh), climb, kick], axis=1)
 
 
@@ -48,18 +48,18 @@ def believed(
     Measurement Error in Nonlinear Models, chapter 4). The reading's own error is c/√(1 − ρ), ρ at most one half; where
     every reading is the same, as where the log has none, ρ is 0. Rows that stand are as they were read.
     """
-    sides = []
-    slope = log.get("grade_rad", jnp.zeros(len(log)))
+    log, sides = jax.tree.map(np.asarray, log), []
+    slope = np.asarray(log.get("grade_rad", np.zeros(len(log))))
     for name, read in (("grade_rad", slope), ("speed_mps", log.speed_end_mps - log.speed_start_mps)):
         sd = float(instruments[INSTRUMENTS.index(name)])
         if sd == 0.0:
             sides.append([0.0])
             continue
-        moving = np.asarray(read)[moves]
+        moving = read[moves]
         spread = float(np.var(moving))
         share = 0.5 * (1.0 - np.sqrt(max(1.0 - 4.0 * sd**2 / spread, 0.0))) if spread > 0 else 0.0
         nearer = share * (float(np.mean(moving)) - read)
-        sides.append([jnp.where(moves, nearer + side, 0.0) for side in (sd, -sd)])
+        sides.append([np.where(moves, nearer + side, 0.0) for side in (sd, -sd)])
     return [shifted(log, *errors) for errors in product(*sides)]
 
 
@@ -67,7 +67,7 @@ def shifted(log: Segments, slope_rad: ArrayLike, change_mps: ArrayLike) -> Segme
     """The log with slopes and changes of speed higher by so much, a number or one for each row."""
     ends = log.speed_start_mps - 0.5 * change_mps, log.speed_end_mps + 0.5 * change_mps
     moved = eqx.tree_at(lambda s: (s.speed_start_mps, s.speed_end_mps), log, ends)
-    return moved.with_channels(grade_rad=log.get("grade_rad", jnp.zeros(len(log))) + slope_rad)
+    return moved.with_channels(grade_rad=log.get("grade_rad", np.zeros(len(log))) + slope_rad)
 
 
 @eqx.filter_jit

@@ -3,11 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import numpy as np
+from jaxtyping import Array
 from scipy.optimize import lsq_linear
 
 from hdev_jax.inference import padded
 from hdev_jax.logs.checks import Suspicion, alternatives, constant_target, mended, suspicions
+from hdev_jax.physics import Vehicle
 from hdev_jax.problem.problem import Problem
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS
@@ -62,10 +65,10 @@ def implausible(problem: Problem, trips: tuple[int, ...] | None = None) -> tuple
         return found
     mass_kg = s.channels["mass_kg"] if s.has("mass_kg") else problem.vehicle.mass_kg
     heavy = float(np.median(np.asarray(mass_kg))) > TRUCK_KG
-    declared = min(_left(problem, s, y, mass) for mass in (MASSES_OF_TRUCKS if heavy else MASSES))
+    declared = _left(problem, s, y, MASSES_OF_TRUCKS if heavy else MASSES)
     best: tuple[float, _Other] | None = None
     for other in _others(problem):
-        left = _left(problem, _as(s, other), y, 1.0)
+        left = _left(problem, _as(s, other), y)
         if best is None or left < best[0]:
             best = (left, other)
     if best is None or best[0] > GAIN * declared or best[0] > LEFT:
@@ -120,20 +123,27 @@ def _some_rows(problem: Problem, trips: tuple[int, ...] | None) -> tuple[Segment
     return problem.segments.take(rows), np.asarray(problem.log.target("energy_wh"))[rows]
 
 
-def _left(problem: Problem, s: Segments, y: np.ndarray, mass: float) -> float:
-    """Share of the measured power's square that the vehicle leaves, each part scaled within what is open."""
-    rows = padded(s, y)
-    parts = {k: np.asarray(v)[: len(y)] for k, v in problem.vehicle.breakdown(rows.segments).items()}
-    names = [k for k, x in parts.items() if np.any(x)]
+@eqx.filter_jit
+def _breakdown(vehicle: Vehicle, segments: Segments) -> dict[str, Array]:
+    return vehicle.breakdown(segments)
+
+
+def _left(problem: Problem, s: Segments, y: np.ndarray, masses: tuple[float, ...] = (1.0,)) -> float:
+    """Share of the measured power's square that the vehicle leaves, each part scaled within what is open, at the best
+    of these masses, in the sheet's."""
+    breakdown = _breakdown(problem.vehicle, padded(s, y).segments)
+    parts = {k: x for k, v in breakdown.items() if np.any(x := np.asarray(v)[: len(y)])}
     weight = 1.0 / np.sqrt(np.asarray(s.duration_s))
-    scale = [mass if k in _WITH_MASS else 1.0 for k in names]
-    A = np.stack([parts[k] for k in names], axis=1) * np.asarray(scale) * weight[:, None]
-    target = y * weight
-    size = np.linalg.norm(A, axis=0)
-    width = np.asarray([_width(problem, k) for k in names])
+    columns, target = np.stack(list(parts.values()), axis=1) * weight[:, None], y * weight
+    width = np.asarray([_width(problem, k) for k in parts])
     low = np.maximum(1.0 - width, 0.05)
-    fit = lsq_linear(A / size, target, bounds=(low * size, (1.0 + width) * size), method="bvls")
-    return 2.0 * float(fit.cost) / float(target @ target)
+    costs = []
+    for mass in masses:
+        A = columns * np.asarray([mass if k in _WITH_MASS else 1.0 for k in parts])
+        size = np.linalg.norm(A, axis=0)
+        fit = lsq_linear(A / size, target, bounds=(low * size, (1.0 + width) * size), method="bvls")
+        costs.append(float(fit.cost))
+    return 2.0 * min(costs) / float(target @ target)
 
 
 def _width(problem: Problem, part: str) -> float:

@@ -3,22 +3,16 @@
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
-from hdev_jax.inference import padded_rows
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Noise", "estimate_noise", "whiten", "without_level"]
 
 MAX_ORDER = 24
-ORDERS = (4, 12, MAX_ORDER)  # that the filter is compiled for; the rest of the coefficients are zero
-NARROW, WIDE = 2, 32  # columns that it takes at once
-PIECE = 65_536  # rows that it takes at once
+PIECE = 2_048  # rows at a time: what a lag takes from them stays in the cache
 BLOCK_S = 600.0
 BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
@@ -197,41 +191,20 @@ def _log_likelihood(noise: Noise, residual: np.ndarray, trip: np.ndarray, slices
 def _filtered(
     columns: Float[np.ndarray, "row k"], noise: Noise, trip: Int[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row k+1"]:
-    """Columns, and a level of 1, less what the rows before predict of them, over the prediction's sd.
-
-    Rows, orders and widths come in a few shapes only: a program for each log, order and set of candidates would take
-    longer to compile than to run. Long logs are taken a piece of rows at a time.
-    """
-    (n, k), order = columns.shape, noise.order
-    lags = next(o for o in ORDERS if o >= order)
-    at = np.minimum(_positions(trip), order)
-    before, rows, size = (lags, PIECE, lags + PIECE) if n > PIECE else (0, n, padded_rows(n))
-    width = NARROW if k + 1 <= NARROW else WIDE
-    out = np.empty((n, k + 1))
-    for start in range(0, n, rows):
-        low, stop = max(start - before, 0), min(start + rows, n)
-        here = slice(before - (start - low), before - start + stop)  # where rows low to stop are in this piece
-        phi, inverse = np.zeros((size, lags)), np.ones(size)
-        phi[here, :order], inverse[here] = noise.coefficients[at[low:stop]], 1.0 / noise.scales[at[low:stop]]
-        for first in range(0, k + 1, width):
-            part = columns[low:stop, first : first + width]
-            wide = np.zeros((size, width))
-            wide[here, : part.shape[1]] = part
-            if k < first + width:
-                wide[here, k - first] = 1.0
-            white = np.asarray(_filter(wide, phi, inverse))[before : before + stop - start]
-            out[start:stop, first : first + width] = white[:, : k + 1 - first]
-    return out
-
-
-@jax.jit
-def _filter(columns: Any, phi: Any, inverse: Any) -> Array:
-    out = columns
-    for k in range(phi.shape[1]):
-        back = jnp.concatenate([jnp.zeros_like(columns[: k + 1]), columns[: -(k + 1)]])
+    """Columns, and a level of 1, less what the rows before predict of them, over the prediction's sd."""
+    n, order = len(columns), noise.order
+    plain, at = np.column_stack([columns, np.ones(n)]), np.minimum(_positions(trip), order)
+    out = np.empty_like(plain)
+    for start in range(0, n, PIECE):
+        stop = min(start + PIECE, n)
         # rows too early in their trip have a zero coefficient here, so nothing leaks from the trip before
-        out = out - phi[:, k : k + 1] * back
-    return out * inverse[:, None]
+        phi, left = noise.coefficients[at[start:stop]], plain[start:stop].copy()
+        for lag in range(1, min(order, stop - 1) + 1):
+            low = max(start - lag, 0)
+            rows = stop - lag - low
+            left[-rows:] -= phi[-rows:, lag - 1 : lag] * plain[low : stop - lag]
+        out[start:stop] = left / noise.scales[at[start:stop], None]
+    return out
 
 
 def whiten(

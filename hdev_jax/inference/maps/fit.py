@@ -31,6 +31,7 @@ from scipy.linalg import cho_factor, cho_solve, get_lapack_funcs
 from hdev_jax.errors import InputError
 from hdev_jax.inference.maps.prior import Losses, roughness, ties
 from hdev_jax.inference.row_noise import INSTRUMENTS, believed, row_noise, shapes
+from hdev_jax.inference.rows import padded
 from hdev_jax.physics import EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
 
@@ -95,7 +96,8 @@ def learn_map(
     if not smooth or min(smooth) <= 0.0 or not 0.0 < mean < 1.0 or min(wide, alike, straight) <= 0.0:
         raise ValueError("strengths of the prior are above 0, its mean is an efficiency between 0 and 1")
     _check(segments, energy_wh, start)
-    problem = _Problem(vehicle, jax.tree.map(jnp.asarray, segments), energy_wh, start)
+    rows = padded(segments, energy_wh)  # with rows that stand
+    problem = _Problem(vehicle, rows.segments, np.asarray(rows.measured), start)
     losses = Losses.of(start, mean)
     theta, instruments = losses.logarithm(np.asarray(start.values, dtype=float).ravel()), np.zeros(len(INSTRUMENTS))
     fixed = alike * ties(start) + straight * roughness(start, 2) + np.eye(theta.size) / wide**2

@@ -76,9 +76,10 @@ def _parts(phi: Float[np.ndarray, "n dim"], data: Sums) -> Any:
     half = _forward(low, [data.moment[:, i] / variance[:, None] for i in range(k)])
     one = np.ones_like(half[0])
     cross = [_forward(low, [tight[:, j : j + 1] * one if i == j else 0.0 * one for i in range(k)]) for j in range(k)]
-    taken = [[sum(np.sum(cross[a][i] * cross[b][i], axis=1) for i in range(k)) for b in range(k)] for a in range(k)]
-    own = [[(vehicles * tight[:, a] + 1.0 if a == b else 0.0) - taken[a][b] for b in range(k)] for a in range(k)]
-    right = [sum(np.sum(cross[a][i] * half[i], axis=1) for i in range(k)) for a in range(k)]
+    each = np.moveaxis(np.array(cross), 2, 0).reshape(len(phi), k, k * vehicles)
+    taken = each @ np.swapaxes(each, 1, 2)
+    own = [[(vehicles * tight[:, a] + 1.0 if a == b else 0.0) - taken[:, a, b] for b in range(k)] for a in range(k)]
+    right = list((each @ np.moveaxis(np.array(half), 1, 0).reshape(len(phi), k * vehicles, 1))[..., 0].T)
     return tight, variance, low, half, _lower(own), right
 
 

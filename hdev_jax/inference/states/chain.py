@@ -30,24 +30,16 @@ class Smoothed(NamedTuple):
     log_likelihood: Float[Array, " chain"]
 
 
-def _forward(carry: tuple[Any, Any], row: tuple[Any, Any]) -> tuple[Any, Any]:
-    before, total = carry
-    move, fit = row
-    top = jnp.max(fit, axis=(-2, -1), keepdims=True)
-    moved = before[:, :, None] * move
-    joint = jnp.sum(moved * jnp.exp(fit - top), axis=1)
+def _forward(before: Any, likely: Any) -> tuple[Any, Any]:
+    joint = jnp.sum(before[:, :, None] * likely, axis=1)
     norm = jnp.sum(joint, axis=-1, keepdims=True) + TINY
-    return (joint / norm, total + jnp.log(norm[:, 0]) + top[:, 0, 0]), (jnp.sum(moved, axis=1), joint / norm, before)
+    filtered = joint / norm
+    return filtered, (filtered, norm[:, 0])
 
 
-def _backward(later: Any, row: tuple[Any, Any, Any]) -> tuple[Any, Any]:
-    move, fit, before = row
-    weight = move * jnp.exp(fit - jnp.max(fit, axis=(-2, -1), keepdims=True)) * later[:, None, :]
-    earlier = jnp.sum(weight, axis=-1)
-    pairs = before[:, :, None] * weight
-    return earlier / (jnp.sum(earlier, axis=-1, keepdims=True) + TINY), pairs / (
-        jnp.sum(pairs, axis=(-2, -1), keepdims=True) + TINY
-    )
+def _backward(later: Any, likely: Any) -> tuple[Any, Any]:
+    earlier = jnp.sum(likely * later[:, None, :], axis=-1)
+    return earlier / (jnp.sum(earlier, axis=-1, keepdims=True) + TINY), later
 
 
 @jax.jit
@@ -58,11 +50,17 @@ def smooth(moves: Pairs, fits: Pairs) -> Smoothed:
     chance of its states); `fits[t]`, log-likelihood of row t for each pair of states before and after it.
     """
     chains, states = fits.shape[1:3]
-    begin = (jnp.full((chains, states), 1.0 / states, fits.dtype), jnp.zeros(chains, fits.dtype))
-    (_, total), (ahead, filtered, before) = jax.lax.scan(_forward, begin, (moves, fits), unroll=UNROLL)
-    last = jnp.ones((chains, states), fits.dtype)
-    _, pairs = jax.lax.scan(_backward, last, (moves, fits, before), reverse=True, unroll=UNROLL)
-    return Smoothed(ahead, filtered, pairs, total)
+    # what needs no other row is done for all rows at once
+    top = jnp.max(fits, axis=(-2, -1), keepdims=True)
+    likely = moves * jnp.exp(fits - top)
+    begin = jnp.full((chains, states), 1.0 / states, fits.dtype)
+    _, (filtered, norm) = jax.lax.scan(_forward, begin, likely, unroll=UNROLL)
+    _, later = jax.lax.scan(_backward, jnp.ones_like(begin), likely, reverse=True, unroll=UNROLL)
+    before = jnp.concatenate([begin[None], filtered[:-1]])[..., None]
+    pairs = before * likely * later[..., None, :]
+    pairs = pairs / (jnp.sum(pairs, axis=(-2, -1), keepdims=True) + TINY)
+    total = jnp.sum(jnp.log(norm) + top[..., 0, 0], axis=0)
+    return Smoothed(jnp.sum(before * moves, axis=2), filtered, pairs, total)
 
 
 @jax.jit

@@ -29,7 +29,10 @@ class Lanes(NamedTuple):
             k = int(np.argmin(filled))
             lane[s], place[s] = k, filled[k] + np.arange(s.stop - s.start)
             filled[k] += s.stop - s.start
-        return cls(lane, place, (padded_rows(int(filled.max())), len(filled)), np.array([s.start for s in slices]))
+        longest = int(filled.max())
+        # a scan takes as long as its rows: no fewer than 64, and shapes that double up to those of any other program
+        size = max(64, 2 ** (longest - 1).bit_length()) if longest <= padded_rows(1) else padded_rows(longest)
+        return cls(lane, place, (size, len(filled)), np.array([s.start for s in slices]))
 
     def spread(self, values: np.ndarray, fill: Any) -> np.ndarray:
         out = np.empty((*self.shape, *values.shape[1:]))
