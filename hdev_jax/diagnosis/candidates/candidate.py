@@ -73,10 +73,11 @@ class Candidate:
         """The variant of the effect that has these of its sizes, with the shapes that act on them; None where there is
         none."""
         at = np.flatnonzero(np.asarray(kept))
-        sizes, groups, columns = (tuple(x[k] for k in at) for x in (self.sizes, self.groups, self.columns))
+        sizes = tuple(self.sizes[k] for k in at)
         if len(at) == len(self.sizes) or sizes not in self.effect.variants:
             return None
         shapes = tuple((n, v) for n, v in self.shapes if _matters(self.parameter(n), sizes))
+        groups, columns = tuple(self.groups[k] for k in at), tuple(self.columns[k] for k in at)
         return replace(self, sizes=sizes, groups=groups, columns=columns, shapes=shapes)
 
     @property
