@@ -11,7 +11,7 @@ from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.mode import add_mode
-from hdev_jax.diagnosis.competition.needed import backward, classes, without_idle_switches
+from hdev_jax.diagnosis.competition.needed import backward, classes, without_far, without_idle_switches
 from hdev_jax.diagnosis.competition.refit import widened, without
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.competition.switching import add_switching, decoded_again, mistaken, with_states
@@ -46,14 +46,15 @@ def compete(
     too, and a verdict on every other candidate.
     """
 
-    def declared() -> State:
+    def calibrated() -> State:
         tell("calibrating the declared model")
         return State(training.calibrate(vehicle, table))
 
-    state = remember(0, declared)
+    state = remember(0, calibrated)
+    declared = state.fit
     for step in range(1, training.settings.most_effects + 3):
         rng = np.random.default_rng([seed, step])
-        state = remember(step, lambda s=state, k=step, r=rng: _step(rows_with(training, s), s, k, r, tell))
+        state = remember(step, lambda s=state, k=step, r=rng: _step(rows_with(training, s), s, declared, k, r, tell))
         if state.finished:
             break
     return state
@@ -67,7 +68,9 @@ def rows_with(training: Training, state: State) -> Training:
     return with_states(training, state)
 
 
-def _step(training: Training, state: State, step: int, rng: np.random.Generator, tell: Tell) -> State:
+def _step(
+    training: Training, state: State, declared: Calibration, step: int, rng: np.random.Generator, tell: Tell
+) -> State:
     """One round: the first of an exchange of two, forward, the searched candidates, an exchange, a wider form and a
     term without a name that changes something; then backward. `finished` where none does."""
     tell(f"scoring candidates, step {step}")
@@ -96,8 +99,9 @@ def _step(training: Training, state: State, step: int, rng: np.random.Generator,
             tell("added a term without a name")
     asked = {v.id for v in sought}
     sought += [v for v in state.verdicts if v.id not in asked and training.library[v.id].searched]
-    if new is None and (less := without_idle_switches(training, state, scores)) is not state:
-        new = less
+    if new is None:
+        less = without_far(training, without_idle_switches(training, state, scores), declared)
+        new = None if less is state else less
     if new is None:
         state = replace(state, found=classes(scores, state))
         return replace(state, verdicts=verdicts_of(round_, sought), finished=True)

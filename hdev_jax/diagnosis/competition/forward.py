@@ -115,8 +115,7 @@ def _refitted(round_: Round, s: Score) -> Refit | None:
         round_.tell(f"refitting {s.candidate.id} with {len(s.candidate.sizes)} of its sizes")
         came = refit(round_.training, round_.state, s, round_.scores)
     if came.fit is None:
-        why = Rejection(Kind.FAR, dict(zip(("name", "z"), came.far, strict=True))) if came.far else None
-        round_.turned_down(s.candidate.id, why or Rejection(Kind.REFIT))
+        round_.turned_down(s.candidate.id, Rejection(Kind.REFIT))
         return None
     return came
 

@@ -22,7 +22,7 @@ from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
 from hdev_jax.physics import unavailable
 
-__all__ = ["backward", "can_be_asked", "classes", "model_without", "needed", "without_idle_switches"]
+__all__ = ["backward", "can_be_asked", "classes", "model_without", "needed", "without_far", "without_idle_switches"]
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,30 @@ def without_idle_switches(training: Training, state: State, scores: Scores) -> S
         if worth(lost, f.score.candidate, training.settings) <= 0.0:
             why = Rejection(Kind.SUPERFLUOUS, {"beside": "effects added later", "times": 2})
             state = replace(less, removed={**less.removed, f.id: why})
+    return state
+
+
+def without_far(training: Training, state: State, declared: Calibration) -> State:
+    """The state without the effect that drives a declared coefficient far from its table, further than it was in the
+    declared model: the most likely reason is that it stands for another one. Asked at the end, for on the way there a
+    coefficient may hold what is not in the model yet."""
+    limit = {
+        c.name: max(training.settings.moved, abs(float(z)))
+        for c, z in zip(declared.table.free, declared.prior_z(), strict=True) if np.isfinite(z)
+    }  # fmt: skip
+
+    def far(fit: Calibration) -> dict[str, float]:
+        each = zip(fit.table.free, fit.prior_z(), strict=True)
+        return {c.name: float(z) for c, z in each if abs(z) > limit.get(c.name, np.inf)}
+
+    if not (now := far(state.fit)):
+        return state
+    for f in reversed([f for f in state.found if not f.score.candidate.effect.searched]):
+        less = without(training, state, f.id)
+        if not far(less.fit):
+            name = max(now, key=lambda k: abs(now[k]))
+            why = Rejection(Kind.FAR, {"name": name, "z": now[name], "times": 2})
+            return replace(less, removed={**less.removed, f.id: why})
     return state
 
 

@@ -27,15 +27,13 @@ __all__ = ["Refit", "as_reported", "fitted", "gained", "in_range", "joined", "re
 @dataclass(frozen=True)
 class Refit:
     """A joint refit: the `fit` (None where the candidate is out of range or not significant in it), its gain in
-    log-likelihood, the score at the shapes that it started from. Where that is the reason: `fewer`, the candidate
-    without the group (a gear) or the size that ends out of range; `far`, the declared coefficient that it drives away
-    from its table, with how far in prior sd."""
+    log-likelihood, the score at the shapes that it started from; where that is the reason, `fewer`, the candidate
+    without the group (a gear) or the size that ends out of range."""
 
     fit: Calibration | None
     gain: float
     score: Score
     fewer: Candidate | None = None
-    far: tuple[str, float] | None = None
 
 
 def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
@@ -64,12 +62,10 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
     start = refined(training, s, scores)[0] if shaped or least_squares else s
     noise = scores.baseline.noise
     ways = [noise] * better + [None] * least_squares + [noise] * (generalise and not better)
-    fewer = far = None
+    fewer = None
     for way in ways:
         fit = _with(training, state, start, way)
-        good = fit is not None and _stands(fit, c, settings) and _all_in_range(fit, state, settings)
-        far = _far(fit, state.fit, settings) if good and fit is not None else None
-        if good and fit is not None and far is None:
+        if fit is not None and _stands(fit, c, settings) and _all_in_range(fit, state, settings):
             started = replace(s, candidate=replace(c, shapes=start.candidate.shapes), beta=start.beta)
             return Refit(fit, gained(training, fit, scores), started)
         if fit is not None and fewer is None and c.kind == "size":
@@ -78,7 +74,7 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
                 bool(p.lower <= p.null + b <= p.upper) for p, b in zip(map(c.parameter, c.sizes), beta, strict=True)
             ]
             fewer = without_idle(c, beta) or c.narrower(inner)
-    return replace(failed, fewer=fewer, far=far)
+    return replace(failed, fewer=fewer)
 
 
 def joined(training: Training, state: State, s: Score, noise: Noise | None = None) -> Calibration | None:
@@ -86,9 +82,8 @@ def joined(training: Training, state: State, s: Score, noise: Noise | None = Non
     are those of generalised least squares, and its shapes with them unless these rows do not settle them."""
     fit = _with(training, state, s, noise)
     settings = training.settings
-    if fit is None or not _stands(fit, s.candidate, settings) or not _all_in_range(fit, state, settings):
-        return None
-    return None if _far(fit, state.fit, settings) else fit
+    good = fit is not None and _stands(fit, s.candidate, settings) and _all_in_range(fit, state, settings)
+    return fit if good else None
 
 
 def _with(training: Training, state: State, s: Score, noise: Noise | None) -> Calibration | None:
@@ -286,18 +281,6 @@ def _all_in_range(fit: Calibration, state: State, settings: Settings) -> bool:
     """Whether no earlier effect is clearly out of its range now: of two sizes that cancel, one is too many. An effect
     of about 0 is left to the backward step."""
     return all(in_range(fit, f.score.candidate, settings.stands) for f in state.found)
-
-
-def _far(fit: Calibration, before: Calibration, settings: Settings) -> tuple[str, float] | None:
-    """The declared coefficient that an effect drives away from its table, with how far in prior sd: the most likely
-    reason is that the effect stands for another one. None where all stay, or come nearer than they were."""
-    was = dict(zip((c.name for c in before.table.free), before.prior_z(), strict=True))
-    moved = [
-        (c.name, float(z))
-        for c, z in zip(fit.table.free, fit.prior_z(), strict=True)
-        if not c.path.startswith("effects.") and abs(z) > max(settings.moved, abs(was.get(c.name, 0.0)))
-    ]
-    return max(moved, key=lambda m: abs(m[1]), default=None)
 
 
 def _sizes(fit: Calibration, c: Candidate) -> Float[np.ndarray, " k"]:
