@@ -19,11 +19,13 @@ Group = Sequence[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their resu
 ARTEFACT = "studies/simulators"
 NOTES = (
     "Right: nothing changed, no false name, and the form of the efficiency is named (regenerating efficiency, losses "
-    "by load) or something is called unexplained; one change, an entry or a class of at most three holds it, or a "
-    "declared coefficient that takes it has a 90 % interval beyond the sheet's value, on the right side; no slope in "
-    "the log, no false name, and something is called unexplained or the slope is said to be missing",
+    "by load), two efficiencies are declared already, or something is called unexplained; one change, an entry or a "
+    "class of at most three holds it, or a declared coefficient that takes it has a 90 % interval beyond the sheet's "
+    "value, on the right side; no slope in the log, no false name, and something is called unexplained or the slope is "
+    "said to be missing",
     "False name: an entry that is neither the change nor the form of the efficiency, which FASTSim has by load and "
-    "direction and SUMO by direction, while the sheet declares one number. Blamed: of these, an instrument or the "
+    "direction and SUMO by direction, while the sheet declares one number. In logs of samples of the past second a "
+    "late slope, a time skew or a filter is no false name either. Blamed: of these, an instrument or the "
     "payload. Impossible: a size or a coefficient that no vehicle has",
     "Error over refit: test RMSE over that of a refit that knows the cause: the kernel with the simulator's true "
     "parameters, the change and the form of the efficiency, calibrated on the same training trips; median, logs "

@@ -59,7 +59,8 @@ def diagnose(
     tell: Tell = lambda _: None,
     checkpoint: Checkpoint = lambda _, compute: compute(),
 ) -> Outcome:
-    """What the declared vehicle lacks. Test trips are held out: they are used once, when everything has been chosen.
+    """What the declared vehicle lacks. Test trips are held out: nothing is chosen by them; at the end they confirm the
+    model or not.
 
     **Arguments:** `library`, the candidates by id; `settings`, every number that decides; `seed` of placebos,
     resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
@@ -77,9 +78,9 @@ def diagnose(
     state = compete(training, problem.vehicle, problem.table, seed=seed, tell=tell, remember=remember)
 
     # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing;
-    #    the declared one where the held-out trips do not bear them out
+    #    the declared one where the held-out trips do not confirm them
     # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
-    #    points, random intercepts of trips. While most of it is no noise, no instrument is the cause
+    #    points, random intercepts of trips. While most of it is structure, no instrument is the cause
     tell("error before and after on the held-out test trips")
     training = rows_with(training, state)
 
@@ -92,7 +93,7 @@ def diagnose(
     if model.left.significant and model.left.share > settings.instrument_share:
         physics = no_instrument_named(training, model.named, model.left.share)
         if physics is not model.named:
-            tell("no instrument is named while most of what is left is no noise")
+            tell("most of what is left is structure: no instrument's fault is named")
             model = handed_out(physics, None, "remainder-2")
     named, steps, predicted, given, left = model
 
@@ -130,14 +131,20 @@ def _handed_out(
     problem: Problem, split: Split, training: Training, named: State, state: State | None, *, seed: int, tell: Tell,
     keep: Callable[[Callable[[], Any]], Any],
 ) -> _Model:  # fmt: skip
-    """The model with the named effects, or the declared one where the held-out trips do not bear them out. `state`
-    holds the term without a name, where it is still to be described."""
+    """The model with the named effects, or the declared one where the held-out trips do not confirm them. `state` holds
+    the term without a name, where it is still to be described.
+
+    Held-out trips know no states: effects with a search of their own (loads that switch, phases and modes by trip) are
+    predicted by their means there, so a model that has one is not asked.
+    """
     settings = training.settings
     steps = path(training, problem, named)
     predicted = [problem.predict(fit.vehicle) for fit in steps]
-    if named.found and held_out_gain(problem, split, predicted[0], predicted[-1]) <= 0.0:
-        tell("the held-out trips do not bear it out: nothing is named")
-        named, steps, predicted = none_named(named, steps[0]), steps[:1], predicted[:1]
+    if named.found and not any(f.score.candidate.effect.searched for f in named.found):
+        levels = training.clusters.kind == "trip"
+        if not held_out_gain(problem, split, predicted[0], predicted[-1], levels=levels) > 0.0:
+            tell("not confirmed on the held-out trips: nothing is named")
+            named, steps, predicted, state = none_named(named, steps[0]), steps[:1], predicted[:1], None
     given = given_states(problem, split, named, steps[-1], seed)
     explained = predicted[-1] if given is None else given.predicted
     described = _formula(problem, training, state, explained, given) if state is not None else None

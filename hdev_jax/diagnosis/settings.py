@@ -99,7 +99,7 @@ class Settings:
         0.05, "p-value above which an effect is not needed beside another of its class", "1", "Wald test, 5 %"
     )
     inexact: float = _number(
-        0.2, "share by which the form of an effect may differ from the vehicle's: less tells no two effects apart", "1",
+        0.2, "share by which forms of effects are inexact: effects that differ by less are one class", "1",
         "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
     )  # fmt: skip
     most_in_class: int = _number(2, "members of a class that are listed at most", "effects", "contract §4")

@@ -125,9 +125,8 @@ class InverterLoss(Effect):
 class PartLoad(Effect):
     """Efficiency that falls at low load, and at high load: P₀·|P|/(P_h + |P|) + c·P², P what comes from the drive.
 
-    A part that is in proportion to |P| is the declared efficiency (`efficiency_scale`). The first term is the rest of
-    what a working drive loses at any load: half of P₀ at P_h, and none of it where the drive does nothing, which tells
-    it from a load at standstill.
+    The part in proportion to |P| is the declared efficiency (`efficiency_scale`). The first term levels off at P₀: half
+    of it is lost at P_h, nothing where the drive does nothing, which distinguishes it from a load at standstill.
     """
 
     id: ClassVar[str] = "part_load"
@@ -138,7 +137,7 @@ class PartLoad(Effect):
     source: ClassVar[str] = "Larminie and Lowry, Electric Vehicle Technology Explained, eq. 7.23 (constant, copper)"
     parameters: ClassVar[Parameters] = (
         # a drive of 100 kW that has 94 % at its best and 75 % at a twentieth of its power loses 1.4 kW more than 6 %
-        Size("standby_w", "W", 0.0, 500.0, 0.0, 1.5e4, least=20.0, label="loss at any load"),
+        Size("standby_w", "W", 0.0, 500.0, 0.0, 1.5e4, least=20.0, label="loss that levels off"),
         # 5 % of 50 kW, of a small machine at its rated power, are 1e-6 per watt; of a truck's 300 kW a sixth of that
         Size("per_w", "1/W", 0.0, 1e-7, 0.0, 5e-6, least=5e-9, label="loss per power squared"),
         Shape("half_w", "W", 3e3, 2e3, 300.0, 1e5, grid=(1e3, 3e3, 1e4, 3e4), of="standby_w", label="load of half"),

@@ -52,7 +52,7 @@ def implausible(problem: Problem, trips: tuple[int, ...] | None = None) -> tuple
     used = problem.measured if trips is None else problem.measured[problem.rows(trips)]
     if problem.log.targets and (constant := constant_target(problem.target, used)) is not None:
         return (constant,)
-    found = suspicions(problem.log)
+    found = suspicions(problem.log, target=False)
     target = TARGETS[problem.target]
     if (
         problem.vehicle.entry != "road"

@@ -111,9 +111,9 @@ def test_what_held_out_trips_contradict_is_not_named():
 def test_gain_on_held_out_trips_is_that_of_the_better_prediction():
     problem, split = nothing()
     right, wrong = problem.predict(problem.vehicle), problem.predict(problem.vehicle.plus(MassScale(0.1)))
-    assert held_out_gain(problem, split, wrong, right) > 3.0
-    assert held_out_gain(problem, split, right, wrong) < -3.0
-    assert held_out_gain(problem, split, right, right) == 0.0
+    assert held_out_gain(problem, split, wrong, right, levels=True) > 3.0
+    assert held_out_gain(problem, split, right, wrong, levels=True) < -3.0
+    assert held_out_gain(problem, split, right, right, levels=True) == 0.0
 
 
 @pytest.mark.parametrize("missing", [True, False])

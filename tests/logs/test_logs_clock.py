@@ -73,6 +73,16 @@ def test_each_kind_has_its_way():
     assert set(log.segments.channels["my_kw"]) == {1.0, 2.0, 3.0}
 
 
+def test_a_state_that_is_sent_once_holds_and_the_rows_are_counted():
+    frame = uneven({"speed_mps": 1.0, "battery_power_kw": 1.0})
+    sent = pd.DataFrame({"time_s": [3.0, 4.0, 5.0], "mass_kg": [15e3, 15e3, 18e3]})
+    log = read(pd.concat([frame, sent]).sort_values("time_s", kind="stable"), clock="speed_mps")
+    mass, time = log.segments.channels["mass_kg"], np.asarray(log.segments.time_s)
+    assert set(mass[time >= 5.0]) == {18e3}
+    (said,) = [e.reason for e in log.ledger if e.column == "mass_kg" and "held for more than ten" in e.reason]
+    assert f"in {np.sum(time > 15.0)} rows" in said
+
+
 def test_energies_by_row_are_summed_and_never_shared_out():
     """On a faster clock a row would have the energy of many; a counter has a value at every time."""
     frame = uneven({"speed_mps": 1.0, "battery_power_kw": 0.25}).rename(columns={"battery_power_kw": "energy_wh"})

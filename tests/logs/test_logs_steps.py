@@ -30,14 +30,14 @@ def xml(
         for i in range(vehicles):
             if k < (0, 20)[i % 2]:
                 continue
-            v = course(i)
+            v, lane = course(i), "12_0" if k < 25 else ":J_0_0"  # of a map, then inside a junction
             wh = 100.0 * v[k + 1] * step / 3600.0 + (v[k + 1] ** 2 - v[k] ** 2) / 7.2
             sums[i] += wh
             told = f'totalEnergyConsumed="{sums[i] + 5.0:.4f}" totalEnergyRegenerated="5.0000" ' if totals else ""
             lines.append(
                 f'        <vehicle id="bus.{i}" energyConsumed="{wh:.4f}" {told}actualBatteryCapacity="9000.00" '
                 f'chargingStationId="NULL" speed="{v[k + 1]:.6f}" acceleration="{(v[k + 1] - v[k]) / step:.6f}" '
-                f'lane="a_0" posOnLane="{k:.2f}"/>'
+                f'lane="{lane}" posOnLane="{k:.2f}"/>'
             )
         lines.append("    </timestep>")
     text = [lines[0], lines[1], lines[2]]

@@ -52,7 +52,8 @@ def compete(
 
     state = remember(0, calibrated)
     declared = state.fit
-    for step in range(1, training.settings.most_effects + 3):
+    # nothing is added in the second half: what is taken out there is one of those that were
+    for step in range(1, 2 * training.settings.most_effects + 3):
         rng = np.random.default_rng([seed, step])
         state = remember(step, lambda s=state, k=step, r=rng: _step(rows_with(training, s), s, declared, k, r, tell))
         if state.finished:
@@ -107,9 +108,10 @@ def _step(
         return replace(state, verdicts=verdicts_of(round_, sought), finished=True)
     if new.hidden is not state.hidden:
         training = with_states(training, new)
-    kept = decoded_again(training, backward(training, new, newest=len(new.terms) > len(state.terms)))
-    for id_ in set(new.ids) - set(kept.ids):
-        tell(f"removed {id_}: {kept.removed[id_]}")
+    old = len(new.terms) > len(state.terms) or {*new.ids} < {*state.ids}  # the last one found is not the newest then
+    kept = decoded_again(training, backward(training, new, newest=old))
+    for id_ in {*state.ids, *new.ids} - {*kept.ids}:
+        tell(f"removed {id_}: {kept.removed.get(id_, 'competes again')}")
     trail = {**kept.trail, ",".join(kept.ids): [float(x) for x in kept.fit.values]} if not kept.terms else kept.trail
     refused = tuple(dict.fromkeys((*kept.refused, *round_.reasons)))
     tested = (*kept.tested, *round_.tested)

@@ -84,7 +84,8 @@ def can_be_asked(f: Found) -> bool:
 def backward(training: Training, state: State, *, newest: bool = False) -> State:
     """The state without effects that are no longer needed beside the others, the weakest removed first.
 
-    The newest has just passed every gate beside the others and is not tested, unless `newest`: the others have changed.
+    The newest has just passed every gate beside the others: unless `newest` (the others have changed) it is only asked
+    whether it is one of a class with one of them.
     Beside a term without a name an effect has to be as significant as when it entered, unless it reads the same channel
     (the two may be parts of one cause) or is a constant load. The same holds for a constant load beside a cycle.
     """
@@ -137,13 +138,16 @@ def without_far(training: Training, state: State, declared: Calibration) -> Stat
 
     if not (now := far(state.fit)):
         return state
-    for f in reversed([f for f in state.found if not f.score.candidate.effect.searched]):
-        less = without(training, state, f.id)
-        if not far(less.fit):
-            name = max(now, key=lambda k: abs(now[k]))
-            why = Rejection(Kind.FAR, {"name": name, "z": now[name], "times": 2})
-            return replace(less, removed={**less.removed, f.id: why})
-    return state
+    name = max(now, key=lambda k: abs(now[k]))
+    able = [f for f in state.found if not f.score.candidate.effect.searched]
+    each = [(f, less) for f in able if not far((less := without(training, state, f.id)).fit)]
+    if not each:
+        return state
+    z = [abs(dict(zip((c.name for c in s.fit.table.free), s.fit.prior_z(), strict=True))[name]) for _, s in each]
+    f, less = each[int(np.argmin(z))]  # the one that moves it most
+    return replace(
+        less, removed={**less.removed, f.id: Rejection(Kind.FAR, {"name": name, "z": now[name], "times": 2})}
+    )
 
 
 def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
@@ -160,22 +164,17 @@ def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *,
 
 
 def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Settings) -> bool:
-    """Whether two found effects are one class, of which `f` is the one to go: in the place of g it explains about as
-    much, and beside g no more than g's form may be inexact."""
+    """Whether two found effects are one class, of which `f` is the one to go: the mass or an instrument before a cause
+    in the vehicle, else the one that explains less by itself."""
     if not (can_be_asked(f) and can_be_asked(g)) or f.score.plain or g.score.plain:
         return False
     w = model_without(evidence, state.fit, f, g)
-    totals = w.evidence.totals()
+    totals, (own, other) = w.evidence.totals(), w.each
     before = w.evidence.base_likelihood(totals)
-    own, other = w.each
-    alone, beside, both = (
-        w.evidence.gain(totals, k, before)[0] for k in (own.columns, other.columns, (*own.columns, *other.columns))
-    )
-    later = (f.score.candidate.effect.stage == "sensors", -alone) >= (
-        g.score.candidate.effect.stage == "sensors",
-        -beside,
-    )
-    return later and alone > settings.class_share * beside and both - beside < settings.inexact**2 * beside
+    mine, its = (w.evidence.gain(totals, c.columns, before)[0] for c in w.each)
+    if (own.effect.stage == "sensors", -mine) < (other.effect.stage == "sensors", -its):
+        return False
+    return other.id in alike(w.evidence, own, [other], mine, settings, plain=False, inexact=settings.inexact)
 
 
 def _tried(training: Training, state: State) -> int:
@@ -217,9 +216,10 @@ def classes(scores: Scores, state: State) -> tuple[Found, ...]:
         ways = w.rivals([c for c in scores.source.candidates if c.id in scores.best])
         simple = [c for c in ways if c.freedoms <= w.own.freedoms]
         rivals = [c for some in (ways, simple) for c in best_ways(w.evidence, some, scores.settings)]
-        share = scores.settings.inexact
+        settings = scores.settings
         members = alike(
-            w.evidence, w.own, list(dict.fromkeys(rivals)), own.gain, scores, plain=f.score.plain, inexact=share
-        )
+            w.evidence, w.own, list(dict.fromkeys(rivals)), own.gain, settings, plain=f.score.plain,
+            inexact=settings.inexact,
+        )  # fmt: skip
         out.append(replace(f, alike=members))
     return tuple(out)

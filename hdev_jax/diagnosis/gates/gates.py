@@ -15,6 +15,7 @@ from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of, written_by_chunk
 from hdev_jax.diagnosis.scores.scores import Scores, best_ways, plausible
 from hdev_jax.diagnosis.scores.significance import least_clusters
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Chunk
 
 __all__ = ["DRAWN_GATES", "SCORE_GATES", "Asked", "alike", "first_rejection", "stability"]
@@ -138,7 +139,7 @@ def first_rejection(asked: Asked, gates: Sequence[Gate]) -> Rejection | None:
 
 
 def alike(
-    evidence: Evidence, own: Candidate, rivals: Sequence[Candidate], gain: float, scores: Scores, *,
+    evidence: Evidence, own: Candidate, rivals: Sequence[Candidate], gain: float, settings: Settings, *,
     plain: bool, inexact: float,
 ) -> tuple[str, ...]:  # fmt: skip
     """Its class: other effects that, put in its place, explain about as much, the best first.
@@ -147,7 +148,6 @@ def alike(
     effects are `inexact`. `own` and `rivals` hold places in `evidence`, in which it is not; a rival may come in several
     ways.
     """
-    settings = scores.settings
     found: dict[str, float] = {}
     totals = evidence.totals()
     before = evidence.base_likelihood(totals)
@@ -209,4 +209,4 @@ def of_class(a: Asked, *, inexact: float | None = None) -> tuple[str, ...]:
         simple = [c for c in scores.source.candidates if c.id in scores.best and c.id not in out]
         rivals += best_ways(scores.white, [c for c in simple if c.freedoms <= s.candidate.freedoms], scores.settings)
     rivals = list(dict.fromkeys(rivals))
-    return alike(scores.evidence(s), s.candidate, rivals, s.gain, scores, plain=s.plain, inexact=share)
+    return alike(scores.evidence(s), s.candidate, rivals, s.gain, scores.settings, plain=s.plain, inexact=share)

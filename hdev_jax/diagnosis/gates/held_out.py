@@ -1,4 +1,4 @@
-"""The last gate: do the held-out trips bear out what was found?"""
+"""The last gate: do the held-out trips confirm what was found?"""
 
 from dataclasses import replace
 
@@ -13,14 +13,15 @@ __all__ = ["held_out_gain"]
 
 
 def held_out_gain(
-    problem: Problem, split: Split, before: Float[np.ndarray, " row"], after: Float[np.ndarray, " row"]
+    problem: Problem, split: Split, before: Float[np.ndarray, " row"], after: Float[np.ndarray, " row"], *, levels: bool
 ) -> float:
     """Gain in log-likelihood of one prediction of the held-out trips over another, with the noise that the second
-    leaves on the training trips. A plain error would be blind to what is small beside slow noise."""
+    leaves on the training trips (`levels`: with random intercepts). A plain error would be blind to what is small
+    beside slow noise."""
     s = problem.segments
     trip, seconds = np.asarray(s.trip), np.asarray(s.duration_s)
     train, test = problem.rows(split.train), problem.rows(split.test)
-    noise = estimate_noise((problem.measured - after)[train], trip[train], seconds[train], levels=len(split.train) >= 8)
+    noise = estimate_noise((problem.measured - after)[train], trip[train], seconds[train], levels=levels)
     noise = replace(noise, trip_scale=np.ones(1))
     return _log_likelihood((problem.measured - after)[test], noise, trip[test], seconds[test]) - _log_likelihood(
         (problem.measured - before)[test], noise, trip[test], seconds[test]

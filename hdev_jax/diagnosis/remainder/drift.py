@@ -1,11 +1,11 @@
 """What drifts: a remainder with a memory, what it behaves like, how large it is and how long it lasts.
 
-A slope that the log lacks is a force too, of a faster kind: of hills.
+A slope that the log lacks is a force as well, which changes within seconds: it is looked for in means over `HILL_S`.
 
 A load under a controller has no levels and no channel. Means over a minute have little of the rows' own noise. Where
 they are correlated from one minute to the next, their size says what they are: the same at standstill and at any speed
 (a load), in proportion to speed (a force) or to power (a gain). Its course and its energy in each trip are those of a
-Gauss-Markov process of that size and memory; where it is like none of these, of a power.
+Gauss-Markov process of that size and memory; where it behaves like none of these, the course is that of a load.
 """
 
 from collections.abc import Sequence

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -146,10 +146,11 @@ def remainder(
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
     drift, course, slope = _drift(problem, split, given, settings)
     if slope:
+        sizes.append(slope.rms * float(np.sqrt(np.mean(train.residual**2))))
         hills = (
-            f"a force that comes and goes as a slope of at least {100 * slope:.1f} % (standard deviation) would make"
+            f"a force that comes and goes as a slope of at least {100 * slope.sd:.1f} % (standard deviation) would make"
         )
-        parts.insert(0, f"{hills}: the log has no slope, which is the first thing to add")
+        parts.insert(0, f"{hills}, or gusts: the log has no slope, which is the first thing to add")
     if drift.words:
         parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
@@ -167,13 +168,20 @@ def remainder(
     )  # fmt: skip
 
 
+class _Slope(NamedTuple):
+    """A slope that the log lacks: its standard deviation, and the RMS of its power over that of the residual."""
+
+    sd: float
+    rms: float
+
+
 def _drift(
     problem: Problem, split: Split, given: np.ndarray, settings: Settings
-) -> tuple[Drift, dict[str, Any] | None, float]:
-    """What is slow in the training rows' residual of a battery's target, its course in all trips, and the standard
-    deviation of the slope that it behaves like where the log has none (else 0); nothing of another target."""
+) -> tuple[Drift, dict[str, Any] | None, _Slope | None]:
+    """What is slow in the training rows' residual of a battery's target, its course in all trips, and the slope that it
+    behaves like where the log has none; nothing of another target."""
     if not TARGETS[problem.target].of_battery:
-        return Drift("none", float("nan"), 0.0), None, 0.0
+        return Drift("none", float("nan"), 0.0), None, None
     s = problem.segments
     seconds, trip, speed = np.asarray(s.duration_s), np.asarray(s.trip), np.asarray(s.speed_mps)
     residual, predicted = (as_watts(problem.target, x, seconds) for x in (problem.measured - given, given))
@@ -183,11 +191,13 @@ def _drift(
         return slow, drift_of(slow.take(np.isin(slow.trip, split.train)), settings)
 
     slow, drift = over(MINUTE_S)
+    slope = None
     if problem.vehicle.entry == "road" and not s.has("grade_rad"):
         force = drift if drift.like == "force" else over(HILL_S)[1]
-        mass_kg = s.channels["mass_kg"] if s.has("mass_kg") else problem.vehicle.mass_kg
-        weight = GRAVITY_MPS2 * float(np.mean(np.asarray(mass_kg)))
-        slope = force.sd / weight if force.like == "force" else 0.0
-    else:
-        slope = 0.0
+        rows = np.isin(trip, split.train)
+        share = force.sd**2 * float(np.mean(speed[rows] ** 2)) / max(float(np.mean(residual[rows] ** 2)), 1e-300)
+        if force.like == "force" and share > settings.least_share:
+            mass_kg = s.channels["mass_kg"] if s.has("mass_kg") else problem.vehicle.mass_kg
+            sd = force.sd / (GRAVITY_MPS2 * float(np.mean(np.asarray(mass_kg))))
+            slope = _Slope(sd, min(float(np.sqrt(share)), 1.0))
     return drift, drift.course(slow, problem.log.trip_names, split.test), slope

@@ -98,7 +98,8 @@ def _kwh(
     off = stats.t.ppf((np.arange(DRAWS) + 0.5) / DRAWS, freedom)
     out = []
     for k, (power, error) in enumerate(fitted):
-        factor = np.concatenate([1.0 + error / power * off, (power + error * off) / model.power_w[k]])
+        own = max(float(model.power_w[k]), 1e-9)
+        factor = np.concatenate([1.0 + error / max(power, 1e-9) * off, (power + error * off) / own])
         each = np.maximum(drawn[:, None, k, :] * factor[None, :, None], 0.0)
         low, high = np.quantile(each.reshape(-1, each.shape[-1]), (0.05, 0.95), axis=0)
         trips = {}

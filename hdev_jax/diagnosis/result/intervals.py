@@ -72,8 +72,8 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
     of an effect without shapes, its sizes over another that it may have, as likely as rows make it.
 
     All other coefficients are fitted at every point, by the least squares that found it, generalised or ordinary;
-    where another size is open, by those that its own is `reported` by. Empty for effects without such shapes or sizes,
-    for switches, and for effects that are not searched on a grid.
+    where another size is open, by those that its own is `reported` by. An effect with neither is open to what an
+    undeclared regenerating efficiency would change. Empty for switches, and for effects with a search of their own.
 
     **Returns:** what is open, by parameter.
     """
@@ -81,7 +81,7 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
     if not names:
         other = other_size(c)
         found = _other_open(training, state, s, other, reported) if other else {}
-        return found or _undeclared(training, state, s)
+        return found or ({} if c.effect.searched else _undeclared(training, state, s))
     effect = state.fit.vehicle.effect(c.id)
     here = {n: float(np.asarray(getattr(effect, n))) for n in names}
     grids = {n: _wide(c, n, here[n], training.facts.row_s) for n in names}

@@ -42,10 +42,13 @@ def constant_target(name: str, measured: np.ndarray) -> Suspicion | None:
     return Suspicion(COASTING, evidence, mend)
 
 
-def suspicions(log: Log) -> tuple[Suspicion, ...]:
-    """What about the log cannot be right, whatever the vehicle."""
-    if log.targets and (constant := constant_target(log.targets[0], log.target(log.targets[0]))) is not None:
-        return (constant,)
+def suspicions(log: Log, *, target: bool = True) -> tuple[Suspicion, ...]:
+    """What about the log cannot be right, whatever the vehicle. `target`: whether its usual target is looked at too, as
+    it is not where another one is in use."""
+    usual = log.targets[:1] if target else ()
+    for constant in (constant_target(name, log.target(name)) for name in usual):
+        if constant is not None:
+            return (constant,)
     if (counter := _counter(log)) is not None:  # of the others' evidence the energy is a part
         return (counter,)
     found = (_sign(log), _consumption(log), _distance(log))

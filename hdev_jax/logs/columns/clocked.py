@@ -47,10 +47,10 @@ def clocked(raw: Raw, adapter: Adapter) -> Raw:
     """The channels of `raw` as a table at the times of the adapter's `clock`; without one, at those of the slower one
     of speed and measurement.
 
-    A power is the mean over a row's interval, an energy the sum, a state the last value, all else linear between its
-    own values; over more than ten of its own steps no value is known. What is measured at the battery is never made up
-    between measurements: a row without one has none. Raises `InputError` where no channel is the clock, or a sum would
-    have to be shared out.
+    A power is the mean over a row's interval, an energy the sum, a state the last value until the next, all else linear
+    between its own values, of which none is known over more than ten of its own steps. What is measured at the battery
+    is never made up between measurements: a row without one has none. Raises `InputError` where no channel is the
+    clock, or a sum would have to be shared out.
     """
     file, ledger = raw.file, raw.ledger
     values: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -252,9 +252,11 @@ def _resampled(t: np.ndarray, x: np.ndarray, clock: _Clock, kind: str, measured:
         where += f", {far} of them in no row" if far else ""
         if measured or kind == "sum":
             return means, where
-        return np.where(np.isfinite(means), means, _at(t, x, clock.at, True)), where
-    linear = kind != "last"
-    return _at(t, x, clock.at, linear), "linear between two" if linear else "the last one before"
+        return np.where(np.isfinite(means), means, _between(t, x, clock.at)), where
+    if kind != "last":
+        return _between(t, x, clock.at), "linear between two"
+    held, long = _held(t, x, clock.at)
+    return held, "the last one before" + (f", held for more than ten of its steps in {long} rows" if long else "")
 
 
 def _around(t: np.ndarray, x: np.ndarray, clock: _Clock, total: bool, faster: bool) -> tuple[np.ndarray, int]:
@@ -281,12 +283,20 @@ def _around(t: np.ndarray, x: np.ndarray, clock: _Clock, total: bool, faster: bo
     return out, int((~used).sum())
 
 
-def _at(t: np.ndarray, x: np.ndarray, at: np.ndarray, linear: bool) -> np.ndarray:
+def _between(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
     """A channel at other times; NaN before its first value, after its last, and in its gaps."""
     following = np.searchsorted(t, at, "left")
     before = np.searchsorted(t, at, "right") - 1
     outside = (before < 0) | (following >= len(t))
     low, high = np.clip(before, 0, len(t) - 1), np.clip(following, 0, len(t) - 1)
     gap = t[high] - t[low] > GAP_SAMPLES * _step(t) * (1.0 + 1e-9)
-    values = np.interp(at, t, x) if linear else x[low]
-    return np.where(outside | gap, np.nan, values)
+    return np.where(outside | gap, np.nan, np.interp(at, t, x))
+
+
+def _held(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, int]:
+    """A state at other times, NaN before its first value: many are sent only when they change, a payload perhaps once.
+    And in how many rows it is older than ten of its steps."""
+    before = np.searchsorted(t, at, "right") - 1
+    low = np.clip(before, 0, len(t) - 1)
+    old = (before >= 0) & (at - t[low] > GAP_SAMPLES * _step(t) * (1.0 + 1e-9)) & (len(t) > 1)
+    return np.where(before < 0, np.nan, x[low]), int(old.sum())

@@ -57,4 +57,6 @@ def on_one_clock(raw: Raw, adapter: Adapter, time_s: np.ndarray, trip: np.ndarra
         tables.append(made.table.assign(**{k: raw.table[k].iloc[rows[0]] for k in kept}))
         units |= made.units
         ledger = ledger + made.ledger
+    if not tables:
+        raise InputError(f"{raw.file}: no row has both a trip and a time")
     return replace(raw, table=pd.concat(tables, ignore_index=True), lines=None, units=units, ledger=ledger)

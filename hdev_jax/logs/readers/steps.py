@@ -15,9 +15,10 @@ from hdev_jax.logs.ledger import Ledger
 __all__ = ["STEP", "read_steps"]
 
 STEP = "step"
-"""The column of a row's length [s]: an attribute of no vehicle, but the time since the step before."""
+"""The column of a row's length [s]: an attribute of no vehicle, but the usual time from one step to the next."""
 
 _ENERGIES = ("energyConsumed", "totalEnergyConsumed", "totalEnergyRegenerated")
+_NEEDED = (*_ENERGIES, "speed", "acceleration", "slope", "mass", "posOnLane", "Consum")
 _SAME = 0.01  # of the sums: attributes are written with two digits behind the point
 _MISSING = 0.05  # beyond, it is no matter of digits or of a full battery
 
@@ -38,12 +39,13 @@ def read_steps(path: Path, data: bytes) -> tuple[pd.DataFrame, Ledger]:
             if key == "id" or key in texts:
                 continue
             try:
-                number = float(value)
+                number = float(value.replace("_", "?"))  # the lane 12_0 is no number
             except ValueError:
-                if key in numbers:
+                if key in _NEEDED:
                     raise InputError(
                         f"{path}: vehicle '{name}' at time {time:g} s: {key} = '{value}', a number is expected"
                     ) from None
+                numbers.pop(key, None)  # once a text, never a number
                 texts[key] = len(ids)
                 continue
             column = numbers.setdefault(key, array("d"))

@@ -12,12 +12,12 @@ _WINDOW = 8  # bytes that a shift works on
 
 def raw_bits(signal: Any, data: np.ndarray) -> np.ndarray | None:
     """The bits of a signal (of cantools) as whole numbers `[frame]`, without sign and scale; None where the frames are
-    too short to hold it. **Arguments:** `data`, bytes `[frame, byte]`."""
+    too short to hold it, or it is a text of more than 64 bits. **Arguments:** `data`, bytes `[frame, byte]`."""
     first, length = signal.start // 8, signal.length
     little = signal.byte_order == "little_endian"
     skipped = signal.start % 8 if little else 7 - signal.start % 8
     needed = -(-(skipped + length) // 8)
-    if first + needed > data.shape[1]:
+    if length > 64 or first + needed > data.shape[1]:
         return None
     window = np.zeros((len(data), _WINDOW + 1), np.uint8)
     window[:, :needed] = data[:, first : first + needed]
@@ -43,8 +43,9 @@ def physical(signal: Any, data: np.ndarray, others: Mapping[str, Any], j1939: bo
         return np.full(len(data), np.nan)
     conversion = signal.conversion
     if conversion.is_float:
-        x = bits.astype(np.uint32).view(np.float32) if signal.length == 32 else bits.view(np.float64)
-        x = x.astype(np.float64)
+        of_width = {16: (np.uint16, np.float16), 32: (np.uint32, np.float32), 64: (np.uint64, np.float64)}
+        whole, real = of_width[signal.length]
+        x = bits.astype(whole).view(real).astype(np.float64)
     elif signal.is_signed:
         sign = np.int64(1 << (signal.length - 1)) if signal.length < 64 else np.int64(0)
         whole = bits.astype(np.int64)
