@@ -11,11 +11,18 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from planted import SHORT, diagnosed, named, opened
+from planted import SHORT, declared, diagnosed, found_in_turn, named, opened, training
 
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.competition.compete import no_instrument_named
+from hdev_jax.diagnosis.competition.needed import without_idle_switches
+from hdev_jax.diagnosis.competition.state import Found
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.gates.rejection import Kind
+from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference import effect_coefficients
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import read_log
 from hdev_jax.physics import LIBRARY, Effect, PartLoad, RegenEfficiency, Rolling
@@ -106,6 +113,34 @@ def test_what_held_out_trips_contradict_is_not_named():
     assert named(result) == []
     assert {c["id"]: c["kind"] for c in result.summary["candidates"]} == {"mass_scale": Kind.NOT_HELD_OUT}
     np.testing.assert_array_equal(result.predicted_after, result.predicted_before)
+
+
+def test_no_instrument_is_named_while_most_of_what_is_left_is_structure():
+    problem, _ = nothing()
+    rows = training(changed(problem, LIBRARY["power_gain"](0.1, 0.0)), ["power_gain"])
+    state = found_in_turn(rows, problem, ["power_gain"])
+    less = no_instrument_named(rows, state, 0.7)
+    assert less.ids == ()
+    (verdict,) = [v for v in less.verdicts if v.id == "power_gain"]
+    assert verdict.rejection.kind is Kind.INSTRUMENT
+    assert "70 %" in str(verdict.rejection)
+    assert no_instrument_named(rows, less, 0.7) is less
+
+
+@pytest.mark.parametrize(("limit_w", "stays"), [(9e5, False), (3e4, True)])
+def test_a_limit_that_is_never_reached_any_more_is_taken_out(limit_w, stays):
+    problem, _ = nothing()
+    limit = LIBRARY["regen_limit"](limit_w, 1.0)
+    rows = training(changed(problem, limit), ["regen_limit"])
+    state = declared(rows, problem)
+    table = [replace(c, free=False) for c in effect_coefficients(limit, ("power_w",))]
+    candidate = Candidate(type(limit), ("power_w",), (None,), (("share", 1.0), ("power_w", limit_w)), "limit", ())
+    found = Found(limit.id, Score(candidate, np.array([1.0]), 9.0, 0.0, 0.0, 9.0, 1.0), 0.0, 1.0, (), 9.0)
+    fit = rows.calibrate(state.fit.vehicle.plus(limit), state.fit.table.plus(*table))
+    state = replace(state, fit=fit, found=(found,))
+    left = without_idle_switches(rows, state, score_all(rows, state.fit))
+    assert ("regen_limit" in left.ids) is stays
+    assert left.fit.vehicle.has("regen_limit") is stays
 
 
 def test_gain_on_held_out_trips_is_that_of_the_better_prediction():
