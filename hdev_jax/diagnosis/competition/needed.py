@@ -151,15 +151,15 @@ def without_far(training: Training, state: State, declared: Calibration) -> Stat
 
 
 def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
-    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is in their span, is not
-    confirmed by cross-validation there, or is one of a class with one of them. The newest (not `old`) has been tested
-    already but for the last."""
+    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is not confirmed by
+    cross-validation there, or is one of a class with one of them. The newest (not `old`) has been tested already but
+    for the last."""
     if any(_doubles(evidence, state, f, g, settings) for g in state.found if g is not f):
         return 1.0
     if not old:
         return 0.0
     own = needed(evidence, state.fit, f)
-    stands = own.left > settings.absorbed and own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate)
+    stands = own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate)
     return own.p if stands else 1.0
 
 
