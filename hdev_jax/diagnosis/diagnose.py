@@ -59,8 +59,8 @@ def diagnose(
     tell: Tell = lambda _: None,
     checkpoint: Checkpoint = lambda _, compute: compute(),
 ) -> Outcome:
-    """What the declared vehicle lacks. Test trips are held out: nothing is chosen by them; at the end they confirm the
-    model or not.
+    """What the declared vehicle lacks. Test trips are held out: nothing is chosen by them, but at the end they may
+    contradict the model.
 
     **Arguments:** `library`, the candidates by id; `settings`, every number that decides; `seed` of placebos,
     resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
@@ -78,7 +78,7 @@ def diagnose(
     state = compete(training, problem.vehicle, problem.table, seed=seed, tell=tell, remember=remember)
 
     # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing;
-    #    the declared one where the held-out trips do not confirm them
+    #    the declared one where the held-out trips contradict them
     # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
     #    points, random intercepts of trips. While most of it is structure, no instrument is the cause
     tell("error before and after on the held-out test trips")
@@ -131,7 +131,7 @@ def _handed_out(
     problem: Problem, split: Split, training: Training, named: State, state: State | None, *, seed: int, tell: Tell,
     keep: Callable[[Callable[[], Any]], Any],
 ) -> _Model:  # fmt: skip
-    """The model with the named effects, or the declared one where the held-out trips do not confirm them. `state` holds
+    """The model with the named effects, or the declared one where the held-out trips contradict them. `state` holds
     the term without a name, where it is still to be described.
 
     Held-out trips know no states: effects with a search of their own (loads that switch, phases and modes by trip) are
@@ -142,8 +142,8 @@ def _handed_out(
     predicted = [problem.predict(fit.vehicle) for fit in steps]
     if named.found and not any(f.score.candidate.effect.searched for f in named.found):
         levels = training.clusters.kind == "trip"
-        if not held_out_gain(problem, split, predicted[0], predicted[-1], levels=levels) > 0.0:
-            tell("not confirmed on the held-out trips: nothing is named")
+        if not held_out_gain(problem, split, predicted[0], predicted[-1], levels=levels) > -settings.ahead:
+            tell("contradicted by the held-out trips: nothing is named")
             named, steps, predicted, state = none_named(named, steps[0]), steps[:1], predicted[:1], None
     given = given_states(problem, split, named, steps[-1], seed)
     explained = predicted[-1] if given is None else given.predicted

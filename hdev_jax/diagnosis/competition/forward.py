@@ -74,28 +74,29 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
 def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:
     """The leader, or the simplest of those that these rows cannot distinguish from it; and the ids of the class.
 
-    Where it is an instrument's fault, a cause in the vehicle or its mass that does about as well takes its place; where
-    it is the mass, the efficiency, if one number is declared for all of it.
+    Where one efficiency is declared for all of it, and the leader is a gain or a mass that a wrong efficiency looks
+    like, the efficiency that does about as well takes its place; or the mass that of a gain.
     """
-    one = round_.state.fit.vehicle.one_efficiency
 
     def asks(s: Score) -> tuple[int, int]:
         effect = s.candidate.effect
         return effect.instrument + (effect.stage == "sensors"), s.candidate.freedoms
 
-    def prior(s: Score) -> tuple[bool, bool, float]:
-        effect = s.candidate.effect
-        return effect.instrument, not (one and effect.of_efficiency), -round_.scores.worth(s)
+    def prior(s: Score) -> tuple[bool, bool]:
+        return s.candidate.effect.instrument, not s.candidate.effect.of_efficiency
 
     same = {able[0].candidate.id, *of_class(round_.asked(able[0]), inexact=0.0)}
     first = min((s for s in able if s.candidate.id in same), key=asks)
-    if first.candidate.effect.stage != "sensors":
+    library = round_.training.library.values()
+    looks_like = {id_ for c in library if c.of_efficiency for id_ in c.mistaken_for}
+    if not round_.state.fit.vehicle.one_efficiency or first.candidate.id not in looks_like or not asks(first)[0]:
         return first, same
-    members = of_class(round_.asked(first))
-    instead = [s for s in able if s.candidate.id in members]
-    if not first.candidate.effect.instrument:
-        instead = [s for s in instead if one and s.candidate.effect.of_efficiency]
-    return min((first, *instead), key=prior), same | {*members}
+    members = {*of_class(round_.asked(first))}
+    instead = [
+        s for s in able if s.candidate.id in members
+        and (s.candidate.effect.of_efficiency or (s.candidate.id in looks_like and asks(s)[0]))
+    ]  # fmt: skip
+    return min((first, *instead), key=prior), same | members
 
 
 def _refitted(round_: Round, s: Score) -> Refit | None:

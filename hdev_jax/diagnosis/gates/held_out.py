@@ -1,4 +1,4 @@
-"""The last gate: do the held-out trips confirm what was found?"""
+"""The last gate: do the held-out trips contradict what was found?"""
 
 from dataclasses import replace
 

@@ -60,7 +60,7 @@ SENTENCES = {
     Kind.PLACEBO: "a placebo ({how}) does as well",
     Kind.UNSTABLE: "comes first in only {percent:.0f} % of resampled sets of {unit}",
     Kind.SUPERFLUOUS: "not needed beside {beside}",
-    Kind.NOT_HELD_OUT: "not confirmed: the model with all that was found predicts the held-out trips no better",
+    Kind.NOT_HELD_OUT: "contradicted: the model with all that was found predicts the held-out trips worse",
     Kind.INSTRUMENT: "{percent:.0f} % of the remaining variance is structure, so no instrument's fault is named",
     Kind.FOUND: "found",
     Kind.DECLARED: "declared in the sheet",
