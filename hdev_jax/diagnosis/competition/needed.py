@@ -24,6 +24,8 @@ from hdev_jax.physics import unavailable
 
 __all__ = ["backward", "can_be_asked", "classes", "model_without", "needed", "without_far", "without_idle_switches"]
 
+CORRELATED = 0.5  # of two estimates, below which a class is not looked for: 80 % of the gain alike is 0.9
+
 
 @dataclass(frozen=True)
 class Without:
@@ -115,9 +117,14 @@ def without_idle_switches(training: Training, state: State, scores: Scores) -> S
     """The state without switches (a limit, a delay) that are not worth their numbers beside what was added later: a
     limit that is never reached any more. Only a refit can show it, so this is asked at the end."""
     for f in [f for f in state.found if not _has_columns(f) and not f.score.candidate.effect.searched]:
+        c, at = f.score.candidate, _places(state.fit, f)
+        if c.parameter(c.sizes[0]).smooth and np.any(
+            np.abs(state.fit.values[at]) > training.settings.stands * state.fit.errors[at]
+        ):
+            continue  # a delay that is clearly more than nothing needs no refit
         less = without(training, state, f.id)
         lost = gained(training, state.fit, scores) - gained(training, less.fit, scores)
-        if worth(lost, f.score.candidate, training.settings) <= 0.0:
+        if worth(lost, c, training.settings) <= 0.0:
             why = Rejection(Kind.SUPERFLUOUS, {"beside": "effects added later", "times": 2})
             state = replace(less, removed={**less.removed, f.id: why})
     return state
@@ -168,6 +175,8 @@ def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Set
     in the vehicle, else the one that explains less by itself."""
     if not (can_be_asked(f) and can_be_asked(g)) or f.score.plain or g.score.plain:
         return False
+    if not _correlated(state.fit, f, g):
+        return False
     w = model_without(evidence, state.fit, f, g)
     totals, (own, other) = w.evidence.totals(), w.each
     before = w.evidence.base_likelihood(totals)
@@ -175,6 +184,19 @@ def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Set
     if (own.effect.stage == "sensors", -mine) < (other.effect.stage == "sensors", -its):
         return False
     return other.id in alike(w.evidence, own, [other], mine, settings, plain=False, inexact=settings.inexact)
+
+
+def _places(fit: Calibration, f: Found) -> list[int]:
+    """Where the sizes of a found effect are among the free coefficients."""
+    paths = {f"effects.{f.id}.{n}" for n in f.score.candidate.sizes}
+    return [k for k, c in enumerate(fit.table.free) if c.path in paths]
+
+
+def _correlated(fit: Calibration, f: Found, g: Found) -> bool:
+    """Whether the estimates of two effects are correlated at all: those of one class are, for their columns are."""
+    sd = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
+    both = np.ix_(_places(fit, f), _places(fit, g))
+    return bool(np.any(np.abs(fit.covariance[both] / np.outer(sd, sd)[both]) > CORRELATED))
 
 
 def _tried(training: Training, state: State) -> int:
