@@ -6,7 +6,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TEXT = " ".join(README.split())
-REAL, PLANTED = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("real_logs.md", "planted_summary.md"))
+REAL, PLANTED, SIMULATORS = (
+    (ROOT / "docs" / name).read_text(encoding="utf-8")
+    for name in ("real_logs.md", "planted_summary.md", "simulators_quick.md")
+)
 
 
 def row(page: str, name: str) -> list[str]:
@@ -41,3 +44,13 @@ def test_shares_of_synthetic_logs_are_those_of_the_page():
     at = row(PLANTED, "name").index("false name")
     wrong, logs = sum(float(r[at]) * int(r[1]) for r in outside), sum(int(r[1]) for r in outside)
     assert f"a wrong one is named in {round(wrong)} of {logs}." in TEXT
+
+
+def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
+    _, n, right, false, blamed, *_ = row(SIMULATORS, "any change")
+    assert f"the change is named in {round(100 * float(right))} % of {n} logs" in TEXT
+    assert (
+        f"a false name stands in {round(100 * float(false))} %, in {round(100 * float(blamed))} % an instrument" in TEXT
+    )
+    _, _, _, lasso, *_ = row(SIMULATORS, "LassoCV")
+    assert f"LassoCV has a false name in {round(100 * float(lasso))} %" in TEXT
