@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from hdev_jax.physics import LIBRARY
+
 __all__ = ["FORMS", "INSTRUMENTS", "PAYLOAD", "PLANTS", "Plant"]
 
 PAYLOAD = "mass_scale"
 # effects that say that a channel is measured wrongly
-INSTRUMENTS = frozenset({
-    "accelerometer_bias", "grade_bias", "grade_lag", "grade_scale", "power_gain", "sampling_filter", "speed_scale",
-    "time_skew", "torque_offset",
-})  # fmt: skip
+INSTRUMENTS = frozenset(k for k, c in LIBRARY.items() if c.instrument)
 # The form of the efficiency, which both simulators have and a sheet of one number lacks; never false.
 # FASTSim: driving efficiency by load, regenerating efficiency constant. SUMO: one efficiency for each direction.
 FORMS: Mapping[str, frozenset[str]] = {

@@ -6,7 +6,7 @@ from typing import Any
 
 from experiments.simulators.plants import FORMS, INSTRUMENTS, PAYLOAD, PLANTS
 
-__all__ = ["MOST", "PLAUSIBLE", "blamed", "covered", "false", "implausible", "named", "right", "sized", "told"]
+__all__ = ["MOST", "PLAUSIBLE", "blamed", "covered", "false", "implausible", "moved", "named", "right", "sized"]
 
 NINETY = 1.645  # standard deviations of a normal distribution to each side that hold 90 %
 MOST = 3  # names of a class that still is an answer
@@ -46,7 +46,7 @@ def named(task: Mapping[str, Any], result: Result) -> bool:
     return any(_ids(e) & PLANTS[task["plant"]].names for e in result["named"])
 
 
-def told(task: Mapping[str, Any], result: Result) -> bool:
+def moved(task: Mapping[str, Any], result: Result) -> bool:
     """Whether a declared coefficient that may take the change says so: its 90 % interval is beyond the sheet's value
     on the right side, and where the truth is a number, it is nearer to that than to the sheet's."""
     plant = PLANTS[task["plant"]]
@@ -89,7 +89,7 @@ def right(task: Mapping[str, Any], result: Result) -> bool:
     if not plant.names and not plant.coefficients:
         form = any(_ids(e) & _forms(task) for e in result["named"])
         return not wrong and (form or result["unexplained"] or result["two_efficiencies"])
-    return named(task, result) or told(task, result)
+    return named(task, result) or moved(task, result)
 
 
 def sized(task: Mapping[str, Any], result: Result) -> dict[str, float] | None:

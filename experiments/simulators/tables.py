@@ -133,7 +133,7 @@ def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray]:
         for t, r in group:
             fine = PLANTS[plant].names
             said = {next(iter(fine & set(e["class"])), e["id"]) for e in r["named"]}
-            if scores.told(t, r):
+            if scores.moved(t, r):
                 said |= {k for k in PLANTS[plant].coefficients[:1] if not said & fine}
             for name in said or {"unexplained" if r["unexplained"] else "nothing"}:
                 row[name] = row.get(name, 0.0) + 100.0 / len(group)
@@ -158,10 +158,10 @@ def said_rows(results: Group) -> list[dict[str, Any]]:
     rows = []
     for t, r in results:
         names = [f"{' or '.join(e['class'])} ({_sizes(e)})" for e in r["named"]]
-        told = PLANTS[t["plant"]].coefficients[:1] if scores.told(t, r) else ()
+        moved = PLANTS[t["plant"]].coefficients[:1] if scores.moved(t, r) else ()
         rows.append({
             "log": f"{t['line']}, {t['vehicle']}, seed {t['seed']}", "changed": PLANTS[t["plant"]].words,
-            "said": "; ".join([*names, *(f"{k} moved" for k in told)]) or "nothing", "right": scores.right(t, r),
+            "said": "; ".join([*names, *(f"{k} moved" for k in moved)]) or "nothing", "right": scores.right(t, r),
             "unexplained": r["unexplained"],
             "before": r["test_rmse"]["before"], "after": r["test_rmse"]["after"], "refit": r["refit_rmse"],
         })  # fmt: skip

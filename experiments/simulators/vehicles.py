@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = ["Simulated", "Vehicle", "drawn", "headwind_force_n", "slope_with_force"]
+from hdev_jax.units import GRAVITY_MPS2
 
-GRAVITY_MPS2 = 9.80665
+__all__ = ["Simulated", "Vehicle", "drawn", "headwind_force_n", "slope_with_force"]
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What a simulator is told of a vehicle.
+    """The numbers of a vehicle that a simulator needs.
 
     `rotating_kg`: mass that the rotating parts add; `driving`, `regenerating`: constant efficiencies (of FASTSim, a
     factor on its transmission's, for both); `ratio`: motor revolutions to the wheel's; `recovered`: share of the

@@ -102,6 +102,10 @@ class Settings:
         0.2, "share by which forms of effects are inexact: effects that differ by less are one class", "1",
         "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
     )  # fmt: skip
+    correlated: float = _number(
+        0.5, "least correlation of two estimates for which a class among found effects is looked for", "1",
+        "time: of those that share 80 % of their gain it is 0.9",
+    )  # fmt: skip
     most_in_class: int = _number(2, "members of a class that are listed at most", "effects", "contract §4")
     wider_p: float = _number(
         1e-3, "p-value below which a size joins an effect that was found without it", "1", "as strict as `level`"

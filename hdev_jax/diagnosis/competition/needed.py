@@ -24,8 +24,6 @@ from hdev_jax.physics import unavailable
 
 __all__ = ["backward", "can_be_asked", "classes", "model_without", "needed", "without_far", "without_idle_switches"]
 
-CORRELATED = 0.5  # of two estimates, below which a class is not looked for: 80 % of the gain alike is 0.9
-
 
 @dataclass(frozen=True)
 class Without:
@@ -175,7 +173,7 @@ def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Set
     in the vehicle, else the one that explains less by itself."""
     if not (can_be_asked(f) and can_be_asked(g)) or f.score.plain or g.score.plain:
         return False
-    if not _correlated(state.fit, f, g):
+    if not _correlation(state.fit, f, g) > settings.correlated:
         return False
     w = model_without(evidence, state.fit, f, g)
     totals, (own, other) = w.evidence.totals(), w.each
@@ -192,11 +190,11 @@ def _places(fit: Calibration, f: Found) -> list[int]:
     return [k for k, c in enumerate(fit.table.free) if c.path in paths]
 
 
-def _correlated(fit: Calibration, f: Found, g: Found) -> bool:
-    """Whether the estimates of two effects are correlated at all: those of one class are, for their columns are."""
+def _correlation(fit: Calibration, f: Found, g: Found) -> float:
+    """The largest one between the sizes of two effects: those of one class are correlated, as their columns are."""
     sd = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
     both = np.ix_(_places(fit, f), _places(fit, g))
-    return bool(np.any(np.abs(fit.covariance[both] / np.outer(sd, sd)[both]) > CORRELATED))
+    return float(np.max(np.abs(fit.covariance[both] / np.outer(sd, sd)[both]), initial=0.0))
 
 
 def _tried(training: Training, state: State) -> int:

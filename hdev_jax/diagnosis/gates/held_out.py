@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.diagnosis.noise.noise import Noise, estimate_noise, whiten
+from hdev_jax.diagnosis.noise.noise import estimate_noise, log_likelihood_of_trip, whiten
 from hdev_jax.problem import Problem, Split
 from hdev_jax.segments import trip_slices
 
@@ -23,16 +23,8 @@ def held_out_gain(
     train, test = problem.rows(split.train), problem.rows(split.test)
     noise = estimate_noise((problem.measured - after)[train], trip[train], seconds[train], levels=levels)
     noise = replace(noise, trip_scale=np.ones(1))
-    return _log_likelihood((problem.measured - after)[test], noise, trip[test], seconds[test]) - _log_likelihood(
-        (problem.measured - before)[test], noise, trip[test], seconds[test]
-    )
-
-
-def _log_likelihood(residual: np.ndarray, noise: Noise, trip: np.ndarray, seconds: np.ndarray) -> float:
-    """Log-likelihood of a residual but for a constant, random intercepts of trips integrated out."""
-    z, one = whiten(residual[:, None], noise, trip, seconds).T
-    total = -0.5 * float(z @ z)
-    for _, rows in trip_slices(trip):
-        uz, uu = float(one[rows] @ z[rows]), float(one[rows] @ one[rows])
-        total += 0.5 * noise.level_sd**2 * uz**2 / (1.0 + noise.level_sd**2 * uu)
-    return total
+    both = problem.measured[test, None] - np.stack([before, after], axis=1)[test]
+    white = whiten(both, noise, trip[test], seconds[test])
+    each = [log_likelihood_of_trip(white[rows], noise.level_sd) for _, rows in trip_slices(trip[test])]
+    was, now = np.sum(each, axis=0)
+    return float(now - was)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from hdev_jax.segments import trip_slices
 
-__all__ = ["Noise", "estimate_noise", "whiten", "without_level"]
+__all__ = ["Noise", "estimate_noise", "log_likelihood_of_trip", "whiten", "without_level"]
 
 MAX_ORDER = 24
 PIECE = 2_048  # rows at a time: what a lag takes from them stays in the cache
@@ -229,6 +229,14 @@ def whiten(
             shrink = 1.0 - 1.0 / np.sqrt(1.0 + noise.block_sd**2 * square)
             out[b] -= (shrink / square) * np.outer(level, level @ out[b])
     return out
+
+
+def log_likelihood_of_trip(white: Float[np.ndarray, "row column"], level_sd: float) -> Float[np.ndarray, " residual"]:
+    """Of each of some whitened residuals of a trip, but for a constant, its random intercept integrated out; the last
+    column is that of an intercept of 1, as `whiten` returns it."""
+    left, level = white[:, :-1], white[:, -1]
+    shared = level_sd**2 * (level @ left) ** 2 / (1.0 + level_sd**2 * float(level @ level))
+    return -0.5 * (np.sum(left**2, axis=0) - shared)
 
 
 def without_level(

@@ -1,7 +1,5 @@
 """What drifts: a remainder with a memory, what it behaves like, how large it is and how long it lasts.
 
-A slope that the log lacks is a force as well, which changes within seconds: it is looked for in means over `HILL_S`.
-
 A load under a controller has no levels and no channel. Means over a minute have little of the rows' own noise. Where
 they are correlated from one minute to the next, their size says what they are: the same at standstill and at any speed
 (a load), in proportion to speed (a force) or to power (a gain). Its course and its energy in each trip are those of a
@@ -20,9 +18,9 @@ from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.states import course
 from hdev_jax.segments import starts_of_runs, trip_slices
 
-__all__ = ["HILL_S", "LIKE", "MINUTE_S", "Drift", "Slow", "drift_of"]
+__all__ = ["LIKE", "Drift", "Slow", "drift_of"]
 
-MINUTE_S, HILL_S = 60.0, 10.0
+MINUTE_S = 60.0
 LEAST_BLOCKS = 30
 LIKE = ("load", "force", "gain", "none")
 LONGEST = 60  # minutes between two means, at most

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
-from hdev_jax.diagnosis.remainder.drift import HILL_S, MINUTE_S, Drift, Slow, drift_of
+from hdev_jax.diagnosis.remainder.drift import Drift, Slow, drift_of
 from hdev_jax.diagnosis.remainder.learner import curve, learn, share_of
+from hdev_jax.diagnosis.remainder.missing import MissingSlope, missing_slope
 from hdev_jax.diagnosis.remainder.rows import features, side
 from hdev_jax.diagnosis.remainder.structure import (
     GROWS_AS,
@@ -24,7 +25,6 @@ from hdev_jax.diagnosis.remainder.structure import (
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.problem import Problem, Split
 from hdev_jax.targets import TARGETS, as_watts
-from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = ["Formula", "Remainder", "remainder"]
 
@@ -147,10 +147,7 @@ def remainder(
     drift, course, slope = _drift(problem, split, given, settings)
     if slope:
         sizes.append(slope.rms * float(np.sqrt(np.mean(train.residual**2))))
-        hills = (
-            f"a force that comes and goes as a slope of at least {100 * slope.sd:.1f} % (standard deviation) would make"
-        )
-        parts.insert(0, f"{hills}, or gusts: the log has no slope, which is the first thing to add")
+        parts.insert(0, slope.words)
     if drift.words:
         parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
@@ -168,16 +165,9 @@ def remainder(
     )  # fmt: skip
 
 
-class _Slope(NamedTuple):
-    """A slope that the log lacks: its standard deviation, and the RMS of its power over that of the residual."""
-
-    sd: float
-    rms: float
-
-
 def _drift(
     problem: Problem, split: Split, given: np.ndarray, settings: Settings
-) -> tuple[Drift, dict[str, Any] | None, _Slope | None]:
+) -> tuple[Drift, dict[str, Any] | None, MissingSlope | None]:
     """What is slow in the training rows' residual of a battery's target, its course in all trips, and the slope that it
     behaves like where the log has none; nothing of another target."""
     if not TARGETS[problem.target].of_battery:
@@ -185,19 +175,7 @@ def _drift(
     s = problem.segments
     seconds, trip, speed = np.asarray(s.duration_s), np.asarray(s.trip), np.asarray(s.speed_mps)
     residual, predicted = (as_watts(problem.target, x, seconds) for x in (problem.measured - given, given))
-
-    def over(mean_s: float) -> tuple[Slow, Drift]:
-        slow = Slow.of(residual, predicted, speed, seconds, trip, mean_s)
-        return slow, drift_of(slow.take(np.isin(slow.trip, split.train)), settings)
-
-    slow, drift = over(MINUTE_S)
-    slope = None
-    if problem.vehicle.entry == "road" and not s.has("grade_rad"):
-        force = drift if drift.like == "force" else over(HILL_S)[1]
-        rows = np.isin(trip, split.train)
-        share = force.sd**2 * float(np.mean(speed[rows] ** 2)) / max(float(np.mean(residual[rows] ** 2)), 1e-300)
-        if force.like == "force" and share > settings.least_share:
-            mass_kg = s.channels["mass_kg"] if s.has("mass_kg") else problem.vehicle.mass_kg
-            sd = force.sd / (GRAVITY_MPS2 * float(np.mean(np.asarray(mass_kg))))
-            slope = _Slope(sd, min(float(np.sqrt(share)), 1.0))
+    slow = Slow.of(residual, predicted, speed, seconds, trip)
+    drift = drift_of(slow.take(np.isin(slow.trip, split.train)), settings)
+    slope = missing_slope(problem, split, residual, predicted, drift, settings)
     return drift, drift.course(slow, problem.log.trip_names, split.test), slope

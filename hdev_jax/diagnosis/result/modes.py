@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
+from hdev_jax.diagnosis.noise.noise import estimate_noise, log_likelihood_of_trip, whiten
 from hdev_jax.inference import Calibration
 from hdev_jax.inference.states import probability_of_modes
 from hdev_jax.physics.battery import ModeChange
@@ -37,7 +37,7 @@ def mode_block(problem: Problem, fit: Calibration) -> dict[str, Any]:
     best = np.concatenate([residual[s, k] for s, k in zip(slices, nearer, strict=True)])
     noise = estimate_noise(best, trip, seconds, levels=True)
     white = whiten(residual, noise, trip, seconds)
-    fits = np.stack([_log_likelihood(white[s], noise.level_sd) for s in slices])
+    fits = np.stack([log_likelihood_of_trip(white[s], noise.level_sd) for s in slices])
     starts = np.array([problem.log.started_s.get(names[int(trip[s.start])], np.nan) for s in slices])
     vehicle = np.array([int(np.asarray(segments.vehicle)[s.start]) for s in slices])
     order = np.lexsort((starts, vehicle)) if np.all(np.isfinite(starts)) else np.argsort(vehicle, kind="stable")
@@ -52,13 +52,6 @@ def mode_block(problem: Problem, fit: Calibration) -> dict[str, Any]:
         if car == same and (x > 0.5) != (y > 0.5)
     ]
     return {"probability": {name: x for name, x, *_ in each}, "changes": changes}
-
-
-def _log_likelihood(white: np.ndarray, level_sd: float) -> np.ndarray:
-    """Of the whitened residuals of a trip, whose intercept is random: the last column is that of an intercept of 1."""
-    left, level = white[:, :-1], white[:, -1]
-    shared = level_sd**2 * (level @ left) ** 2 / (1.0 + level_sd**2 * float(level @ level))
-    return -0.5 * (np.sum(left**2, axis=0) - shared)
 
 
 def _iso(start: float) -> str | None:
