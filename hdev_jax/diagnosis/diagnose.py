@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
 from hdev_jax.diagnosis.competition.compete import compete, named_alone, no_instrument_named, none_named, rows_with
@@ -67,6 +69,20 @@ def diagnose(
 
     **Returns:** an `Outcome`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
     """
+    # Products of a few hundred rows: more threads than one only wait for each other, long where cores are shared
+    with _blas().limit(limits=1, user_api="blas"):
+        return _diagnosed(problem, split, library, settings, seed, tell, checkpoint)
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _diagnosed(
+    problem: Problem, split: Split, library: Mapping[str, type[Effect]], settings: Settings, seed: int, tell: Tell,
+    checkpoint: Checkpoint,
+) -> Outcome:  # fmt: skip
     # 1. The training rows, and the effects that could act on this target
     training, excluded = training_of(problem, split, library, settings)
 

@@ -104,14 +104,14 @@ class EfficiencyScale(Effect):
 class RegenEfficiency(Effect):
     """Of the braking energy another share is recovered than the sheet says: s·max(−P, 0) is lost.
 
-    With a regenerating efficiency that is estimated it is that one under another name. A machine brakes hardly better
-    than it drives.
+    A machine brakes hardly better than it drives.
     """
 
     id: ClassVar[str] = "regen_efficiency"
     label: ClassVar[str] = "efficiency of regeneration"
     stage: ClassVar[Stage] = "battery"
     of_efficiency: ClassVar[bool] = True
+    same_as: ClassVar[Names] = ("driveline.regenerating_efficiency", "machine.regenerating_efficiency")
     equation: ClassVar[str] = "s·max(−P, 0)"
     source: ClassVar[str] = "paper 2, eq. 7-9 (η_rg)"
     parameters: ClassVar[Parameters] = (Size("share", "1", 0.0, 0.1, -0.05, 1.0, least=0.005),)

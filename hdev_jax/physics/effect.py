@@ -157,6 +157,7 @@ class Effect(eqx.Module):
     order: ClassVar[int] = 0  # limits come after what they limit
     of_battery: ClassVar[bool] = False  # says nothing of a force or a torque
     goes_with: ClassVar[GoesWith] = ""
+    same_as: ClassVar[Names] = ()  # declared coefficients that it is another name of, where a sheet estimates them
     of_efficiency: ClassVar[bool] = False  # every drive has it, where a sheet declares one efficiency for all of it
     instrument: ClassVar[bool] = False  # a fault of a reading: said only where no cause in the vehicle does as well
     declared: ClassVar[Mapping[str, str]] = {}  # fields of a declared term with their keys in a sheet

@@ -144,10 +144,11 @@ class Shape(Parameter):
 class Choice(Parameter):
     """A shape that is only ever one of its `grid`; without a grid the log or a search of its own says which.
 
-    Its null may be NaN: not known until it is chosen.
+    Its null may be NaN: not known until it is chosen. `of` as a shape's.
     """
 
     grid: Sequence[float] | np.ndarray = field(default=(), kw_only=True)
+    of: str = field(default="", kw_only=True)
     _may_be_unknown: ClassVar[bool] = True
 
 

@@ -12,7 +12,7 @@ from hdev_jax.segments import trip_slices
 __all__ = ["Noise", "estimate_noise", "log_likelihood_of_trip", "whiten", "without_level"]
 
 MAX_ORDER = 24
-PIECE = 2_048  # rows at a time: what a lag takes from them stays in the cache
+PIECE = 64  # rows at a time: one product of small matrices in place of a pass for each lag
 BLOCK_S = 600.0
 BLOCK_VARIANCES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the residual's own
 LEVEL_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.85)
@@ -65,13 +65,6 @@ def _levinson(acov: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
         phi[k, k - 1] = reflection
         var[k] = var[k - 1] * (1 - reflection**2)
     return phi, np.sqrt(np.maximum(var, 1e-300))
-
-
-def _positions(trip: np.ndarray) -> np.ndarray:
-    position = np.arange(len(trip))
-    for _, s in trip_slices(trip):
-        position[s] -= s.start
-    return position
 
 
 def _blocks(trip: np.ndarray, duration_s: np.ndarray) -> list[slice]:
@@ -136,14 +129,17 @@ def estimate_noise(
         tried += [(0.0, colour + between), *([(between, colour)] if levels else [])]
 
     best: tuple[float, Noise] | None = None
+    falls, last = 0, -np.inf
     for share, rest in tried:
-        if rest[0] <= 1e-12:
+        # over the shares of the grid the likelihood has one maximum: once it has fallen twice it falls on
+        if rest[0] <= 1e-12 or (falls == 2 and share in LEVEL_SHARES):
             continue
         phi, sd = _levinson(rest, order)
         aic = len(residual) * 2 * np.log(sd) + 2 * np.arange(order + 1)
         keep = max(1, int(np.argmin(aic)))
         noise = Noise(phi[: keep + 1, :keep], sd[: keep + 1] * common, float(np.sqrt(share)) * common, np.ones(1), 0.0)
         loglik = _log_likelihood(noise, residual, trip, slices) - keep
+        falls, last = (falls + 1 if loglik < last else 0), loglik
         if best is None or loglik > best[0] + (2.0 if share > 0 and best[1].level_sd == 0 else 0.0):
             best = (loglik, noise)
     assert best is not None
@@ -192,18 +188,22 @@ def _filtered(
     columns: Float[np.ndarray, "row k"], noise: Noise, trip: Int[np.ndarray, " row"]
 ) -> Float[np.ndarray, "row k+1"]:
     """Columns, and a level of 1, less what the rows before predict of them, over the prediction's sd."""
-    n, order = len(columns), noise.order
-    plain, at = np.column_stack([columns, np.ones(n)]), np.minimum(_positions(trip), order)
+    order, plain = noise.order, np.column_stack([columns, np.ones(len(columns))])
     out = np.empty_like(plain)
-    for start in range(0, n, PIECE):
-        stop = min(start + PIECE, n)
-        # rows too early in their trip have a zero coefficient here, so nothing leaks from the trip before
-        phi, left = noise.coefficients[at[start:stop]], plain[start:stop].copy()
-        for lag in range(1, min(order, stop - 1) + 1):
-            low = max(start - lag, 0)
-            rows = stop - lag - low
-            left[-rows:] -= phi[-rows:, lag - 1 : lag] * plain[low : stop - lag]
-        out[start:stop] = left / noise.scales[at[start:stop], None]
+    # what a row keeps of those before it, as a matrix: of a trip's first rows, and of `PIECE` rows after others
+    first, last = np.eye(order), np.r_[-noise.coefficients[order][::-1], 1.0] / noise.scales[order]
+    for k in range(order):
+        first[k, :k] = -noise.coefficients[k, :k][::-1]
+    first /= noise.scales[:order, None]
+    later = np.zeros((PIECE, PIECE + order))
+    for k in range(PIECE):
+        later[k, k : k + order + 1] = last
+    for _, s in trip_slices(trip):
+        begun = min(s.start + order, s.stop)
+        out[s.start : begun] = first[: begun - s.start, : begun - s.start] @ plain[s.start : begun]
+        for at in range(begun, s.stop, PIECE):
+            rows = min(PIECE, s.stop - at)
+            np.matmul(later[:rows, : rows + order], plain[at - order : at + rows], out=out[at : at + rows])
     return out
 
 

@@ -5,11 +5,9 @@ Gram matrices add up over rows, so a chunk of whole trips is evaluated, whitened
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from threadpoolctl import ThreadpoolController
 
 from hdev_jax.diagnosis.candidates.candidate import Source
 from hdev_jax.diagnosis.noise.noise import Noise, whiten
@@ -56,11 +54,6 @@ class Baseline:
         return whiten(rows, self.noise.after(chunk.first_trip), chunk.trip, chunk.seconds)[: chunk.rows]
 
 
-@cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
 class Sums:
     """Gram matrices by cluster of rows [Jacobian | candidates | residual], and their products with intercepts of trips.
 
@@ -75,10 +68,8 @@ class Sums:
 
     def add(self, rows: Float[np.ndarray, "row k"], clusters: Int[np.ndarray, " row"]) -> None:
         """Add rows, `clusters` being the cluster of each."""
-        # products of a few hundred rows: more threads than one only wait for each other, long where cores are shared
-        with _blas().limit(limits=1, user_api="blas"):
-            for g, part in trip_slices(clusters):
-                self.grams[g] += rows[part].T @ rows[part]
+        for g, part in trip_slices(clusters):
+            self.grams[g] += rows[part].T @ rows[part]
 
     def add_levels(
         self, rows: Float[np.ndarray, "row k"], level: Float[np.ndarray, " row"], clusters: Int[np.ndarray, " row"],

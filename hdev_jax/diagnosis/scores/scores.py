@@ -253,13 +253,18 @@ def _absorption(
     """Which candidates lie in the span of the fitted coefficients, and of which one mostly.
 
     Of an effect with several sizes one may: a gain, though not the offset beside it. A coefficient may have absorbed
-    that effect too, which by its other ways can still be found.
+    that effect too, which by its other ways can still be found. An effect that is a coefficient under another name
+    (`Effect.same_as`) is in it whatever the rows say: what distinguishes them is the model's error.
     """
     names = [c.name for c in table.free]
     absorbs: dict[str, list[str]] = {n: [] for n in names}
     by: dict[str, str] = {}
     if not names:
         return absorbs, by
+    for id_, s in best.items():
+        if same := [c.name for c in table.free if c.path in s.candidate.effect.same_as]:
+            absorbs[same[0]].append(id_)
+            by[id_] = same[0]
     plainest = [c for c in candidates if c.kind == "size" and c.id in best and c.freedoms == len(c.columns) == 1]
     for c in [*(s.candidate for s in best.values() if s.left <= settings.absorbed), *plainest]:
         left, weights = min((white.span(k) for k in c.columns), key=lambda x: x[0])

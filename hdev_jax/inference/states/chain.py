@@ -47,19 +47,19 @@ def smooth(moves: Pairs, fits: Pairs) -> Smoothed:
     """States of chains by filter and smoother.
 
     **Arguments:** `moves[t]`, chance of each state after row t given the one before (of a first row every line is the
-    chance of its states); `fits[t]`, log-likelihood of row t for each pair of states before and after it.
+    chance of its states); `fits[t]`, likelihood of row t for each pair of states before and after it.
     """
     chains, states = fits.shape[1:3]
     # what needs no other row is done for all rows at once
-    top = jnp.max(fits, axis=(-2, -1), keepdims=True)
-    likely = moves * jnp.exp(fits - top)
+    top = jnp.max(fits, axis=(-2, -1), keepdims=True) + TINY
+    likely = moves * (fits / top)
     begin = jnp.full((chains, states), 1.0 / states, fits.dtype)
     _, (filtered, norm) = jax.lax.scan(_forward, begin, likely, unroll=UNROLL)
     _, later = jax.lax.scan(_backward, jnp.ones_like(begin), likely, reverse=True, unroll=UNROLL)
     before = jnp.concatenate([begin[None], filtered[:-1]])[..., None]
     pairs = before * likely * later[..., None, :]
     pairs = pairs / (jnp.sum(pairs, axis=(-2, -1), keepdims=True) + TINY)
-    total = jnp.sum(jnp.log(norm) + top[..., 0, 0], axis=0)
+    total = jnp.sum(jnp.log(norm) + jnp.log(top[..., 0, 0]), axis=0)
     return Smoothed(jnp.sum(before * moves, axis=2), filtered, pairs, total)
 
 
@@ -77,7 +77,7 @@ def draw(
         weight = own * jnp.take_along_axis(into, state[:, None, None], axis=-1)[:, :, 0]
         total = jnp.cumsum(weight, axis=-1)
         drawn = jnp.minimum(jnp.sum(u[:, None] * total[:, -1:] > total, axis=-1), states - 1)
-        return (drawn, move * jnp.exp(fit - jnp.max(fit, axis=(-2, -1), keepdims=True))), drawn
+        return (drawn, move * (fit / (jnp.max(fit, axis=(-2, -1), keepdims=True) + TINY))), drawn
 
     # the last row is followed by none: every state leads on alike
     begin = (jnp.zeros(chains, int), jnp.ones((chains, states, states), filtered.dtype))

@@ -23,6 +23,7 @@ from hdev_jax.physics.states import COVARIATES, KNOTS_C
 __all__ = ["chances", "contrasts", "what_it_depends_on"]
 
 SHRINK = 0.5  # precision of a knot's log-odds about the mean of all: as of 5 minutes of a load with a minute's memory
+STEPS = 3  # of the coefficients in a round of expectation-maximisation, which comes back to them
 FURTHEST = 8.0  # log-odds beyond which a share is 0 or 1 in any log
 KNOTS = len(KNOTS_C)
 FIRST = 1 + KNOTS  # place of the first covariate, after the memory and the knots
@@ -73,8 +74,8 @@ class _Moves:
         each = self.moved[:, :, 1] / chance.on - self.moved[:, :, 0] / (1.0 - chance.on)
         return np.einsum("rb,rbk->rk", each, chance.slopes)
 
-    def fitted(self, columns: Sequence[int]) -> _Fitted:
-        """The values that suit the moves best."""
+    def fitted(self, columns: Sequence[int], steps: int = 100) -> _Fitted:
+        """The values that suit the moves best, or better than the present ones after so many `steps`."""
 
         def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
             chance, pull = self._chance(theta, columns), PULL @ theta[:FIRST]
@@ -84,9 +85,10 @@ class _Moves:
             return 0.5 * float(theta[:FIRST] @ pull) - float(total), -slope
 
         memory = (np.log(LEAST_MEMORY_S), np.log(MOST_MEMORY_S))
+        odds = [(-FURTHEST, FURTHEST)] * KNOTS + [(-2.0 * FURTHEST, 2.0 * FURTHEST)] * len(columns)
         found = optimize.minimize(
-            cost, np.r_[self.start, self.by[list(columns)]], jac=True, method="L-BFGS-B",
-            bounds=[memory] + [(-FURTHEST, FURTHEST)] * KNOTS + [(-2.0 * FURTHEST, 2.0 * FURTHEST)] * len(columns),
+            cost, np.r_[self.start, self.by[list(columns)]], jac=True, method="L-BFGS-B", bounds=[memory, *odds],
+            options={"maxiter": steps},
         )  # fmt: skip
         return _Fitted(np.asarray(found.x), -float(found.fun))
 
@@ -123,7 +125,7 @@ def chances(model: Switching, rows: StateRows, decoded: Decoded) -> Switching:
     covariates; those are as they were for the others."""
     for k in np.flatnonzero(np.any(model.by, axis=1)).tolist():
         moves, columns = _Moves(model, rows, decoded, k), np.flatnonzero(model.by[k]).tolist()
-        model = moves.put(model, k, moves.fitted(columns), columns)
+        model = moves.put(model, k, moves.fitted(columns, STEPS), columns)
     return model
 
 

@@ -26,7 +26,8 @@ def probability_of_modes(
     contiguous and in the order in which they were driven.
     """
     first = np.r_[True, np.diff(vehicle) != 0]
-    fits = jnp.asarray(np.broadcast_to(log_likelihood[:, None, None, :], (len(first), 1, 2, 2)))
+    likelihood = np.exp(log_likelihood - log_likelihood.max(axis=1, keepdims=True))
+    fits = jnp.asarray(np.broadcast_to(likelihood[:, None, None, :], (len(first), 1, 2, 2)))
     change, share = np.full((2, 2), 0.5), np.full(2, 0.5)
     pairs = np.zeros((len(first), 2, 2))
     for _ in range(ROUNDS):
