@@ -155,7 +155,7 @@ def _laid(model: Switching, rows: StateRows) -> tuple[Lanes, _Levels, _Laid]:
     kept, scale = (f(model, rows, lanes.starts) for f in (kept_errors, scales))
     columns = (rows.residual_w, kept, scale, keep, model.expected(rows), first, np.ones(len(first)))
     fills = (0.0, 0.0, 1.0, 1.0, 0.5, 0.0, 0.0)
-    laid = _Laid(*(lanes.spread(c, fill) for c, fill in zip(columns, fills, strict=True)))
+    laid = _Laid(*(jnp.asarray(lanes.spread(c, fill)) for c, fill in zip(columns, fills, strict=True)))
     level = model.base_w + model.on @ model.power_w
     numbers = (
         np.asarray(x, dtype=float)
