@@ -157,10 +157,8 @@ def _laid(model: Switching, rows: StateRows) -> tuple[Lanes, _Levels, _Laid]:
     fills = (0.0, 0.0, 1.0, 1.0, 0.5, 0.0, 0.0)
     laid = _Laid(*(jnp.asarray(lanes.spread(c, fill)) for c, fill in zip(columns, fills, strict=True)))
     level = model.base_w + model.on @ model.power_w
-    numbers = (
-        np.asarray(x, dtype=float)
-        for x in (level, model.on, model.freedom, np.exp(log_t(0.0, model.freedom)), rows.partly)
-    )
+    top = np.exp(log_t(0.0, model.freedom))
+    numbers = [jnp.asarray(np.asarray(x, dtype=float)) for x in (level, model.on, model.freedom, top, rows.partly)]
     return lanes, _Levels(*numbers), laid
 
 
