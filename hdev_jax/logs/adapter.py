@@ -97,7 +97,8 @@ class Adapter:
     that the file has, or is a step [s]; `dbc` the databases of CAN frames. `others` (keep or drop) says what becomes of
     columns without a rule: a table's are kept, signals of a bus are dropped.
     `rows` keeps the rows where that column was measured; `charging` says whether charging at standstill is cut;
-    `repeated_stamps = "spread"` spreads rows of one time stamp over the time to the next.
+    `repeated_stamps = "spread"` spreads rows of one time stamp over the time to the next; `stamp` says where in its
+    time a row's stamp is: in the middle of a sample, at the end or at the start of a mean.
     """
 
     where: str = "adapter"
@@ -115,6 +116,7 @@ class Adapter:
     edge_trim_s: float = 0.0
     time_zone: str | None = None
     repeated_stamps: str = "drop"
+    stamp: str = "middle"
     rows: str | None = None
     charging: str = "cut"
     others: str | None = None
@@ -147,6 +149,7 @@ class Adapter:
             "edge_trim_s": not_negative,
             "time_zone": _zone,
             "repeated_stamps": one_of(("drop", "spread")),
+            "stamp": one_of(("middle", "end", "start")),
             "rows": text,
             "charging": one_of(("cut", "keep")),
             "others": one_of(("keep", "drop")),

@@ -21,6 +21,7 @@ from hdev_jax.logs.repair import repair
 from hdev_jax.logs.rows.charging import without_charging
 from hdev_jax.logs.rows.checked import check_rows
 from hdev_jax.logs.rows.gathered import Rows, concatenate
+from hdev_jax.logs.rows.stamps import as_means, noted_stamps
 from hdev_jax.logs.rows.trips import split_trips
 from hdev_jax.segments import Segments
 from hdev_jax.units import accepted
@@ -102,6 +103,12 @@ def _assembled(raws: Sequence[Raw], rules: Adapter, ledger: Ledger, files: tuple
             rows = replace(rows, data=left, ledger=rows.ledger.add("noted", "no value in any row, absent", column=c))
     rows = without_charging(check_rows(rows, sampled, measured), sampled, rules.charging == "keep")
     rows = split_trips(rows, rules.edge_trim_s, sampled)
+    if sampled and rules.stamp != "middle":
+        if "time_s" not in rows.data:
+            raise InputError(f"{rows.name}: stamp = '{rules.stamp}' needs time_s; the log has durations alone")
+        rows, sampled = as_means(rows, rules.stamp), False
+    elif sampled:
+        rows = noted_stamps(rows)
     columns = _columns(pieces)
     return _log(rows, sampled, measured, columns, files)
 
