@@ -8,10 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["Column", "Ids", "Segments", "starts_of_runs", "trip_slices"]
+__all__ = ["GRADE_SD", "Column", "Ids", "Segments", "starts_of_runs", "trip_slices"]
 
 Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
 Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
+GRADE_SD = "grade_sd_rad"
+"""Channel with the standard deviation of `grade_rad`, where that matters: no cause, and offered as none."""
 
 
 class Segments(eqx.Module):

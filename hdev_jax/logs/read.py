@@ -11,9 +11,9 @@ from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
-from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
+from hdev_jax.logs.instruments import Slope, instruments_of, slope_of
+from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
-from hdev_jax.logs.limits import MAX_GRADE_RAD
 from hdev_jax.logs.log import MEASURED, Log
 from hdev_jax.logs.presets import PRESETS, preset
 from hdev_jax.logs.readers import Raw, find_files, read_raw
@@ -22,7 +22,7 @@ from hdev_jax.logs.rows.charging import without_charging
 from hdev_jax.logs.rows.checked import check_rows
 from hdev_jax.logs.rows.gathered import Rows, concatenate
 from hdev_jax.logs.rows.trips import split_trips
-from hdev_jax.segments import Segments
+from hdev_jax.segments import GRADE_SD, Segments
 from hdev_jax.units import accepted
 
 __all__ = ["log_from_frame", "read_log"]
@@ -170,17 +170,8 @@ def _log(
     if soc is not None and soc.max() > 1.5:  # a share cannot be: this is per cent
         channels["soc"] = soc / 100.0
         ledger = ledger.add("noted", f"up to {soc.max():.4g}, read as per cent", column="soc")
-    if "grade_rad" not in channels and "altitude_m" in channels:
-        channels["grade_rad"] = grade_from_altitude(trip, distance, channels["altitude_m"])
-        ledger = ledger.add("derived", f"from altitude_m over {SLOPE_WINDOW_M:g} m of the way", column="grade_rad")
-        if (steep := np.abs(channels["grade_rad"]) > MAX_GRADE_RAD).any():
-            why = f"steeper than {MAX_GRADE_RAD:g} rad where altitude_m jumps: taken as missing"
-            ledger = ledger.add("noted", why, count=int(steep.sum()), column="grade_rad")
-            gaps = {"grade_rad": np.where(steep, np.nan, channels["grade_rad"])}
-            filled, ledger = repair(gaps, trip, time, ledger)
-            channels = {k: v for k, v in channels.items() if k != "grade_rad"} | filled
-    elif "grade_rad" not in channels:
-        ledger = ledger.add("noted", "neither slope nor altitude in the log: taken as level", column="grade_rad")
+    channels, slope, ledger = _with_slope(channels, data, trip, distance, duration, ledger)
+    read = {c: data[c] for c in ("speed_mps", *measured, *channels) if c in data}
     segments = Segments(
         trip=trip.astype(np.int32),
         vehicle=rows.vehicle.astype(np.int32),
@@ -201,7 +192,34 @@ def _log(
         sampled=sampled,
         files=files,
         started_s=_started(rows) if "time_s" in data else {},
+        instruments=instruments_of(read, slope),
     )
+
+
+def _with_slope(
+    channels: dict[str, Any], data: Mapping[str, np.ndarray], trip: np.ndarray, distance: np.ndarray,
+    duration: np.ndarray, ledger: Ledger,
+) -> tuple[dict[str, Any], tuple[str, Slope] | None, Ledger]:  # fmt: skip
+    """The channels with the slope from altitudes, or smoothed where it was logged with noise, and its standard
+    deviation where that matters."""
+    source = next((c for c in ("grade_rad", "altitude_m") if c in channels), None)
+    if source is None:
+        level = "neither slope nor altitude in the log: taken as level"
+        return channels, None, ledger.add("noted", level, column="grade_rad")
+    slope = slope_of(trip, distance, duration, data[source], of_slope=source == "grade_rad")
+    if slope is None:
+        if source == "altitude_m":
+            channels = {**channels, "grade_rad": np.zeros(len(trip))}
+        return channels, None, ledger
+    made = {"grade_rad": slope.grade_rad, **({GRADE_SD: slope.sd_rad} if slope.noisy else {})}
+    (told,) = instruments_of({}, (source, slope))
+    how = f"from {source}" if source == "altitude_m" else "smoothed"
+    ledger = ledger.add("derived", f"{how} ({told.line()})", column="grade_rad")
+    if slope.jumps:
+        ledger = ledger.add(
+            "noted", f"{source} jumps: the slope begins anew there", count=slope.jumps, column="grade_rad"
+        )
+    return {**channels, **made}, (source, slope), ledger
 
 
 def _started(rows: Rows) -> dict[str, float]:

@@ -13,7 +13,7 @@ from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.physics.parameter import as_array
 from hdev_jax.physics.road import mean_square_speed, weight_on_road
-from hdev_jax.segments import Segments
+from hdev_jax.segments import GRADE_SD, Segments
 from hdev_jax.targets import Target, target_of
 from hdev_jax.units import AIR_DENSITY_KGPM3, J_PER_WH
 
@@ -201,7 +201,17 @@ class Vehicle(eqx.Module):
         for e in self.effects:
             segments = e.across(e.derive(segments))
         segments = jax.tree.map(jnp.asarray, segments)
-        return jax.vmap(lambda row: of(self._chain(self._sensed(row)), row))(segments)
+
+        def column(row: Segments) -> Any:
+            return of(self._chain(self._sensed(row)), row)
+
+        if self.entry != "road" or not segments.has("grade_rad", GRADE_SD):
+            return jax.vmap(column)(segments)
+        # The expectation over what the slope may be, by the two points that have its mean and variance: where power
+        # changes its sign, the chain bends, and an error of the slope costs energy on average.
+        grade, sd = (segments.channels[k] for k in ("grade_rad", GRADE_SD))
+        sides = [jax.vmap(column)(segments.with_channels(grade_rad=grade + e)) for e in (sd, -sd)]
+        return jax.tree.map(lambda a, b: 0.5 * (a + b), *sides)
 
     def _observed(self, column: Array, segments: Segments) -> Array:
         for e in self.effects:
