@@ -11,7 +11,7 @@ from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
-from hdev_jax.logs.instruments import Slope, instruments_of, slope_of
+from hdev_jax.logs.instruments import Slope, instruments_of, slope_of, speed_of
 from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import MEASURED, Log
@@ -146,9 +146,9 @@ def _columns(pieces: list[Piece]) -> tuple[ColumnInfo, ...]:
 def _log(
     rows: Rows, sampled: bool, measured: list[str], columns: tuple[ColumnInfo, ...], files: tuple[str, ...]
 ) -> Log:
-    data, trip = rows.data, rows.trip
+    rows, read = _with_speed(rows, sampled), rows.data
+    data, trip, ledger = rows.data, rows.trip, rows.ledger
     time, duration, v_start, v_end = _intervals(rows, sampled)
-    ledger = rows.ledger
     mean = 0.5 * (v_start + v_end)
     speed = data.get("speed_mps", mean)
     made = np.where(np.isfinite(speed), speed, mean) * duration
@@ -171,7 +171,6 @@ def _log(
         channels["soc"] = soc / 100.0
         ledger = ledger.add("noted", f"up to {soc.max():.4g}, read as per cent", column="soc")
     channels, slope, ledger = _with_slope(channels, data, trip, distance, duration, ledger)
-    read = {c: data[c] for c in ("speed_mps", *measured, *channels) if c in data}
     segments = Segments(
         trip=trip.astype(np.int32),
         vehicle=rows.vehicle.astype(np.int32),
@@ -192,8 +191,21 @@ def _log(
         sampled=sampled,
         files=files,
         started_s=_started(rows) if "time_s" in data else {},
-        instruments=instruments_of(read, slope),
+        instruments=instruments_of({c: read[c] for c in ("speed_mps", *measured, *channels) if c in read}, slope),
     )
+
+
+def _with_speed(rows: Rows, sampled: bool) -> Rows:
+    """Speeds of samples that are read in coarse steps, smoothed."""
+    if not (sampled and "time_s" in rows.data):
+        return rows
+    if (found := speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])) is None:
+        return rows
+    speed, step = found
+    changed = int(np.sum(speed != rows.data["speed_mps"]))
+    why = f"read in steps of {3.6 * step:.2g} km/h: smoothed, by at most half a step"
+    ledger = rows.ledger.add("derived", why, count=changed, column="speed_mps")
+    return replace(rows, data={**rows.data, "speed_mps": speed}, ledger=ledger)
 
 
 def _with_slope(

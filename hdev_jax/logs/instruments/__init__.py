@@ -2,6 +2,7 @@
 
 from hdev_jax.logs.instruments.instrument import Instrument, instruments_of
 from hdev_jax.logs.instruments.slope import Slope, slope_of
+from hdev_jax.logs.instruments.speed import speed_of
 from hdev_jax.logs.instruments.steps import step_of
 
-__all__ = ["Instrument", "Slope", "instruments_of", "slope_of", "step_of"]
+__all__ = ["Instrument", "Slope", "instruments_of", "slope_of", "speed_of", "step_of"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from hdev_jax.logs.instruments.smoother import Course, course_of, lanes_of, smoothed
+from hdev_jax.logs.instruments.smoother import HEIGHT, SLOPE, Course, course_of, lanes_of, smoothed
 from hdev_jax.logs.instruments.steps import step_of
 from hdev_jax.logs.limits import MAX_GRADE_RAD
 
@@ -63,12 +63,12 @@ def slope_of(
     if of_slope and not _rough(trip[first], height, readings, np.add.reduceat(distance_m, first)):
         return None
     broken = np.zeros(len(first), bool) if of_slope else _jumps(trip[first], at, height, readings)
-    lanes = lanes_of(
-        np.cumsum(broken | new_trip[first]), at, mean(clock, every), height, readings.astype(float), of_slope=of_slope
-    )
+    kind = SLOPE if of_slope else HEIGHT
+    part = np.cumsum(broken | new_trip[first])
+    lanes = lanes_of(part, at, mean(clock, every), height, readings.astype(float), kind=kind)
     step = step_of(z[there])
-    course = course_of(lanes, of_slope=of_slope, least=max(step / np.sqrt(12.0), 1e-5 if of_slope else 1e-3))
-    slope, sd = smoothed(lanes, course, of_slope=of_slope)
+    course = course_of(lanes, kind, least=max(step / np.sqrt(12.0), 1e-5 if of_slope else 1e-3))
+    slope, sd = smoothed(lanes, course, kind)
     run = np.cumsum(new_trip) - 1.0
     apart = float(middle[-1]) + 1.0  # trips on one line, further apart than any is long
     place, places = middle + apart * run, at + apart * run[first]

@@ -15,20 +15,38 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
-__all__ = ["Course", "Lanes", "course_of", "lanes_of", "smoothed"]
+__all__ = ["DRIVE", "HEIGHT", "SLOPE", "Course", "Kind", "Lanes", "course_of", "lanes_of", "smoothed"]
 
 LANE = 256  # cells that are filtered together; a lane more costs less than a longer one
 MARGIN = 64  # cells at a lane's ends that are another's: several spans of smoothing
 BATCH = 32  # lanes at a time
 SOME = 8  # lanes whose likelihood is maximised: 2,000 cells of 20 m tell five numbers to a tenth
 UNKNOWN_M = 1e3  # standard deviation of a trip's first height about its first reading
-ROAD, FACTOR = (0.02, 150.0), 2.0  # sd of roads' slopes, length [m] of their hills; each within a factor of two
-SHORT_M = 60.0  # least length: what bends faster is no road, whose vertical curves are longer than 30 m or so
+FACTOR = 2.0  # that the typical values of a kind may be off by: the sd of a log-normal prior
 DRIFTS = 5.0  # log-likelihood that the two numbers of a drift have to gain: ln n of some hundred readings
 _LEAST = 1e-12  # of a variance: readings without noise are met
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What is read, the level or its slope; its `typical` standard deviation of slope and length, and the least length;
+    whether the readings may have noise beyond their step, and drift."""
+
+    of_slope: bool
+    typical: tuple[float, float]
+    shortest: float
+    noisy: bool = True
+    drifts: bool = False
+
+
+# Roads: slopes of 2 %, hills of 150 m or so; what bends within less than 60 m is none, as vertical curves are longer.
+HEIGHT = Kind(False, (0.02, 150.0), 60.0, drifts=True)
+SLOPE = Kind(True, (0.02, 150.0), 60.0)
+# Speeds over time: accelerations of 0.5 m/s² that change within seconds, a pedal within half of one; only in steps.
+DRIVE = Kind(False, (0.5, 4.0), 0.5, noisy=False)
 
 
 @dataclass(frozen=True)
@@ -44,7 +62,8 @@ class Course:
 
 class Lanes(NamedTuple):
     """Cells side by side `[lane, cell]`: steps of distance and time from the cell before, readings (means of `count`
-    independent ones; 0: none there). `at` is the cell's index, `mine` whether the lane answers for it."""
+    independent ones; 0: none there) above the lane's `origin`. `at` is the cell's index, `mine` whether the lane
+    answers for it."""
 
     step_m: np.ndarray
     step_s: np.ndarray
@@ -52,11 +71,12 @@ class Lanes(NamedTuple):
     count: np.ndarray
     at: np.ndarray
     mine: np.ndarray
+    origin: np.ndarray
 
 
 def lanes_of(
     trip: np.ndarray, place_m: np.ndarray, time_s: np.ndarray, reading: np.ndarray, count: np.ndarray, *,
-    of_slope: bool,
+    kind: Kind,
 ) -> Lanes:  # fmt: skip
     """Cells of all trips cut into overlapping lanes of one length; heights less each lane's first one."""
     at, mine = [], []
@@ -74,12 +94,12 @@ def lanes_of(
     again = np.diff(index, axis=1, prepend=index[:, :1] - 1) == 0
     z, n = reading[index], np.where(again, 0.0, count[index])
     first = np.argmax(n > 0, axis=1)
-    origin = 0.0 if of_slope else np.take_along_axis(z, first[:, None], axis=1)
+    origin = np.zeros((len(z), 1)) if kind.of_slope else np.take_along_axis(z, first[:, None], axis=1)
     step_m, step_s = (np.diff(x[index], axis=1, prepend=x[index[:, :1]]) for x in (place_m, time_s))
-    return Lanes(step_m, step_s, np.where(n > 0, z - origin, 0.0), n, index, own)
+    return Lanes(step_m, step_s, np.where(n > 0, z - origin, 0.0), n, index, own, origin)
 
 
-def course_of(lanes: Lanes, *, of_slope: bool, least: float) -> Course:
+def course_of(lanes: Lanes, kind: Kind, *, least: float) -> Course:
     """The numbers of greatest likelihood; `least` is the white noise that readings in steps have at least.
 
     A drift is there where it pays, and only of heights: of slopes it could not be told from the road.
@@ -91,12 +111,13 @@ def course_of(lanes: Lanes, *, of_slope: bool, least: float) -> Course:
     scale = max(float(np.median(steps)) if len(steps) else 0.0, least)
 
     def course(x: np.ndarray) -> Course:
-        slope, length, white, *drift = (float(v) for v in np.exp(np.clip(x, -60.0, 20.0)))
-        return Course(slope, max(length, SHORT_M), float(np.hypot(white, least)), *drift)
+        slope, length, *errors = (float(v) for v in np.exp(np.clip(x, -60.0, 20.0)))
+        white, *drift = errors or (0.0,)
+        return Course(slope, max(length, kind.shortest), float(np.hypot(white, least)), *drift)
 
     def cost(x: np.ndarray) -> float:
-        prior = 0.5 * float(np.sum(((x[:2] - np.log(ROAD)) / np.log(FACTOR)) ** 2))
-        value = prior - float(_called(_likelihood, cells, course(x), of_slope)[0])
+        prior = 0.5 * float(np.sum(((x[:2] - np.log(kind.typical)) / np.log(FACTOR)) ** 2))
+        value = prior - float(_called(_likelihood, cells, course(x), kind)[0])
         return value if np.isfinite(value) else 1e300
 
     def lowest(starts: list[np.ndarray]) -> Any:
@@ -105,21 +126,26 @@ def course_of(lanes: Lanes, *, of_slope: bool, least: float) -> Course:
         options = {"xatol": 0.1, "fatol": 0.2, "maxfev": 150, "initial_simplex": simplex}
         return minimize(cost, first, method="Nelder-Mead", options=options)
 
-    white = lowest([np.log([0.02, ell, s * scale]) for ell in (50.0, 200.0) for s in (0.03, 0.3, 1.0)])
-    if of_slope:
-        return course(white.x)
-    tried = [np.r_[white.x, np.log([s * scale, tau])] for s in (1.0, 4.0) for tau in (20.0, 120.0)]
-    drifting = lowest(tried)
-    return course(drifting.x if drifting.fun < white.fun - DRIFTS else white.x)
+    sd, length = kind.typical
+    whites = [[s * scale] for s in (0.03, 0.3, 1.0)] if kind.noisy else [[]]
+    found = lowest([np.log([sd, part * length, *w]) for part in (0.4, 1.3) for w in whites])
+    if kind.drifts:
+        tried = [np.r_[found.x, np.log([s * scale, tau])] for s in (1.0, 4.0) for tau in (20.0, 120.0)]
+        drifting = lowest(tried)
+        found = drifting if drifting.fun < found.fun - DRIFTS else found
+    return course(found.x)
 
 
-def smoothed(lanes: Lanes, course: Course, *, of_slope: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Posterior mean and standard deviation of the slope in every cell `[cell]`, as tan θ is of heights over metres."""
+def smoothed(
+    lanes: Lanes, course: Course, kind: Kind, *, level: bool = False
+) -> tuple[Float[np.ndarray, " cell"], Float[np.ndarray, " cell"]]:
+    """Posterior mean and standard deviation of the slope in every cell, as tan θ is of heights over metres; or of the
+    level."""
     mean, var = (np.concatenate(x)[: len(lanes.at)] for x in zip(
-        *(_called(_slopes, batch, course, of_slope) for batch in _batches(lanes, BATCH)), strict=True))  # fmt: skip
+        *(_called(_states, batch, course, kind, level) for batch in _batches(lanes, BATCH)), strict=True))  # fmt: skip
     cells = int(lanes.at.max()) + 1
     out, sd = np.empty(cells), np.empty(cells)
-    out[lanes.at[lanes.mine]] = mean[lanes.mine]
+    out[lanes.at[lanes.mine]] = (mean + (lanes.origin if level else 0.0))[lanes.mine]
     sd[lanes.at[lanes.mine]] = np.sqrt(np.maximum(var[lanes.mine], 0.0))
     return out, sd
 
@@ -133,12 +159,15 @@ def _batches(lanes: Lanes, size: int) -> list[tuple[np.ndarray, ...]]:
     return out
 
 
-def _called(program: Any, cells: tuple[np.ndarray, ...], course: Course, of_slope: bool) -> list[np.ndarray]:
+def _called(
+    program: Any, cells: tuple[np.ndarray, ...], course: Course, kind: Kind, level: bool = False
+) -> list[np.ndarray]:
     """A program of a batch, in double precision whatever the caller computes in."""
     with jax.enable_x64(True):
         numbers = jnp.asarray([course.slope, course.length_m, course.white, course.drift, course.drift_s])
-        sees = jnp.asarray([0.0, 1.0, 0.0, 0.0, 0.0] if of_slope else [1.0, 0.0, 0.0, 1.0, 0.0])
-        return [np.asarray(x) for x in program(tuple(map(jnp.asarray, cells)), numbers, sees)]
+        sees = jnp.asarray([0.0, 1.0, 0.0, 0.0, 0.0] if kind.of_slope else [1.0, 0.0, 0.0, 1.0, 0.0])
+        wants = jnp.asarray([1.0, 0.0, 0.0, 0.0, 0.0] if level else [0.0, 1.0, 0.0, 0.0, 0.0])
+        return [np.asarray(x) for x in program(tuple(map(jnp.asarray, cells)), numbers, sees, wants)]
 
 
 def _smooth_course(sd: Array, scale: Array, step: Array) -> tuple[Array, Array]:
@@ -230,14 +259,14 @@ def _forward(cells: Any, course: Array, sees: Array, keep: bool) -> Any:
 
 
 @jax.jit
-def _likelihood(cells: Any, course: Array, sees: Array) -> tuple[Array]:
+def _likelihood(cells: Any, course: Array, sees: Array, _: Array) -> tuple[Array]:
     """The log-likelihood of a batch, but for a constant."""
     return (jnp.sum(_forward(cells, course, sees, keep=False)),)
 
 
 @jax.jit
-def _slopes(cells: Any, course: Array, sees: Array) -> tuple[Array, Array]:
-    """The slope's posterior means and variances `[lane, cell]`."""
+def _states(cells: Any, course: Array, sees: Array, wants: Array) -> tuple[Array, Array]:
+    """Posterior means and variances `[lane, cell]` of what is wanted of the state."""
 
     def step(carry: Any, cell: _Cell) -> Any:
         r, n = carry  # what later cells say, as it acts on this one
@@ -245,11 +274,11 @@ def _slopes(cells: Any, course: Array, sees: Array) -> tuple[Array, Array]:
         left = jnp.eye(5)[None] - cell.gain[:, :, None] * sees[None, None]
         r = sees[None] * (cell.miss * told)[:, None] + jnp.einsum("lji,lj->li", left, r)
         n = jnp.outer(sees, sees)[None] * told[:, None, None] + jnp.swapaxes(left, -1, -2) @ n @ left
-        towards = cell.cov[:, 1]
-        slope = cell.mean[:, 1] + jnp.einsum("lj,lj->l", towards, r)
-        spread = cell.cov[:, 1, 1] - jnp.einsum("li,lij,lj->l", towards, n, towards)
+        towards = cell.cov @ wants
+        mean = cell.mean @ wants + jnp.einsum("lj,lj->l", towards, r)
+        spread = towards @ wants - jnp.einsum("li,lij,lj->l", towards, n, towards)
         r, n = jnp.einsum("lji,lj->li", cell.move, r), jnp.swapaxes(cell.move, -1, -2) @ n @ cell.move
-        return (r, n), (slope, spread)
+        return (r, n), (mean, spread)
 
     lanes = cells[0].shape[0]
     end = jnp.zeros((lanes, 5)), jnp.zeros((lanes, 5, 5))
