@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike, Bool, Float
 from scipy.optimize import nnls
 
 from hdev_jax.physics import Vehicle
-from hdev_jax.segments import Segments
+from hdev_jax.segments import GRADE_SD, Segments
 
 __all__ = ["INSTRUMENTS", "believed", "row_noise", "shapes"]
 
@@ -52,7 +52,7 @@ def believed(
     slope = np.asarray(log.get("grade_rad", np.zeros(len(log))))
     for name, read in (("grade_rad", slope), ("speed_mps", log.speed_end_mps - log.speed_start_mps)):
         sd = float(instruments[INSTRUMENTS.index(name)])
-        if sd == 0.0:
+        if sd == 0.0 or (name == "grade_rad" and log.has(GRADE_SD)):  # the kernel takes that error's expectation itself
             sides.append([0.0])
             continue
         moving = read[moves]
