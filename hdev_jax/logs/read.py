@@ -22,7 +22,7 @@ from hdev_jax.logs.rows.charging import without_charging
 from hdev_jax.logs.rows.checked import check_rows
 from hdev_jax.logs.rows.gathered import Rows, concatenate
 from hdev_jax.logs.rows.trips import split_trips
-from hdev_jax.segments import GRADE_SD, Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 from hdev_jax.units import accepted
 
 __all__ = ["log_from_frame", "read_log"]
@@ -201,11 +201,11 @@ def _with_speed(rows: Rows, sampled: bool) -> Rows:
         return rows
     if (found := speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])) is None:
         return rows
-    speed, step = found
+    speed, sd, step = found
     changed = int(np.sum(speed != rows.data["speed_mps"]))
     why = f"read in steps of {3.6 * step:.2g} km/h: smoothed, by at most half a step"
     ledger = rows.ledger.add("derived", why, count=changed, column="speed_mps")
-    return replace(rows, data={**rows.data, "speed_mps": speed}, ledger=ledger)
+    return replace(rows, data={**rows.data, "speed_mps": speed, ACCEL_SD: sd}, ledger=ledger)
 
 
 def _with_slope(

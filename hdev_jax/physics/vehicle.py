@@ -13,9 +13,9 @@ from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.physics.parameter import as_array
 from hdev_jax.physics.road import mean_square_speed, weight_on_road
-from hdev_jax.segments import GRADE_SD, Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, READING_ERRORS, Segments
 from hdev_jax.targets import Target, target_of
-from hdev_jax.units import AIR_DENSITY_KGPM3, J_PER_WH
+from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2, J_PER_WH
 
 __all__ = ["Entry", "Vehicle", "coefficients_that_hold"]
 
@@ -205,11 +205,13 @@ class Vehicle(eqx.Module):
         def column(row: Segments) -> Any:
             return of(self._chain(self._sensed(row)), row)
 
-        if self.entry != "road" or not segments.has("grade_rad", GRADE_SD):
+        if self.entry != "road" or not any(segments.has(k) for k in READING_ERRORS):
             return jax.vmap(column)(segments)
-        # The expectation over what the slope may be, by the two points that have its mean and variance: where power
-        # changes its sign, the chain bends, and an error of the slope costs energy on average.
-        grade, sd = (segments.channels[k] for k in ("grade_rad", GRADE_SD))
+        # The expectation over what slope and acceleration may be, by the two points that have the mean and variance of
+        # their force: where power changes its sign the chain bends, and such an error costs energy on average.
+        level = jnp.zeros_like(segments.duration_s)
+        sd = jnp.hypot(segments.get(GRADE_SD, level), segments.get(ACCEL_SD, level) / GRAVITY_MPS2)
+        grade = segments.get("grade_rad", level)
         sides = [jax.vmap(column)(segments.with_channels(grade_rad=grade + e)) for e in (sd, -sd)]
         return jax.tree.map(lambda a, b: 0.5 * (a + b), *sides)
 

@@ -135,7 +135,7 @@ def test_speed_in_steps_is_smoothed_within_half_a_step(tmp_path):
     frame = road(standing=False)
     true = frame.speed_mps.to_numpy()
     read_ = np.round(true * 3.6) / 3.6
-    speed, step = speed_of(np.repeat(np.arange(3), ROWS // 3), frame.time_s.to_numpy(), read_) or (read_, 0.0)
+    speed, _, step = speed_of(np.repeat(np.arange(3), ROWS // 3), frame.time_s.to_numpy(), read_) or (read_, read_, 0.0)
     assert step == pytest.approx(1 / 3.6)
     assert np.abs(speed - read_).max() <= 0.5 * step + 1e-12
     inner = np.arange(ROWS)[1:-1] % (ROWS // 3)

@@ -12,8 +12,9 @@ __all__ = ["speed_of"]
 
 def speed_of(
     trip: Int[np.ndarray, " row"], time_s: Float[np.ndarray, " row"], reading: Float[np.ndarray, " row"]
-) -> tuple[Float[np.ndarray, " row"], float] | None:
-    """Speeds [m/s] of samples as what is read in steps tells of them, none further off than half a step; and the step.
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"], float] | None:
+    """Speeds [m/s] of samples as what is read in steps tells of them, none further off than half a step; the standard
+    deviation of their acceleration [m/s²]; the step [m/s].
 
     A speed in steps of 1 km/h, read each second, has accelerations of 0.06 m/s² that are none: an inertia of a truck's
     5 kN. A reading of 0 is standing. **Returns:** None where there is no step, or too small a one to matter.
@@ -29,4 +30,4 @@ def speed_of(
     lanes = lanes_of(trip, time_s, time_s, reading, np.ones(len(trip)), kind=DRIVE)
     course = course_of(lanes, DRIVE, least=step / np.sqrt(12.0))
     speed = np.clip(smoothed(lanes, course, DRIVE, level=True)[0], reading - 0.5 * step, reading + 0.5 * step)
-    return np.where(reading > 0, np.maximum(speed, 0.0), 0.0), step
+    return np.where(reading > 0, np.maximum(speed, 0.0), 0.0), smoothed(lanes, course, DRIVE)[1], step
