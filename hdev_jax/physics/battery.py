@@ -64,7 +64,8 @@ class VoltageDependence(Effect):
     equation: ClassVar[str] = "P·k·(V − V₀)"
     source: ClassVar[str] = "inverter efficiency against DC voltage"
     needs: ClassVar[Names] = ("voltage_v",)
-    lacks: ClassVar[Names] = READING_ERRORS  # the voltage sags with the power: it would tell what such readings do not
+    lacks: ClassVar[Names] = READING_ERRORS
+    instead: ClassVar[str] = "slope or speed are read with errors, and the voltage that sags tells what they leave open"
     parameters: ClassVar[Parameters] = (
         # an inverter's efficiency moves by a few percent over 100 V
         Size("per_v", "1/V", 0.0, 5e-4, -5e-3, 5e-3, least=1e-6, label="per volt"),
