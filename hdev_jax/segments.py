@@ -8,10 +8,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["Column", "Ids", "Segments", "starts_of_runs", "trip_slices"]
+__all__ = ["ACCEL_SD", "GRADE_SD", "READING_ERRORS", "Column", "Ids", "Segments", "starts_of_runs", "trip_slices"]
 
 Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
 Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
+GRADE_SD, ACCEL_SD = "grade_sd_rad", "accel_sd_mps2"
+READING_ERRORS = (GRADE_SD, ACCEL_SD)
+"""Channels with the standard deviations of the slope and of the acceleration by speeds, where they matter: no cause of
+anything, and offered as none."""
 
 
 class Segments(eqx.Module):

@@ -58,6 +58,10 @@ class Settings:
         0.25, "share of a size by ordinary least squares that generalised least squares must not exclude", "1",
         "chosen on seeds 1-99",
     )  # fmt: skip
+    beyond_readings: float = _number(
+        0.02, "least share of the error's variance that an effect explains where slope or speed have known errors",
+        "1", "as `least_share`: 1 % of the error",
+    )  # fmt: skip
     placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
     placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
     shifts: int = _number(

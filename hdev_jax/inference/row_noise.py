@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike, Bool, Float
 from scipy.optimize import nnls
 
 from hdev_jax.physics import Vehicle
-from hdev_jax.segments import Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 
 __all__ = ["INSTRUMENTS", "believed", "row_noise", "shapes"]
 
@@ -52,7 +52,8 @@ def believed(
     slope = np.asarray(log.get("grade_rad", np.zeros(len(log))))
     for name, read in (("grade_rad", slope), ("speed_mps", log.speed_end_mps - log.speed_start_mps)):
         sd = float(instruments[INSTRUMENTS.index(name)])
-        if sd == 0.0:
+        known = {"grade_rad": GRADE_SD, "speed_mps": ACCEL_SD}[name]
+        if sd == 0.0 or log.has(known):  # the kernel takes the expectation over that error itself
             sides.append([0.0])
             continue
         moving = read[moves]

@@ -1,13 +1,12 @@
-"""Rows to intervals: gaps, samples that stand for tᵢ ± dt/2, slope from altitude. By trip, without a loop over rows."""
+"""Rows to intervals: gaps, samples that stand for tᵢ ± dt/2. By trip, without a loop over rows."""
 
 import numpy as np
 
 from hdev_jax.logs.limits import GAP_SAMPLES
 
-__all__ = ["SLOPE_WINDOW_M", "gaps", "grade_from_altitude", "sample_intervals", "starts", "trip_median"]
+__all__ = ["gaps", "sample_intervals", "starts", "trip_median"]
 
 END_SAMPLES = 5  # the noise of a slope at the end of a parabola through 3 is 2.6 σ/dt, through 5 it is 1.1 σ/dt
-SLOPE_WINDOW_M = 100.0  # barometers and GNSS resolve a metre or so: over 100 m that is 1 % of slope
 
 
 def starts(trip: np.ndarray) -> np.ndarray:
@@ -92,47 +91,3 @@ def _one_sided(at: np.ndarray, to: int, trip: np.ndarray, step: np.ndarray, spee
             powers = np.vander(t, min(len(rows), 3), increasing=True)
             out[k] = np.linalg.lstsq(powers, speed[rows], rcond=None)[0][1]
     return out
-
-
-def grade_from_altitude(
-    trip: np.ndarray, distance_m: np.ndarray, altitude_m: np.ndarray, window_m: float = SLOPE_WINDOW_M
-) -> np.ndarray:
-    """Slope [rad]: at each row the line of least squares through the altitudes within half a window along the way.
-
-    A row weighs what it covers of the way, so that standing still says nothing. Rows longer than the window look at
-    their neighbours. Altitude belongs to the middle of a row.
-    """
-    n = len(trip)
-    edges = np.flatnonzero(starts(trip))
-    sizes = np.diff(np.r_[edges, n])
-    run = np.repeat(np.arange(len(edges)), sizes)
-    end = np.cumsum(distance_m)
-    middle = end - 0.5 * distance_m
-    origin = np.repeat((end - distance_m)[edges], sizes)
-    s = middle - origin
-    z = altitude_m - np.repeat(np.add.reduceat(altitude_m, edges) / sizes, sizes)
-    w = np.maximum(distance_m, 0.0)
-    moving = w[w > 0]
-    half = max(window_m / 2.0, 1.5 * float(np.median(moving)) if len(moving) else 0.0)
-    # one increasing coordinate over all trips, far enough apart that no window reaches into the next
-    span = float(s.max(initial=0.0)) + 4.0 * half
-    place = s + run * span
-    low = np.searchsorted(place, place - half, "left")
-    high = np.searchsorted(place, place + half, "right")
-    centre = s - np.repeat(s[edges + sizes // 2], sizes)
-
-    def window(values: np.ndarray) -> np.ndarray:
-        total = np.r_[0.0, np.cumsum(values)]
-        return total[high] - total[low]
-
-    w0, ws, wz = window(w), window(w * centre), window(w * z)
-    wss, wsz = window(w * centre**2), window(w * centre * z)
-    safe = np.where(w0 > 0, w0, 1.0)
-    spread = wss - ws**2 / safe
-    cross = wsz - ws * wz / safe
-    # less spread than a tenth of the window's own says nothing about a slope: standing at the end of a trip
-    enough = spread > 0.01 * w0 * half**2 / 3.0
-    tangent = np.where(enough, cross / np.where(enough, spread, 1.0), np.nan)
-    from hdev_jax.logs.repair import fill_nearest
-
-    return np.arctan(np.nan_to_num(fill_nearest(tangent, run), nan=0.0))

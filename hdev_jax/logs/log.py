@@ -10,6 +10,7 @@ import numpy as np
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import near
 from hdev_jax.logs.columns import ColumnInfo
+from hdev_jax.logs.instruments import Instrument
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS
@@ -28,7 +29,8 @@ class Log:
     (`battery_power_w`, `energy_wh`); `trip_names[trip[i]]` and `vehicle_names[segments.vehicle[i]]` name row i;
     `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from; `part`,
     where one trip is split into several: the part that each row is in, in the place of its trip among the names;
-    `started_s`, when trips began, in seconds since 1970 by the log's clock, of those whose clock has a date.
+    `started_s`, when trips began, in seconds since 1970 by the log's clock, of those whose clock has a date;
+    `instruments`, noise and steps of what was read.
     """
 
     segments: Segments
@@ -41,6 +43,7 @@ class Log:
     files: tuple[str, ...] = ()
     part: np.ndarray | None = None
     started_s: Mapping[str, float] = field(default_factory=dict)
+    instruments: tuple[Instrument, ...] = ()
 
     @classmethod
     def from_frame(cls, frame: Any, *, name: str = "frame", adapter: Any = None) -> "Log":

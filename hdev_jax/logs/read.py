@@ -11,9 +11,9 @@ from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
-from hdev_jax.logs.intervals import SLOPE_WINDOW_M, grade_from_altitude, sample_intervals, starts, trip_median
+from hdev_jax.logs.instruments import Slope, instruments_of, slope_of, speed_of
+from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
-from hdev_jax.logs.limits import MAX_GRADE_RAD
 from hdev_jax.logs.log import MEASURED, Log
 from hdev_jax.logs.presets import PRESETS, preset
 from hdev_jax.logs.readers import Raw, find_files, read_raw
@@ -23,7 +23,7 @@ from hdev_jax.logs.rows.checked import check_rows
 from hdev_jax.logs.rows.gathered import Rows, concatenate
 from hdev_jax.logs.rows.stamps import as_means, noted_stamps
 from hdev_jax.logs.rows.trips import split_trips
-from hdev_jax.segments import Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 from hdev_jax.units import accepted
 
 __all__ = ["log_from_frame", "read_log"]
@@ -153,9 +153,9 @@ def _columns(pieces: list[Piece]) -> tuple[ColumnInfo, ...]:
 def _log(
     rows: Rows, sampled: bool, measured: list[str], columns: tuple[ColumnInfo, ...], files: tuple[str, ...]
 ) -> Log:
-    data, trip = rows.data, rows.trip
+    rows, read = _with_speed(rows, sampled), rows.data
+    data, trip, ledger = rows.data, rows.trip, rows.ledger
     time, duration, v_start, v_end = _intervals(rows, sampled)
-    ledger = rows.ledger
     mean = 0.5 * (v_start + v_end)
     speed = data.get("speed_mps", mean)
     made = np.where(np.isfinite(speed), speed, mean) * duration
@@ -177,17 +177,7 @@ def _log(
     if soc is not None and soc.max() > 1.5:  # a share cannot be: this is per cent
         channels["soc"] = soc / 100.0
         ledger = ledger.add("noted", f"up to {soc.max():.4g}, read as per cent", column="soc")
-    if "grade_rad" not in channels and "altitude_m" in channels:
-        channels["grade_rad"] = grade_from_altitude(trip, distance, channels["altitude_m"])
-        ledger = ledger.add("derived", f"from altitude_m over {SLOPE_WINDOW_M:g} m of the way", column="grade_rad")
-        if (steep := np.abs(channels["grade_rad"]) > MAX_GRADE_RAD).any():
-            why = f"steeper than {MAX_GRADE_RAD:g} rad where altitude_m jumps: taken as missing"
-            ledger = ledger.add("noted", why, count=int(steep.sum()), column="grade_rad")
-            gaps = {"grade_rad": np.where(steep, np.nan, channels["grade_rad"])}
-            filled, ledger = repair(gaps, trip, time, ledger)
-            channels = {k: v for k, v in channels.items() if k != "grade_rad"} | filled
-    elif "grade_rad" not in channels:
-        ledger = ledger.add("noted", "neither slope nor altitude in the log: taken as level", column="grade_rad")
+    channels, slope, ledger = _with_slope(channels, data, trip, distance, duration, ledger)
     segments = Segments(
         trip=trip.astype(np.int32),
         vehicle=rows.vehicle.astype(np.int32),
@@ -208,7 +198,47 @@ def _log(
         sampled=sampled,
         files=files,
         started_s=_started(rows) if "time_s" in data else {},
+        instruments=instruments_of({c: read[c] for c in ("speed_mps", *measured, *channels) if c in read}, slope),
     )
+
+
+def _with_speed(rows: Rows, sampled: bool) -> Rows:
+    """Speeds of samples that are read in coarse steps, smoothed."""
+    if not (sampled and "time_s" in rows.data):
+        return rows
+    if (found := speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])) is None:
+        return rows
+    speed, sd, step = found
+    changed = int(np.sum(speed != rows.data["speed_mps"]))
+    why = f"read in steps of {3.6 * step:.2g} km/h: smoothed, by at most half a step"
+    ledger = rows.ledger.add("derived", why, count=changed, column="speed_mps")
+    return replace(rows, data={**rows.data, "speed_mps": speed, ACCEL_SD: sd}, ledger=ledger)
+
+
+def _with_slope(
+    channels: dict[str, Any], data: Mapping[str, np.ndarray], trip: np.ndarray, distance: np.ndarray,
+    duration: np.ndarray, ledger: Ledger,
+) -> tuple[dict[str, Any], tuple[str, Slope] | None, Ledger]:  # fmt: skip
+    """The channels with the slope from altitudes, or smoothed where it was logged with noise, and its standard
+    deviation where that matters."""
+    source = next((c for c in ("grade_rad", "altitude_m") if c in channels), None)
+    if source is None:
+        level = "neither slope nor altitude in the log: taken as level"
+        return channels, None, ledger.add("noted", level, column="grade_rad")
+    slope = slope_of(trip, distance, duration, data[source], of_slope=source == "grade_rad")
+    if slope is None:
+        if source == "altitude_m":
+            channels = {**channels, "grade_rad": np.zeros(len(trip))}
+        return channels, None, ledger
+    made = {"grade_rad": slope.grade_rad, **({GRADE_SD: slope.sd_rad} if slope.noisy else {})}
+    (told,) = instruments_of({}, (source, slope))
+    how = f"from {source}" if source == "altitude_m" else "smoothed"
+    ledger = ledger.add("derived", f"{how} ({told.line()})", column="grade_rad")
+    if slope.jumps:
+        ledger = ledger.add(
+            "noted", f"{source} jumps: the slope begins anew there", count=slope.jumps, column="grade_rad"
+        )
+    return {**channels, **made}, (source, slope), ledger
 
 
 def _started(rows: Rows) -> dict[str, float]:

@@ -10,7 +10,7 @@ from hdev_jax.logs.intervals import starts
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import Log
 from hdev_jax.logs.repair import CIRCULAR
-from hdev_jax.segments import Segments
+from hdev_jax.segments import GRADE_SD, Segments
 from hdev_jax.units import unit_of
 
 __all__ = ["HALT_S", "by_distance"]
@@ -18,7 +18,7 @@ __all__ = ["HALT_S", "by_distance"]
 HALT_S = 10.0  # a bus stop or a red light; shorter is stop-and-go, a part of driving the stretch
 # What a metre of road has or costs: m·g·sinθ·Δs, force·Δs. Torque is a force at the shaft.
 _OF_THE_ROAD = (
-    "grade_rad", "altitude_m", "curvature_1pm", "wet_road", "mass_kg", "traction_force_n", "motor_torque_nm",
+    "grade_rad", GRADE_SD, "altitude_m", "curvature_1pm", "wet_road", "mass_kg", "traction_force_n", "motor_torque_nm",
 )  # fmt: skip
 _STATES = ("gear", "road_surface")  # kinds, which have no mean
 _ROUNDING = 1e-6  # of a length: ten samples of 10 m are 100 m, whatever their sum is in binary

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
 from hdev_jax.physics.parameter import Choice, Shape, Size, Switch
+from hdev_jax.segments import READING_ERRORS
 from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = [
@@ -63,6 +64,8 @@ class VoltageDependence(Effect):
     equation: ClassVar[str] = "P·k·(V − V₀)"
     source: ClassVar[str] = "inverter efficiency against DC voltage"
     needs: ClassVar[Names] = ("voltage_v",)
+    lacks: ClassVar[Names] = READING_ERRORS
+    instead: ClassVar[str] = "slope or speed are read with errors, and the voltage that sags tells what they leave open"
     parameters: ClassVar[Parameters] = (
         # an inverter's efficiency moves by a few percent over 100 V
         Size("per_v", "1/V", 0.0, 5e-4, -5e-3, 5e-3, least=1e-6, label="per volt"),

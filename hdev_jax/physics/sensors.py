@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from hdev_jax.physics.across import later_slope, low_pass, neighbours, shifted
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Row, Signal, Stage
 from hdev_jax.physics.parameter import Choice, Size, Switch
-from hdev_jax.segments import Segments
+from hdev_jax.segments import ACCEL_SD, Segments
 
 __all__ = [
     "AccelerometerBias",
@@ -238,6 +238,8 @@ class SamplingFilter(Effect):
     instrument: ClassVar[bool] = True
     equation: ClassVar[str] = "P → P + Σ cⱼ·(P₋ⱼ − 2P + P₊ⱼ), or τ·dP/dt + P"
     source: ClassVar[str] = "Proakis and Manolakis, Digital Signal Processing (symmetric FIR; first-order lag)"
+    lacks: ClassVar[Names] = (ACCEL_SD,)
+    instead: ClassVar[str] = "the speeds are read in coarse steps and were smoothed, which is a filter by itself"
     parameters: ClassVar[Parameters] = (
         Size("tap_1", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),
         Size("tap_2", "1", 0.0, 0.1, -1.0, 1.0, least=0.002),

@@ -13,9 +13,9 @@ from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.physics.parameter import as_array
 from hdev_jax.physics.road import mean_square_speed, weight_on_road
-from hdev_jax.segments import Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, READING_ERRORS, Segments
 from hdev_jax.targets import Target, target_of
-from hdev_jax.units import AIR_DENSITY_KGPM3, J_PER_WH
+from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2, J_PER_WH
 
 __all__ = ["Entry", "Vehicle", "coefficients_that_hold"]
 
@@ -201,7 +201,19 @@ class Vehicle(eqx.Module):
         for e in self.effects:
             segments = e.across(e.derive(segments))
         segments = jax.tree.map(jnp.asarray, segments)
-        return jax.vmap(lambda row: of(self._chain(self._sensed(row)), row))(segments)
+
+        def column(row: Segments) -> Any:
+            return of(self._chain(self._sensed(row)), row)
+
+        if self.entry != "road" or not any(segments.has(k) for k in READING_ERRORS):
+            return jax.vmap(column)(segments)
+        # The expectation over what slope and acceleration may be, by the two points that have the mean and variance of
+        # their force: where power changes its sign the chain bends, and such an error costs energy on average.
+        level = jnp.zeros_like(segments.duration_s)
+        sd = jnp.hypot(segments.get(GRADE_SD, level), segments.get(ACCEL_SD, level) / GRAVITY_MPS2)
+        grade = segments.get("grade_rad", level)
+        sides = [jax.vmap(column)(segments.with_channels(grade_rad=grade + e)) for e in (sd, -sd)]
+        return jax.tree.map(lambda a, b: 0.5 * (a + b), *sides)
 
     def _observed(self, column: Array, segments: Segments) -> Array:
         for e in self.effects:

@@ -1,5 +1,6 @@
 """A problem: a log, a sheet and a target brought together, its split into training and test trips, its errors."""
 
+from hdev_jax.problem.harm import without_harmful_slope
 from hdev_jax.problem.metrics import metrics, sum_weight
 from hdev_jax.problem.plausible import implausible
 from hdev_jax.problem.problem import Problem, derivable, prepare
@@ -15,4 +16,5 @@ __all__ = [
     "prepare",
     "split_trips",
     "sum_weight",
+    "without_harmful_slope",
 ]

@@ -95,7 +95,7 @@ def _others(problem: Problem) -> Iterator[_Other]:
     if not any(c.name == "distance_m" for c in log.columns):  # beside a distance the unit of speed shows by itself
         speeds = [c.name for c in log.columns if c.name in ("speed_mps", "speed_start_mps")][:1]
         yield from (_Other(n, unit, k) for n in speeds for unit, k in alternatives(log, n).items())
-    if any(c.name == "grade_rad" for c in log.columns):
+    if problem.segments.has("grade_rad") and any(c.name == "grade_rad" for c in log.columns):
         yield from (_Other("grade_rad", unit, k) for unit, k in alternatives(log, "grade_rad").items())
         yield _Other("grade_rad", "with the other sign", -1.0)
 

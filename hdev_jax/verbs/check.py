@@ -44,6 +44,8 @@ def check(
         per = f"{kwh / km:8.3f}" if km > 0.05 and energy is not None else f"{'-':>8s}"
         total = f"{kwh:9.3f}" if energy is not None else f"{'-':>9s}"
         lines.append(f"{name:{wide}s} {int(m.sum()):7d} {minutes:7.1f} {km:8.2f} {total} {per}")
+    if log.instruments:
+        lines += ["", "instruments", *(f"  {i.line()}" for i in log.instruments)]
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
     found = suspicions(log)

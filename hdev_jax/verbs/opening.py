@@ -26,7 +26,7 @@ from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.library import DECLARED
-from hdev_jax.problem import Problem, Split, prepare, split_trips
+from hdev_jax.problem import Problem, Split, prepare, split_trips, without_harmful_slope
 from hdev_jax.rundir import Run
 from hdev_jax.verbs.arguments import names_of, seed_of
 from hdev_jax.verbs.result import Result
@@ -291,7 +291,7 @@ def opened(
     with progress.busy("reading the logs"):
         log = log_of(logs, adapter)
         split = split_trips(log, train_trips, test_trips)
-        problem = prepare(split.log, sheet, target)
+        problem = without_harmful_slope(prepare(split.log, sheet, target), split)
     tried(problem, known, effects, *candidates)
     config = {
         "verb": verb,

@@ -67,6 +67,17 @@ def test_the_first_gate_that_a_score_does_not_pass_says_why(values, kind, number
     assert why == Rejection(kind, numbers)
 
 
+def test_where_readings_have_errors_a_small_gain_is_no_cause(log, scores):
+    least = scores.settings.beyond_readings
+    scores.inexact = True
+    assert first_rejection(asked(log, scores, "standstill_load"), EVERY) is None
+    scores.settings = replace(scores.settings, beyond_readings=0.99)
+    why = first_rejection(asked(log, scores, "standstill_load"), EVERY)
+    assert why is not None
+    assert why.kind is Kind.READINGS
+    assert least < why.numbers["share"] < 0.99
+
+
 def test_what_a_coefficient_takes_up_is_said_first(log, scores):
     scores.absorbed_by["standstill_load"] = "road.c_rr"
     why = first_rejection(asked(log, scores, "standstill_load", left_out_gain=-9.0), EVERY)

@@ -9,7 +9,7 @@ from logs_helpers import intervals, read, samples, write
 
 from hdev_jax.errors import InputError
 from hdev_jax.logs import read_log
-from hdev_jax.logs.intervals import grade_from_altitude, trip_median
+from hdev_jax.logs.intervals import trip_median
 from hdev_jax.logs.repair import fill_forward, fill_linear, fill_nearest
 from hdev_jax.segments import trip_slices
 from hdev_jax.units import COLUMNS, accepted, conversion, parse_column, to_si
@@ -98,16 +98,6 @@ def test_slope_from_altitude(tmp_path, dt):
         assert np.abs(log.segments.channels["grade_rad"] - true)[20:-20].max() < 0.003
     assert np.isfinite(log.segments.channels["grade_rad"]).all()
     assert any(e.kind == "derived" and e.column == "grade_rad" for e in log.ledger)
-
-
-def test_a_constant_slope_is_found_exactly_and_trips_do_not_mix():
-    distance = np.tile([100.0, 100.0, 0.0, 100.0], 50)
-    trip = np.repeat([0, 1], 100)
-    s = np.cumsum(distance) - distance / 2
-    altitude = np.where(trip == 0, 0.05 * s, 3000.0 - 0.02 * s)
-    grade = grade_from_altitude(trip, distance, altitude)
-    np.testing.assert_allclose(grade, np.where(trip == 0, np.arctan(0.05), -np.arctan(0.02)), rtol=1e-6)
-    np.testing.assert_array_equal(grade_from_altitude(trip, np.zeros(200), altitude), 0.0)
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.none() | st.integers(-5, 5)), min_size=1, max_size=40))

@@ -12,7 +12,8 @@ from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
 from hdev_jax.physics.battery import BatteryResistance, FrictionBlending, RegenCutoff, RegenLimit, TractionLimit
 from hdev_jax.physics.machine import switch
 from hdev_jax.physics.road import Aero, AirDensity, ConstantHeadwind, Grade, Headwind, Inertia, Rolling
-from hdev_jax.segments import Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
+from hdev_jax.units import GRAVITY_MPS2
 
 M, G, RHO = 24e3, 9.80665, 1.225
 
@@ -328,3 +329,19 @@ def test_without_ratios_torque_is_that_of_a_wheel() -> None:
         machine=Machine(made.arr(1.0), made.arr(1.0)),
     )
     same(car.torque(row), [M * G * 0.006 * 0.5])
+
+
+def test_an_error_of_the_readings_counts_as_the_mean_of_what_they_may_be() -> None:
+    """Energy and breakdown are those of both sides; where power changes its sign, the losses of an error stay."""
+    log, car = made.drives(*made.LENGTHS), made.baseline()
+    sd, zero = jnp.full(len(log), 0.004), jnp.zeros(len(log))
+    force_sd = jnp.hypot(sd, 0.03 / GRAVITY_MPS2)
+    told = log.with_channels(**{GRADE_SD: sd, ACCEL_SD: zero + 0.03})
+    grade = jnp.asarray(log.channels["grade_rad"])
+    sides = [car.energy(log.with_channels(grade_rad=grade + e)) for e in (force_sd, -force_sd)]
+    np.testing.assert_allclose(car.energy(told), 0.5 * (sides[0] + sides[1]), rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(sum(car.breakdown(told).values()), car.energy(told), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(car.force(told), car.force(log), rtol=1e-4, atol=1.0)
+    assert jnp.sum(car.energy(log.with_channels(**{GRADE_SD: zero + 0.05}))) > jnp.sum(car.energy(log)) + 0.1
+    exact = log.with_channels(**{GRADE_SD: zero})
+    np.testing.assert_allclose(car.energy(exact), car.energy(log), rtol=1e-12, atol=1e-9)

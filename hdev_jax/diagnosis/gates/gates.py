@@ -79,6 +79,17 @@ def _agreed(a: Asked) -> Rejection | None:
     return Rejection(Kind.CONTRADICTED, {"share": share})
 
 
+def _beyond_readings(a: Asked) -> Rejection | None:
+    """Where slope or speed were read with errors, what they were given the readings is known up to the form of their
+    distribution: a small gain from a change of that form is no cause."""
+    if not a.scores.inexact:
+        return None
+    plain, columns = a.scores.plain, a.score.candidate.columns
+    share = plain.gain(plain.totals(), columns)[0] / max(plain.misfit(), 1e-300)
+    least = a.scores.settings.beyond_readings
+    return Rejection(Kind.READINGS, {"share": float(share), "least": least}) if share < least else None
+
+
 def _worthwhile(a: Asked) -> Rejection | None:
     worth = a.scores.worth(a.score)
     return Rejection(Kind.OUTSCORED, {"worth": float(worth)}) if worth <= 0 else None
@@ -128,6 +139,7 @@ SCORE_GATES: tuple[Gate, ...] = (
     _confirmed,
     _significant,
     _agreed,
+    _beyond_readings,
     _worthwhile,
 )
 DRAWN_GATES: tuple[Gate, ...] = (_beats_placebos, _stable)
@@ -179,7 +191,7 @@ def stability(a: Asked) -> float:
     rivals = [
         s for s in scores.best.values()
         if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in {*scores.absorbed_by, *a.out}
-        and plausible(s, settings)
+        and plausible(s, settings) and _beyond_readings(replace(a, score=s)) is None
     ]  # fmt: skip
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
     small = [scores.evidence(s).only(s.candidate) for s in rivals]

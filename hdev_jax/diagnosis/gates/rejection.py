@@ -19,6 +19,7 @@ class Kind(StrEnum):
     NOT_CONFIRMED = "not_confirmed"
     NOT_SIGNIFICANT = "not_significant"
     CONTRADICTED = "contradicted"
+    READINGS = "readings"
     OUTSCORED = "outscored"
     REFIT = "refit"
     FAR = "far_from_table"
@@ -54,6 +55,7 @@ SENTENCES = {
     Kind.NOT_CONFIRMED: "not confirmed by cross-validation: does not lower the error on {unit} left out of the fit",
     Kind.NOT_SIGNIFICANT: "not significant over the whole library (FDR-adjusted p = {q:.2g})",
     Kind.CONTRADICTED: "generalised least squares exclude {share:.0%} of its size by ordinary least squares",
+    Kind.READINGS: "explains {share:.1%} of the error, which is not beyond what errors of the readings leave",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
     Kind.FAR: "it would move {name} to {z:+.1f} prior sd from the sheet's value",

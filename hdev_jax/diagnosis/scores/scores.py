@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
@@ -15,6 +16,7 @@ from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration, ParameterTable
 from hdev_jax.physics import Parameter
+from hdev_jax.segments import READING_ERRORS
 
 __all__ = [
     "NO_EFFECT",
@@ -121,6 +123,11 @@ class Scores:
     def _adjust(self) -> None:
         every = [1.0 if k in self.absorbed_by else min(1.0, s.p * self.ways[k]) for k, s in self.best.items()]
         self.q = dict(zip(self.best, map(float, stats.false_discovery_control(every)), strict=True))
+
+    @cached_property
+    def inexact(self) -> bool:
+        """Whether slope or speed were read with errors that matter."""
+        return any(next(iter(self.baseline.chunks())).segments.has(k) for k in READING_ERRORS)
 
     def replaced(self, s: Score) -> None:
         """Have an effect in another way than the one that looked best, and adjust every p-value again."""
