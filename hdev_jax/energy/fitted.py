@@ -1,0 +1,102 @@
+"""A vehicle with the uncertainty of its coefficients: calibrated on a log, or as a fit before has left it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from hdev_jax.inference import Spread, calibrate, cluster_rows, covariance_root, left_out, padded
+from hdev_jax.inference.calibrate import inside
+from hdev_jax.physics import Vehicle
+from hdev_jax.problem import Problem
+
+__all__ = ["DRAWS", "LEVEL", "Fitted", "calibrated_on", "interval"]
+
+DRAWS = 256  # points of a Sobol sequence: quantiles of 5 and 95 % are within about 2 % of a standard deviation
+LEVEL = 0.9  # probability inside every interval
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A vehicle at its estimates and what they leave open.
+
+    `covariance` of the table's free coefficients, known to `freedom` degrees of freedom; `spread`, the noise of rows
+    and trips, None where the log does not measure the target and no fit has left it; `how`, where the estimates come
+    from, in a sentence; `notes` for the user.
+    """
+
+    problem: Problem
+    vehicle: Vehicle
+    covariance: Float[np.ndarray, "free free"]
+    freedom: float
+    spread: Spread | None
+    how: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def values(self) -> Float[np.ndarray, " free"]:
+        """The free coefficients at their estimates."""
+        return self.problem.table.values(self.vehicle)
+
+    def draws(self, seed: int, count: int = DRAWS) -> Float[np.ndarray, "draw free"]:
+        """Coefficients: the estimates, then draws of a multivariate Student t, inside their supports.
+
+        Quasi-random (scrambled Sobol), so that few draws have steady quantiles; one more dimension than coefficients
+        for the t's common scale.
+        """
+        free, at = self.problem.table.free, self.values
+        if not free:
+            return at[None, :]
+        u = stats.qmc.Sobol(len(free) + 1, rng=np.random.default_rng(seed)).random(count)
+        u = np.clip(u, 1e-9, 1.0 - 1e-9)
+        z = stats.norm.ppf(u[:, 1:]) @ covariance_root(self.covariance).T
+        scale = np.sqrt(self.freedom / stats.chi2.ppf(u[:, :1], self.freedom))
+        drawn = at + scale * z
+        inner = [[inside(float(x), c.lower, c.upper) for x, c in zip(row, free, strict=True)] for row in drawn]
+        return np.concatenate([at[None, :], np.asarray(inner)])
+
+    def noise_kwh(self, rows: np.ndarray) -> float:
+        """Standard deviation of the measured energy of these rows (a mask) of one trip about the model [kWh]."""
+        if self.spread is None:
+            return 0.0
+        p, s = self.problem, self.spread
+        per_kwh = {"energy_wh": 1e3, "battery_power_kw": 3600.0}[p.target]
+        weight = p.weight()[rows] / per_kwh
+        each = weight * np.sqrt(s.scale**2 + (s.growth * self.predicted[rows]) ** 2)
+        return float(np.sqrt(s.together * np.sum(each**2) + (s.level * np.sum(each)) ** 2))
+
+    @property
+    def predicted(self) -> Float[np.ndarray, " row"]:
+        """The target's column at the estimates."""
+        return self.problem.predict(self.vehicle)
+
+
+def calibrated_on(problem: Problem, trips: Sequence[int] | None = None) -> Fitted:
+    """The vehicle calibrated on these trips of the log, all by default.
+
+    Degrees of freedom are those of the clusters: trips, or blocks where there are few trips.
+    """
+    used = np.ones(len(problem.log), bool) if trips is None else problem.rows(trips)
+    segments = problem.segments.take(used)
+    rows, clusters = padded(segments, problem.measured[used]), cluster_rows(segments)
+    fit = calibrate(problem.vehicle, problem.table, rows, problem.target, clusters)
+    spread, _ = left_out(fit, rows, problem.target, problem.weight()[used])
+    count = len(np.unique(problem.log.trip[used]))
+    how = f"calibrated on {count} trip{'s' if count > 1 else ''} of this log"
+    notes = () if fit.converged else (f"the calibration stopped early: {fit.message}",)
+    if not problem.table.free:
+        how = "every coefficient of the sheet is known: nothing was calibrated"
+    vehicle = jax.tree.map(np.asarray, fit.vehicle)
+    fitted = Fitted(
+        problem, vehicle, fit.covariance, max(clusters.count - 1.0, 2.0), spread, how, (*problem.notes, *notes)
+    )
+    return fitted if problem.table.free else replace(fitted, covariance=np.zeros((0, 0)))
+
+
+def interval(drawn: Float[np.ndarray, "draw *rest"], level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper end of the central interval of draws (first axis)."""
+    low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+    return low, high

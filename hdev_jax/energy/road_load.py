@@ -1,0 +1,229 @@
+"""Road load A + B·v + C·v² on a flat, dry, straight road in still air, from driving in service."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hdev_jax.energy.fitted import DRAWS, Fitted, interval
+from hdev_jax.errors import InputError
+from hdev_jax.inference import insert, linearised, padded
+from hdev_jax.inference.sheet import Sheet
+from hdev_jax.inference.sheet.schema import Declared
+from hdev_jax.physics import Vehicle
+from hdev_jax.physics.tyres import REFERENCE_TEMP_C
+from hdev_jax.problem import Problem
+from hdev_jax.segments import Segments
+from hdev_jax.targets import TARGETS
+from hdev_jax.units import GRAVITY_MPS2
+
+__all__ = ["NAMES", "SHOWN_KMH", "UNITS", "RoadLoad", "driven_range", "in_service", "open_sheet", "speeds_kmh"]
+
+NAMES = ("A", "B", "C")
+UNITS = ("N", "N/(m/s)", "N/(m/s)²")
+SHOWN_KMH = (50.0, 80.0)
+WIDE = 0.5  # of a coefficient that the sheet gives without an sd: the log decides
+B_SHARE = 0.2  # of A that B·v is expected to be at most, at 20 m/s (f₁ of UN GTR 15's default loads is 0)
+TOGETHER, UNSAID = 0.95, 0.9  # correlation; sd over the table's: beyond these it is said
+# What the road load is without: no wind, no bends, dry, nobody ahead.
+STILL = {
+    "wind_speed_mps": 0.0, "wind_from_rad": 0.0, "heading_rad": 0.0, "curvature_1pm": 0.0, "wet_road": 0.0,
+    "gap_m": 1e6, "road_surface": 0.0, "ambient_temp_c": REFERENCE_TEMP_C, "brake_pressure_pa": 0.0, "grade_rad": 0.0,
+    "accel_mps2": 0.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RoadLoad:
+    """Road load of a vehicle of `mass_kg` at the standard air density.
+
+    `abc` A [N], B [N/(m/s)], C [N/(m/s)²] with the ends of their 90 % intervals `lower`, `upper`; the same of the force
+    [N] at `speeds_kmh`; `driven_kmh`, the range of speeds that the log has (5 to 95 % of the way); `how` in a sentence.
+    """
+
+    abc: Float[np.ndarray, " 3"]
+    lower: Float[np.ndarray, " 3"]
+    upper: Float[np.ndarray, " 3"]
+    speeds_kmh: Float[np.ndarray, " speed"]
+    force: Float[np.ndarray, " speed"]
+    force_lower: Float[np.ndarray, " speed"]
+    force_upper: Float[np.ndarray, " speed"]
+    mass_kg: float
+    driven_kmh: tuple[float, float]
+    how: str
+    notes: tuple[str, ...] = ()
+
+
+def speeds_kmh(driven: tuple[float, float]) -> Float[np.ndarray, " speed"]:
+    """Where the force is given: every 5 km/h to beyond what was driven."""
+    return np.arange(10.0, max(90.0, driven[1]) + 5.1, 5.0)
+
+
+def driven_range(segments: Segments) -> tuple[float, float]:
+    """Speeds between which 90 % of the way was driven [km/h]."""
+    v, x = np.asarray(segments.speed_mps) * 3.6, np.asarray(segments.distance_m)
+    order = np.argsort(v)
+    share = np.cumsum(x[order]) / max(float(np.sum(x)), 1e-9)
+    low, high = (float(v[order][min(np.searchsorted(share, q), len(v) - 1)]) for q in (0.05, 0.95))
+    return low, high
+
+
+def open_sheet(sheet: Sheet, mass_kg: float) -> tuple[Sheet, list[str]]:
+    """The sheet with c_rr, C_d·A and B estimated: a number without an sd, or one that came from a log, gets a wide one.
+
+    **Raises:** `InputError` for a sheet without `road.c_rr` or `road.cda_m2`.
+    """
+    declared, notes = dict(sheet.declared), []
+    for path in ("road.c_rr", "road.cda_m2"):
+        if path not in declared:
+            raise sheet.fail(path, "the road load is estimated from it on")
+        d = declared[path]
+        if d.groups or d.per_vehicle:
+            raise InputError(
+                f"sheet {sheet.path}: {path} is per vehicle; a log and a sheet of one vehicle are expected"
+            )
+        if d.sd is None or d.estimated:
+            declared[path] = replace(d, sd=WIDE * max(abs(d.value), 1e-4), estimated=False)
+            why = "came from a log" if d.estimated else "has no sd"
+            notes.append(f"{path} of the sheet {why}: it is estimated from this log alone, from {d.value:g} on")
+    if not {"road.b_n_per_mps", "effects.rolling_linear.n_per_mps"} & {*declared}:
+        sd = B_SHARE * declared["road.c_rr"].value * mass_kg * GRAVITY_MPS2 / 20.0
+        declared["road.b_n_per_mps"] = Declared(0.0, sd)
+        notes.append(f"the sheet has no road.b_n_per_mps: it is estimated, as 0 ± {sd:.2g} N·s/m before the log")
+    other = copy.copy(sheet)
+    other.declared = declared
+    return other, notes
+
+
+@eqx.filter_jit
+def _forces(vehicle: Vehicle, structure: Any, thetas: Array, rows: Segments) -> Array:
+    return jax.lax.map(lambda theta: insert(vehicle, structure, theta).force(rows), thetas)
+
+
+def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
+    """A, B, C of the fitted vehicle: the forces of its road effects at steady speeds through the kernel.
+
+    Effects that fade or that only instruments have (tyres that warm up, a brake that drags, a slope's error) are no
+    part of it, nor is the weather: the air has the standard density, tyres are at 20 °C. **Raises:** `InputError` where
+    the chain is entered behind the road.
+    """
+    problem = fitted.problem
+    if problem.vehicle.entry != "road":
+        raise InputError("the log measures torque or force without what separates them from the road: see hdev check")
+    driven = driven_range(problem.segments)
+    kmh = speeds_kmh(driven)
+    passing = [
+        e.id
+        for e in fitted.vehicle.effects
+        if e.id == "air_density" or any(e.overrides(h) for h in ("derive", "across", "sense", "observe"))
+    ]
+    car = replace_mass(fitted.vehicle, mass_kg)
+    thetas = fitted.draws(seed, DRAWS)
+    rows = _steady(problem, kmh / 3.6, mass_kg)
+    # of all effects, so that coefficients stay where they are; then without those that are no part of it
+    force = np.asarray(_forces(car, problem.table.structure, jnp.asarray(thetas), rows))
+    for effect_id in passing:
+        without = [c for c in problem.table.free if c.path.startswith(f"effects.{effect_id}.")]
+        if without or car.has(effect_id):
+            force = force - _share_of(car, problem, thetas, rows, effect_id)
+    x = np.vander(kmh / 3.6, 3, increasing=True)
+    abc = force @ np.linalg.pinv(x).T
+    low, high = interval(abc[1:])
+    f_low, f_high = interval(force[1:])
+    notes = [*fitted.notes, *_left_open(fitted, abc[1:], driven)]
+    if passing:
+        notes.append(f"no part of the road load: {', '.join(passing)}")
+    return RoadLoad(
+        abc[0], low, high, kmh, force[0], f_low, f_high, mass_kg, driven,
+        f"{fitted.how}, from {TARGETS[problem.target].label}", tuple(notes),
+    )  # fmt: skip
+
+
+def replace_mass(vehicle: Vehicle, mass_kg: float) -> Vehicle:
+    """The same vehicle with this mass."""
+    return eqx.tree_at(lambda v: v.mass_kg, vehicle, np.asarray(mass_kg, dtype=float))
+
+
+def _steady(problem: Problem, v: np.ndarray, mass_kg: float) -> Segments:
+    """A row of a second at each speed, every channel of the log at its neutral value, else at its median."""
+    logged = problem.segments.channels
+    channels = {k: STILL.get(k, float(np.median(np.asarray(x)))) for k, x in logged.items()}
+    channels = {k: x for k, x in channels.items() if k != "air_density_kgpm3"}
+    if "mass_kg" in logged:
+        channels["mass_kg"] = mass_kg
+    rows = Segments.from_arrays(duration_s=np.ones(len(v)), speed_start_mps=v, speed_end_mps=v, **channels)
+    return padded(rows, np.zeros(len(v)), len(v)).segments
+
+
+def _share_of(car: Vehicle, problem: Problem, thetas: np.ndarray, rows: Segments, effect_id: str) -> np.ndarray:
+    """What an effect adds to the force of these rows at these coefficients."""
+    structure = problem.table.structure
+
+    @eqx.filter_jit
+    def both(values: Array) -> Array:
+        def one(theta: Array) -> Array:
+            there = insert(car, structure, theta)
+            return there.force(rows) - there.minus(effect_id).force(rows)
+
+        return jax.lax.map(one, values)
+
+    return np.asarray(both(jnp.asarray(thetas)))
+
+
+def _left_open(fitted: Fitted, abc: Float[np.ndarray, "draw 3"], driven: tuple[float, float]) -> list[str]:
+    """What this log cannot tell, in sentences."""
+    out, table = [], fitted.problem.table
+    correlation = np.corrcoef(abc.T)
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        if abs(correlation[i, j]) > TOGETHER:
+            out.append(
+                f"{NAMES[i]} and {NAMES[j]} are known only together (correlation {correlation[i, j]:+.2f}): the force "
+                "at the speeds driven is surer than either; driving at other speeds would separate them"
+            )
+    sd = np.sqrt(np.diag(fitted.covariance))
+    for name, c, s in zip((c.path for c in table.free), table.free, sd, strict=True):
+        letter = {"road.c_rr": "A", "road.b_n_per_mps": "B", "road.cda_m2": "C"}.get(name)
+        if letter and c.sd and s > UNSAID * c.sd:
+            out.append(f"{letter}: the log says next to nothing of it; its interval is the sheet's ({name})")
+    if not driven[0] < SHOWN_KMH[0] < driven[1] or not driven[0] < SHOWN_KMH[1] < driven[1]:
+        out.append(
+            f"90 % of the way was driven at {driven[0]:.0f} to {driven[1]:.0f} km/h: forces at other speeds are "
+            "extrapolated"
+        )
+    return [*out, *_held(fitted)]
+
+
+def _held(fitted: Fitted) -> list[str]:
+    """By how much A would be another if what the sheet holds were: auxiliary load, efficiency."""
+    problem, out = fitted.problem, []
+    if not TARGETS[problem.target].of_battery:
+        return out
+    table = problem.table
+    rows = padded(problem.segments, problem.measured)
+    unit: Callable[[str], tuple[float, str]] = lambda path: (1e3, "1 kW") if path.endswith("_w") else (0.01, "0.01")
+    for path in ("battery.auxiliary_w", "driveline.efficiency"):
+        if any(c.path == path for c in table.free) or not any(c.path == path for c in table.rows):
+            continue
+        opened = replace(table, rows=tuple(replace(c, free=c.free or c.path == path) for c in table.rows))
+        _, slopes = linearised(fitted.vehicle, opened, rows.segments, problem.target)
+        slopes = slopes[: rows.rows]
+        at = [c.path for c in opened.free].index(path)
+        kept = np.delete(slopes, at, axis=1)
+        precision = np.diag([0.0 if c.sd is None else 1.0 / c.sd**2 for c in table.free])
+        noise = max(float(np.var(problem.measured - fitted.predicted)), 1e-12)
+        moved = -np.linalg.solve(kept.T @ kept / noise + precision, kept.T @ slopes[:, at] / noise)
+        k = [c.path for c in table.free].index("road.c_rr")
+        step, words = unit(path)
+        force = step * float(moved[k]) * float(np.median(_mass(problem))) * GRAVITY_MPS2
+        out.append(f"{path} is held: were it {words} higher, A would be {force:+.3g} N")
+    return out
+
+
+def _mass(problem: Problem) -> np.ndarray:
+    return np.atleast_1d(np.asarray(problem.segments.get("mass_kg", problem.vehicle.mass_kg), dtype=float))
