@@ -1,10 +1,9 @@
 """Energy by cause and trip through the kernel, at the estimates and at draws of the coefficients.
 
-**Convention.** `Vehicle.breakdown`: a force counts at the wheel (its own power there, m·g·c_rr·v of rolling
-resistance); the driveline's and the machine's loss is what the efficiency makes of the sum of all forces, the power
-after the stage less that before it; a load or a loss behind them is what it adds at its place in the chain; a
-correction of an instrument counts as the difference that it makes. Losses that multiply are so told by differences along
-the chain, and the causes add up to the predicted energy exactly (telescoping).
+**Convention.** `Vehicle.breakdown`: a force counts at the wheel (rolling resistance is m·g·c_rr·v there); the loss of
+driveline and machine is the power after the stage less that before it, of all forces together; a load or a loss behind
+them is what it adds at its place in the chain; the correction of an instrument is the difference that it makes. Losses
+that multiply are so shared out by differences along the chain, and the causes add up to the predicted energy exactly.
 """
 
 from collections.abc import Callable

@@ -73,9 +73,7 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
             )
         key, sign, digits, percent = found.groups()
         if key in _KINEMATIC:
-            raise InputError(
-                f"--set {text}: the trips stay as they were driven; a coefficient or the weather can change"
-            )
+            raise InputError(f"--set {text}: the trips stay as driven; a coefficient or the weather can change")
         if key in _MEASURED:
             raise InputError(f"--set {text}: {key} follows from the drive; a coefficient or the weather can change")
         if key not in coefficients and key not in channels:
@@ -87,9 +85,7 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
             raise InputError(f"--set {text}: {key} is set twice; once is expected")
         channel = key in channels
         if not channel and isinstance(leaf_of(problem.vehicle, key), EfficiencyMap):
-            raise InputError(
-                f"--set {text}: the sheet has a map of the efficiency; a sheet with one number is expected"
-            )
+            raise InputError(f"--set {text}: the sheet has an efficiency map; one number is expected")
         if percent and not sign:
             raise InputError(f"--set {text}: a percentage is a change and has a sign, as in {key}=+{digits}%")
         factor, plus = (1.0 + number / 100.0, 0.0) if percent else (1.0, number) if sign else (0.0, number)

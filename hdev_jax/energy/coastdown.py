@@ -6,10 +6,10 @@ from the start of each run, so that noise of the speed is not differentiated:
 
     m·λ·(v₀ − v(t)) − m·g·h(t) = A·t + B·x(t) + C·∫(v + w)² dt
 
-which is linear in A, B and C, with the speed v₀ of each run free. Wind along the road that is not logged adds ±2Cw·x and
-C·w²·t: each run has a term in x of its own, whose mean over both directions is B and whose spread gives the winds, so
-that C·w² can be taken off. A slope that is not logged adds ±m·g·sin θ·t, estimated beside them. Where a temperature is
-logged, A and B are at 20 °C by the factor 1 + K₀·(T − 20 °C) of UN GTR 15, annex 4, and C at the standard air density.
+which is linear in A, B and C, with the speed v₀ of each run free. Wind along the road that is not logged adds ±2Cw·x
+and C·w²·t: each run has a term in x of its own, whose mean over both directions is B and whose spread gives the winds,
+so that C·w² can be taken off. A slope that is not logged adds ±m·g·sin θ·t, estimated beside them. Where a temperature
+is logged, A and B are at 20 °C by the factor 1 + K₀·(T − 20 °C) of UN GTR 15, annex 4, and C at the standard density.
 
 Intervals: the jackknife over runs, whose errors are correlated within a run (gusts, a slope that is not even).
 """
@@ -78,8 +78,8 @@ def coast_down(log: Log, mass_kg: float, rotating: float, *, level: float = LEVE
     count = [int(np.sum(runs.direction == d)) for d in ((1.0, -1.0) if both else (runs.direction[0],))]
     if min(count) < (2 if both else 3):
         raise InputError(
-            f"coast-down runs by direction: {' and '.join(map(str, count))}; at least 2 in each of two, or 3 in one, are "
-            "expected"
+            f"coast-down runs by direction: {' and '.join(map(str, count))}; at least 2 in each of two directions, or "
+            "3 in one, are expected"
         )
     kmh, powers = speeds_kmh(driven_range(fast := s.take(np.asarray(s.speed_mps) >= LEAST_MPS))), np.arange(3)
     what = np.concatenate([np.eye(3), (kmh[:, None] / 3.6) ** powers])  # A, B, C, then the force at each speed
@@ -142,9 +142,8 @@ def _estimate(runs: _Runs, *, by_wind: bool) -> tuple[Float[np.ndarray, " 3"], f
     b = float(np.mean([np.average(d, weights=w) for d, w in zip(sides, weights, strict=True)]))
     if not by_wind:
         return np.array([a, b, c]), 0.0
-    leftover = (
-        rest[:, Y, Y] - 2 * (a + e * s) * ty - 2 * c * qy + (a + e * s) ** 2 * tt + 2 * c * (a + e * s) * tq + c**2 * qq
-    )
+    solved = np.stack([-(a + e * s), 0.0 * s, -c + 0.0 * s, 1.0 + 0.0 * s, 0.0 * s], axis=1)
+    leftover = np.einsum("ri,rij,rj->r", solved, rest, solved)  # squares of what each run leaves
     noise = np.maximum(leftover.sum(), 0.0) / max(float(g[:, N, N].sum()) - 2 * len(s) - 3, 1.0) / xx
     square = max(float(np.mean((slopes - b) ** 2 - noise)), 0.0) / (4.0 * c**2)  # of the wind
     return np.array([a - c * square, b, c]), float(np.sqrt(square))
@@ -160,10 +159,8 @@ def _run(s: Segments, mass_kg: float, rotating: float) -> Float[np.ndarray, "5 5
     ones = np.ones(len(s))
     mass = np.asarray(s.get("mass_kg", mass_kg * ones))
     warm = 1.0 + K0_PER_K * (np.asarray(s.get("ambient_temp_c", REFERENCE_C * ones)) - REFERENCE_C)
-    weather = s.has("ambient_temp_c")
-    thick = np.asarray(
-        s.get("air_density_kgpm3", np.asarray(density_of_weather(s)) if weather else AIR_DENSITY_KGPM3 * ones)
-    )
+    usual = density_of_weather(s) if s.has("ambient_temp_c") else AIR_DENSITY_KGPM3 * ones
+    thick = np.asarray(s.get("air_density_kgpm3", np.asarray(usual)))
     air = v
     if s.has(*WIND):
         c = s.channels
@@ -178,4 +175,4 @@ def _run(s: Segments, mass_kg: float, rotating: float) -> Float[np.ndarray, "5 5
     drag = along(air * np.abs(air) * thick / AIR_DENSITY_KGPM3)
     columns = np.stack([along(1.0 / warm), along(v / warm), drag, -rotating * mass * v - climb], axis=1)
     columns -= columns.mean(axis=0)
-    return block_diag(columns.T @ columns, len(s))
+    return np.asarray(block_diag(columns.T @ columns, len(s)))

@@ -28,9 +28,8 @@ def compare_trips(fitted: Fitted, a: tuple[int, ...], b: tuple[int, ...], *, see
     member = np.zeros((2, names))
     for row, trips in enumerate((a, b)):
         if not km[list(trips)].sum() > 0:
-            raise InputError(
-                f"{', '.join(log.trip_names[i] for i in trips)}: never moves; trips with a way are expected"
-            )
+            which = ", ".join(log.trip_names[i] for i in trips)
+            raise InputError(f"{which}: never moves; trips that go somewhere are expected")
         member[row, list(trips)] = 100.0 / km[list(trips)].sum()
     noise = np.array([fitted.noise_kwh(log.trip == i) if np.any(log.trip == i) else 0.0 for i in range(names)])
     wobble = np.random.default_rng(seed).standard_t(fitted.freedom, (len(parts.drawn), names)) * noise
@@ -46,7 +45,7 @@ def compare_sheets(a: Fitted, b: Fitted, *, seed: int = 0) -> pd.DataFrame:
     log = a.problem.log
     km = float(np.sum(np.asarray(log.segments.distance_m))) / 1e3
     if not km > 0:
-        raise InputError("the log never moves; a log with a way is expected")
+        raise InputError("the log never moves; a log of driving is expected")
     one, two = by_cause(a, a.draws(seed)), by_cause(b, b.draws(seed + 1))
     causes = tuple(dict.fromkeys((*one.causes, *two.causes)))
     many = max(len(one.drawn), len(two.drawn))  # a vehicle that is known has but one draw
@@ -59,7 +58,7 @@ def compare_sheets(a: Fitted, b: Fitted, *, seed: int = 0) -> pd.DataFrame:
         measured += 100.0 / km * float(np.sum(np.asarray(log.target("energy_wh")))) / 1e3
     both = ByCause(causes, np.stack(value), np.stack(drawn, axis=1))
     table = _table(both, measured, np.zeros((many, 2)))
-    return table if log.measured else table[~table["cause"].isin([UNEXPLAINED, TOTAL])].reset_index(drop=True)
+    return table if log.measured else pd.DataFrame(table[:-2])
 
 
 def _table(parts: ByCause, measured: np.ndarray, wobble: np.ndarray) -> pd.DataFrame:

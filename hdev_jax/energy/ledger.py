@@ -17,9 +17,20 @@ from hdev_jax.physics import DECLARED, LIBRARY
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TARGETS
 
-__all__ = ["COLUMNS", "PARKED_S", "STANDING_MPS", "TOTAL", "UNEXPLAINED", "Groups", "Ledger", "groups_of", "ledger_of"]
+__all__ = [
+    "COLUMNS",
+    "PARKED_S",
+    "STANDING_MPS",
+    "SUM",
+    "TOTAL",
+    "UNEXPLAINED",
+    "Groups",
+    "Ledger",
+    "groups_of",
+    "ledger_of",
+]
 
-UNEXPLAINED, TOTAL = "unexplained", "measured"
+UNEXPLAINED, TOTAL, SUM = "unexplained", "measured", "all causes"
 PARKED_S = 300.0  # a stop of at least so long is parking; traffic lights and bus stops are shorter
 STANDING_MPS = 0.1
 LEAST_SHARE = 0.05  # of Σ|measured| under which a total has no shares (contract, section 4: pe_percent)
@@ -114,8 +125,8 @@ def ledger_of(fitted: Fitted, *, price: float | None = None, seed: int = 0) -> L
                      100.0 * kwh / total[k] if shares else np.nan,
                      np.nan if price is None else price * kwh)
                 )  # fmt: skip
-            about.append({"level": g.level, "name": name, **_about({n: float(g.member[k] @ x) for n, x in flows.items()},
-                                                                   block, k)})  # fmt: skip
+            sums = {n: float(g.member[k] @ x) for n, x in flows.items()}
+            about.append({"level": g.level, "name": name, **_about(sums, block, k)})
     return Ledger(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(about), undated)
 
 

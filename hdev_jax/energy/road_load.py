@@ -1,7 +1,6 @@
 """Road load A + B·v + C·v² on a flat, dry, straight road in still air, from driving in service."""
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -85,9 +84,7 @@ def open_sheet(sheet: Sheet, mass_kg: float) -> tuple[Sheet, list[str]]:
             raise sheet.fail(path, "the road load is estimated from it on")
         d = declared[path]
         if d.groups or d.per_vehicle:
-            raise InputError(
-                f"sheet {sheet.path}: {path} is per vehicle; a log and a sheet of one vehicle are expected"
-            )
+            raise InputError(f"sheet {sheet.path}: {path} is per vehicle; the sheet of one vehicle is expected")
         if d.sd is None or d.estimated:
             declared[path] = replace(d, sd=WIDE * max(abs(d.value), 1e-4), estimated=False)
             why = "came from a log" if d.estimated else "has no sd"
@@ -206,8 +203,7 @@ def _held(fitted: Fitted) -> list[str]:
         return out
     table = problem.table
     rows = padded(problem.segments, problem.measured)
-    unit: Callable[[str], tuple[float, str]] = lambda path: (1e3, "1 kW") if path.endswith("_w") else (0.01, "0.01")
-    for path in ("battery.auxiliary_w", "driveline.efficiency"):
+    for path, step, words in (("battery.auxiliary_w", 1e3, "1 kW"), ("driveline.efficiency", 0.01, "0.01")):
         if any(c.path == path for c in table.free) or not any(c.path == path for c in table.rows):
             continue
         opened = replace(table, rows=tuple(replace(c, free=c.free or c.path == path) for c in table.rows))
@@ -219,7 +215,6 @@ def _held(fitted: Fitted) -> list[str]:
         noise = max(float(np.var(problem.measured - fitted.predicted)), 1e-12)
         moved = -np.linalg.solve(kept.T @ kept / noise + precision, kept.T @ slopes[:, at] / noise)
         k = [c.path for c in table.free].index("road.c_rr")
-        step, words = unit(path)
         force = step * float(moved[k]) * float(np.median(_mass(problem))) * GRAVITY_MPS2
         out.append(f"{path} is held: were it {words} higher, A would be {force:+.3g} N")
     return out

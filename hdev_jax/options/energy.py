@@ -21,10 +21,10 @@ def energy_parsers(verbs: Any) -> None:
     ledger = verbs.add_parser(
         "ledger",
         help="where the energy goes: kWh, share and cost by cause, trip, week and vehicle",
-        description="Share the measured energy out by cause (rolling, air, slope, losses, loads, each effect of the sheet) "
-        "with intervals, for the whole log, each vehicle, week and trip. What no cause explains is a row of its own, so "
-        "that each block adds up to what was measured. A sheet that hdev calibrate or diagnose wrote is taken as fitted, "
-        "another one is calibrated on this log.",
+        description="Share the measured energy out by cause (rolling, air, slope, losses, loads, each effect of the "
+        "sheet) with intervals, for the whole log, each vehicle, week and trip. What no cause explains is a "
+        "row of its own, so that each block adds up to what was measured. A sheet that hdev calibrate or "
+        "diagnose wrote is taken as fitted, another one is calibrated on this log.",
         epilog="examples:\n  hdev ledger trips.csv --vehicle truck.toml --out where\n"
         "  hdev ledger trips.csv --vehicle result/augmented_vehicle.toml --price 0.25 --out where",
     )
@@ -37,9 +37,9 @@ def energy_parsers(verbs: Any) -> None:
     roadload = verbs.add_parser(
         "roadload",
         help="the vehicle's road load A + B·v + C·v² with intervals, from driving or a coast-down",
-        description="Estimate A, B and C of the road load and the force at 50 and 80 km/h, with intervals: from driving in "
-        "service by the sheet, or from a coast-down log (force or torque 0 throughout, or only time and speed), time-based "
-        "in both directions after SAE J1263 and J2263. What the log cannot tell is said.",
+        description="Estimate A, B and C of the road load and the force at 50 and 80 km/h, with intervals: from "
+        "driving in service by the sheet, or from a coast-down log (force or torque 0 throughout, or only time and "
+        "speed), time-based in both directions after SAE J1263 and J2263. What the log cannot tell is said.",
         epilog="examples:\n  hdev roadload trips.csv --vehicle truck.toml --out load\n"
         "  hdev roadload coasting.csv --vehicle truck.toml --coastdown --out load",
     )
@@ -55,9 +55,9 @@ def energy_parsers(verbs: Any) -> None:
     whatif = verbs.add_parser(
         "whatif",
         help="what a change of the vehicle, its load or the weather would cost on the trips as driven",
-        description="Predict the energy of the trips as driven with a change, by trip and by cause, with intervals. A value "
-        "with a sign is a change (-10%, +500), one without is the new value. Keys are those of the sheet, or channels of "
-        "the log.",
+        description="Predict the energy of the trips as driven with a change, by trip and by cause, with intervals. A "
+        "value with a sign is a change (-10%, +500), one without is the new value. Keys are those of the "
+        "sheet, or channels of the log.",
         epilog="examples:\n  hdev whatif truck.toml trips.csv --set road.c_rr=-10% --out tyres\n"
         "  hdev whatif truck.toml trips.csv --set mass_kg=+500 --set ambient_temp_c=-10 --out winter",
     )
@@ -71,10 +71,11 @@ def energy_parsers(verbs: Any) -> None:
     saved = verbs.add_parser(
         "saved",
         help="what a change has saved, with weather, load, route and speed taken out",
-        description="Calibrate the vehicle on the trips before a change (tyres, a spoiler, training of drivers) and compare "
-        "the trips after it with what the vehicle as it was would have taken: the share saved with an interval, how many "
-        "further trips would settle it, and what else changed meanwhile.",
-        epilog="examples:\n  hdev saved trips.csv --vehicle truck.toml --before ..2024-03-31 --after 2024-04-01.. --out tyres\n"
+        description="Calibrate the vehicle on the trips before a change (tyres, a spoiler, training of drivers) and "
+        "compare the trips after it with what the vehicle as it was would have taken: the share saved with an "
+        "interval, how many further trips would settle it, and what else changed meanwhile.",
+        epilog="examples:\n  hdev saved trips.csv --vehicle truck.toml --before ..2024-03-31 --after 2024-04-01.. "
+        "--out tyres\n"
         "  hdev saved trips.csv --vehicle truck.toml --before T01..T08 --after T09,T11,T12 --out tyres",
     )
     logs_and_sheet(saved)
@@ -88,8 +89,8 @@ def energy_parsers(verbs: Any) -> None:
     compare = verbs.add_parser(
         "compare",
         help="where the difference between two trips, vehicles or sheets comes from",
-        description="Compare two trips of a log, two of its vehicles, or two vehicle sheets on one log: the difference by "
-        "cause, which adds up exactly, with intervals, and the circumstances of both.",
+        description="Compare two trips of a log, two of its vehicles, or two vehicle sheets on one log: the "
+        "difference by cause, which adds up exactly, with intervals, and the circumstances of both.",
         epilog="examples:\n  hdev compare T01 T07 --log trips.csv --vehicle truck.toml --out why\n"
         "  hdev compare old.toml new.toml --log trips.csv --out why",
     )

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
+from hdev_jax.energy.ledger import SUM, TOTAL, UNEXPLAINED
 from hdev_jax.energy.road_load import SHOWN_KMH, RoadLoad
 from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, MEASURED, figure, tidy
@@ -17,42 +17,42 @@ __all__ = ["by_week", "consumption", "differences", "forces", "label", "trip_int
 # Okabe and Ito (2008), as the other figures
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#F0E442", "#7F7F7F")
 MOST_TRIPS = 40
+NOTHING = 1e-9  # of a bar that is left out
 
 
 def label(cause: str) -> str:
     """A cause as a reader calls it."""
-    return cause if cause in (UNEXPLAINED, TOTAL) else names.effect(cause)
+    return cause if cause in (UNEXPLAINED, TOTAL, SUM) else names.effect(cause)
 
 
 def waterfall(rows: pd.DataFrame, per: str = "kwh_per_100km", unit: str = "kWh/100 km") -> Any:
     """Bars that begin where the one before ended, from nothing to the measured energy; one block of the ledger."""
-    scale = rows[per].to_numpy(float) / np.where(rows["kwh"] == 0, 1.0, rows["kwh"].to_numpy(float))
-    parts = rows[rows["cause"] != TOTAL]
-    parts = parts[(parts["kwh"].abs() > 1e-9) | (parts["cause"] == UNEXPLAINED)]
-    last = parts["cause"] == UNEXPLAINED
-    parts = pd.concat([parts[~last].sort_values("kwh", ascending=False), parts[last]])
-    k = float(np.nanmax(np.abs(scale)))
-    value, low, high = (parts[c].to_numpy(float) * k for c in ("kwh", "lower", "upper"))
-    total = float(rows.loc[rows["cause"] == TOTAL, "kwh"].iloc[0]) * k
+    lines = {str(r["cause"]): r for r in rows.to_dict("records")}
+    total = lines.pop(TOTAL)
+    k = total[per] / total["kwh"] if total["kwh"] else 1.0
+    there = [c for c, r in lines.items() if abs(r["kwh"]) > NOTHING and c != UNEXPLAINED]
+    causes = [*sorted(there, key=lambda c: -lines[c]["kwh"]), UNEXPLAINED]
+    value, low, high = (k * np.array([lines[c][n] for c in causes]) for n in ("kwh", "lower", "upper"))
+    total = k * total["kwh"]
     ends = np.cumsum(value)
     starts = ends - value
-    y = np.arange(len(parts) + 1)[::-1].astype(float)
+    y = np.arange(len(causes) + 1)[::-1].astype(float)
     fig = figure(WIDTH, 1.3 + 0.38 * len(y))
     ax = fig.add_subplot()
     colours = [GREY if c == UNEXPLAINED else AFTER if v >= 0 else "#009E73"
-               for c, v in zip(parts["cause"], value, strict=True)]  # fmt: skip
+               for c, v in zip(causes, value, strict=True)]  # fmt: skip
     ax.barh(y[:-1], value, left=starts, color=colours, height=0.62)
     ax.barh(y[-1], total, color=MEASURED, height=0.62)
-    ax.hlines(y[:-1], starts + low, starts + high, color=INK, linewidth=1.1)
+    open_ = low < high
+    ax.hlines(y[:-1][open_], (starts + low)[open_], (starts + high)[open_], color=INK, linewidth=1.1)
     for a, b, x in zip(y[:-1], y[1:], ends, strict=True):
         ax.vlines(x, b, a, color=GREY, linewidth=0.6, linestyle=":")
     reach = max(float(np.max(np.abs(np.r_[starts, ends, starts + high, total]))), 1e-9)
-    for at, edge, text in zip(
-        y, np.r_[np.maximum(starts + np.maximum(high, value), ends), max(total, 0.0)], np.r_[value, total], strict=True
-    ):
-        share = f"  ({100 * text / total:.0f} %)".replace("-", "−") if abs(total) > 1e-9 and at != y[-1] else ""
+    edges = np.r_[np.max([starts, ends, starts + high], axis=0), max(total, 0.0)]
+    for at, edge, text in zip(y, edges, np.r_[value, total], strict=True):
+        share = f"  ({100 * text / total:.1f} %)" if abs(total) > 1e-9 and at != y[-1] else ""
         ax.text(edge + 0.01 * reach, at, f"{text:.3g}{share}".replace("-", "−"), va="center", fontsize=8, color=INK)
-    ax.set_yticks(y, [*(short(label(c), 40) for c in parts["cause"]), TOTAL])
+    ax.set_yticks(y, [*(short(label(c), 40) for c in causes), TOTAL])
     ax.set_xlim(min(0.0, float(np.min(np.r_[starts, ends, starts + low])) * 1.05), reach * 1.14)
     ax.axvline(0, color=GREY, linewidth=0.8)
     ax.set_xlabel(unit)
@@ -62,7 +62,7 @@ def waterfall(rows: pd.DataFrame, per: str = "kwh_per_100km", unit: str = "kWh/1
 
 
 def by_week(rows: pd.DataFrame) -> Any | None:
-    """Stacked bars of each week, kWh/100 km by cause, with what was measured as a dot. None for fewer than two weeks."""
+    """Stacked bars of each week, kWh/100 km by cause, what was measured as a dot. None for fewer than two weeks."""
     weeks = list(dict.fromkeys(rows["name"]))
     if len(weeks) < 2:
         return None
@@ -143,12 +143,12 @@ def forces(load: RoadLoad) -> Any:
 
 def differences(rows: pd.DataFrame, unit: str, title: str) -> Any:
     """A bar for each cause with the interval of its difference, the whole last."""
-    rows = rows[(rows["difference"].abs() > 1e-9) | (rows["cause"] == TOTAL)]
+    rows = pd.DataFrame(rows[(rows["difference"].abs() > NOTHING) | rows["cause"].isin([TOTAL, SUM])])
     y = np.arange(len(rows))[::-1].astype(float)
     value, low, high = (rows[c].to_numpy(float) for c in ("difference", "lower", "upper"))
     fig = figure(WIDTH, 1.3 + 0.38 * max(len(rows), 1))
     ax = fig.add_subplot()
-    colours = [MEASURED if c == TOTAL else GREY if c == UNEXPLAINED else BEFORE if v > 0 else AFTER
+    colours = [MEASURED if c in (TOTAL, SUM) else GREY if c == UNEXPLAINED else BEFORE if v > 0 else AFTER
                for c, v in zip(rows["cause"], value, strict=True)]  # fmt: skip
     ax.barh(y, value, color=colours, height=0.62)
     ax.hlines(y, low, high, color=INK, linewidth=1.1)
@@ -169,10 +169,12 @@ def differences(rows: pd.DataFrame, unit: str, title: str) -> Any:
 
 
 def trip_intervals(
-    names_: Sequence[str], value: np.ndarray, lower: np.ndarray, upper: np.ndarray, unit: str, title: str,
+    names_: Sequence[str], intervals: np.ndarray, unit: str, title: str,
     whole: tuple[float, float, float] | None = None,
 ) -> Any:  # fmt: skip
-    """A dot with its interval for each trip, and as a band what holds for all of them."""
+    """A dot with its interval for each trip (`intervals`: value, lower, upper in columns), and as a band what holds for
+    all of them."""
+    value, lower, upper = intervals.T
     n = len(value)
     named = n <= MOST_TRIPS
     fig = figure(WIDTH, 1.3 + (0.26 * n if named else 4.5))

@@ -63,9 +63,9 @@ class Page:
         return "".join(text for text, _ in self.answer)
 
 
-def span(value: float, lower: float, upper: float, digits: int = 3) -> str:
+def span(value: float | None, lower: float | None, upper: float | None, digits: int = 3) -> str:
     """`12.3 (11.8 to 12.9)`; the value alone where it is certain."""
-    if not lower < upper:
+    if lower is None or upper is None or not lower < upper:
         return words.number(value, digits)
     return f"{words.number(value, digits)} ({words.number(lower, digits)} to {words.number(upper, digits)})"
 

@@ -7,7 +7,7 @@ import pandas as pd
 
 from hdev_jax.energy.compare import compare_sheets, compare_trips
 from hdev_jax.energy.fitted import Fitted
-from hdev_jax.energy.ledger import TOTAL
+from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
 from hdev_jax.energy.saved import circumstances
 from hdev_jax.errors import InputError
 from hdev_jax.logs import Log
@@ -15,7 +15,7 @@ from hdev_jax.logs.adapter import near
 from hdev_jax.report.energy.figures import differences, label
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.report.words import number
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
 
@@ -50,7 +50,8 @@ def compare(
     if all(sheets):
         measured = bool(asked.log.measured)
         name = battery_target(asked.log, target) if measured else target or "energy_wh"
-        one, two = (fitted_for(asked, x, name, name=k, measured=measured) for k, x in (("a", a), ("b", b)))
+        problems = [problem_for(asked, x, name, name=k, measured=measured) for k, x in (("a", a), ("b", b))]
+        one, two = (fitted_for(p, x, calibrate=False) for p, x in zip(problems, (a, b), strict=True))
         titles = (one.problem.sheet.name, two.problem.sheet.name)
         titles = titles if titles[0] != titles[1] else named
         return answered(asked, out, lambda command: _answer(
@@ -59,7 +60,7 @@ def compare(
     if vehicle is None:
         raise InputError("compare: --vehicle is missing; two trips are compared by the sheet of their vehicle")
     trips = [_trips(asked.log, str(x)) for x in (a, b)]
-    fitted = fitted_for(asked, vehicle, battery_target(asked.log, target))
+    fitted = fitted_for(problem_for(asked, vehicle, battery_target(asked.log, target)), vehicle)
 
     def work(command: str) -> EnergyResult:
         table = compare_trips(fitted, *trips, seed=asked.seed)
@@ -83,19 +84,13 @@ def _trips(log: Log, name: str) -> tuple[int, ...]:
 def _answer(
     table: pd.DataFrame, others: pd.DataFrame | None, names: tuple[str, ...], fitted: Fitted, how: str, command: str
 ) -> EnergyResult:
-    total = table[table["cause"] == TOTAL]
-    model = table[table["cause"] != TOTAL]
-    largest = model.reindex(model["difference"].abs().sort_values(ascending=False).index).head(3)
-    most = ", ".join(f"{label(c)} {d:+.3g}".replace("-", "−")
-                     for c, d in zip(largest["cause"], largest["difference"], strict=True))  # fmt: skip
-    if len(total) and others is not None:
-        head = f"{names[1]} takes {number(total['difference'].iloc[0])} kWh/100 km more than {names[0]}"
-        head = head if total["difference"].iloc[0] >= 0 else (
-            f"{names[1]} takes {number(-total['difference'].iloc[0])} kWh/100 km less than {names[0]}"
-        )  # fmt: skip
-    else:
-        explained = model[model["cause"] != "unexplained"]["difference"].sum()
-        head = f"{names[1]} predicts {number(abs(explained))} kWh/100 km {'more' if explained >= 0 else 'less'} than {names[0]}"
+    by = {r["cause"]: r["difference"] for r in records(table)}
+    total = by.pop(TOTAL, 0.0)
+    largest = sorted(by, key=lambda c: -abs(by[c]))[:3]
+    most = ", ".join(f"{label(c)} {by[c]:+.3g}".replace("-", "−") for c in largest)
+    moved = total if others is not None else sum(x for c, x in by.items() if c != UNEXPLAINED)
+    takes = "takes" if others is not None else "predicts"
+    head = f"{names[1]} {takes} {number(abs(moved))} kWh/100 km {'more' if moved >= 0 else 'less'} than {names[0]}"
     summary = {
         "schema": "hdev-compare/1", "a": names[0], "b": names[1], "how": how, "notes": list(fitted.notes),
         "causes": records(table), "circumstances": [] if others is None else records(others.drop(columns=["differs"])),
@@ -105,14 +100,17 @@ def _answer(
         "",
         f"{'cause [kWh/100 km]':34s} {'A':>9s} {'B':>9s} {'B - A':>9s} {'90 % interval':>23s}",
     ]
-    lines += [f"{label(str(r.cause)):34s} {r.a:9.4g} {r.b:9.4g} {r.difference:+9.3g} {f'{r.lower:+.3g} to {r.upper:+.3g}':>23s}"
-              for r in table.itertuples()]  # fmt: skip
+    for r in records(table):
+        between = f"{r['lower']:+.3g} to {r['upper']:+.3g}"
+        lines.append(f"{label(r['cause']):34s} {r['a']:9.4g} {r['b']:9.4g} {r['difference']:+9.3g} {between:>23s}")
     if others is not None:
         lines += ["", f"{'circumstances':30s} {'A':>10s} {'B':>10s}"]
-        lines += [f"{f'{r.what} [{r.unit}]':30s} {r.before:10.4g} {r.after:10.4g}" for r in others.itertuples()]
+        for r in records(others):
+            what = f"{r['what']} [{r['unit']}]"
+            lines.append(f"{what:30s} {r['before']:10.4g} {r['after']:10.4g}")
     lines += [f"vehicle: {how}", *(f"note: {note}" for note in fitted.notes)]
-    rows = [(label(c), number(x), number(y), span(d, low, high))
-            for c, x, y, d, low, high in table.itertuples(index=False)]  # fmt: skip
+    rows = [(label(r["cause"]), number(r["a"]), number(r["b"]), span(r["difference"], r["lower"], r["upper"]))
+            for r in records(table)]  # fmt: skip
     sections = [Section(
         "Where the difference comes from", f"A: {names[0]}. B: {names[1]}. The differences add up to the last one.",
         {"causes": (lambda: differences(table, "kWh/100 km", "B less A by cause; line: 90 % interval"),

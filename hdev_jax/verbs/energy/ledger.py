@@ -1,5 +1,6 @@
 """The verb `ledger`: where a vehicle's energy goes, by trip, week and vehicle."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import by_week, consumption, label, waterfall
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
 
@@ -46,13 +47,13 @@ def ledger(
         raise InputError(f"--price {price}: the price of a kWh, a number of 0 or more, is expected")
     asked = Asked.of("ledger", logs, adapter, effects, seed, {"target": target, "price": price})
     name = battery_target(asked.log, target)
-    fitted = fitted_for(asked, vehicle, name)
+    fitted = fitted_for(problem_for(asked, vehicle, name), vehicle)
     return answered(asked, out, lambda command: _answer(fitted, price, asked, command))
 
 
 def _answer(fitted: Fitted, price: float | None, asked: Asked, command: str) -> EnergyResult:
     found = ledger_of(fitted, price=price, seed=asked.seed)
-    whole, about = found.rows[found.rows["level"] == "all"], found.about.iloc[0]
+    whole, about = _level(found.rows, "all"), records(found.about)[0]
     notes = list(fitted.notes)
     if found.undated:
         notes.append(f"{found.undated} trips have no date in the log: they are in no week")
@@ -72,62 +73,66 @@ def _answer(fitted: Fitted, price: float | None, asked: Asked, command: str) -> 
     return EnergyResult("ledger", "\n".join(lines), summary, {"ledger": found.rows, "about": found.about}, page)
 
 
+def _level(frame: pd.DataFrame, level: str) -> pd.DataFrame:
+    return pd.DataFrame(frame[frame["level"] == level])
+
+
 def _blocks(found: Ledger) -> list[dict[str, Any]]:
     causes = {key: records(block.drop(columns=["level", "name"]))
               for key, block in found.rows.groupby(["level", "name"], sort=False)}  # fmt: skip
     return [{**block, "causes": causes[(block["level"], block["name"])]} for block in records(found.about)]
 
 
-def _pieces(whole: pd.DataFrame, about: pd.Series) -> list[tuple[str, bool]]:
+def _pieces(whole: pd.DataFrame, about: Mapping[str, Any]) -> list[tuple[str, bool]]:
     """The answer: how much, and the causes that take most of it."""
     total = float(about["measured_kwh"])
     per = words.number(about["kwh_per_100km"], 3, "kWh/100 km")
     pieces = [(f"{words.number(total, 4)} kWh over {words.number(about['km'], 4)} km, ", False), (per, True)]
-    parts = whole[~whole["cause"].isin([TOTAL, UNEXPLAINED])].sort_values("kwh", ascending=False)
-    parts = parts[parts["share_percent"] > 0].head(4)
-    left = whole[whole["cause"] == UNEXPLAINED].iloc[0]
-    if len(parts):
-        pieces.append((": ", False))
-        for k, (cause, share) in enumerate(zip(parts["cause"], parts["share_percent"], strict=True)):
-            pieces.append(
-                (f"{', ' if k else ''}{label(cause)} {words.percent(share, signed=False, decimals=0)}", False)
-            )
+    lines = {r["cause"]: r for r in records(whole)}
+    left = lines.pop(UNEXPLAINED)
+    lines.pop(TOTAL)
+    first = [r for r in lines.values() if (r["share_percent"] or 0.0) >= 1.0]
+    first = sorted(first, key=lambda r: -r["kwh"])[:4]
+    causes = [f"{label(r['cause'])} {words.percent(r['share_percent'], signed=False, decimals=0)}" for r in first]
+    if causes:
+        pieces.append((f": {', '.join(causes)}", False))
     share = words.percent(left["share_percent"])
     noise = left["lower"] <= 0 <= left["upper"]
     pieces.append((f"; {share} unexplained, {'no more than noise' if noise else 'more than noise'}.", False))
     return pieces
 
 
-def _sentence(whole: pd.DataFrame, about: pd.Series) -> str:
+def _sentence(whole: pd.DataFrame, about: Mapping[str, Any]) -> str:
     return "".join(text for text, _ in _pieces(whole, about))
 
 
 def _text(whole: pd.DataFrame, price: float | None) -> list[str]:
     head = f"{'cause':34s} {'kWh':>9s} {'90 % interval':>23s} {'kWh/100 km':>11s} {'share':>8s}"
     lines = [head + (f" {'cost':>9s}" if price is not None else "")]
-    for r in whole.itertuples():
-        between = f"{r.lower:.4g} to {r.upper:.4g}" if r.lower < r.upper else "-"
-        share = f"{r.share_percent:.1f} %" if r.share_percent == r.share_percent else "-"
-        cost = f" {r.cost:9.2f}" if price is not None else ""
-        lines.append(f"{label(str(r.cause)):34s} {r.kwh:9.4g} {between:>23s} {r.kwh_per_100km:11.4g} {share:>8s}{cost}")
+    for r in records(whole):
+        between = f"{r['lower']:.4g} to {r['upper']:.4g}" if r["lower"] < r["upper"] else "-"
+        share = "-" if r["share_percent"] is None else f"{r['share_percent']:.1f} %"
+        per = "-" if r["kwh_per_100km"] is None else f"{r['kwh_per_100km']:.4g}"
+        cost = "" if price is None else f" {r['cost']:9.2f}"
+        lines.append(f"{label(r['cause']):34s} {r['kwh']:9.4g} {between:>23s} {per:>11s} {share:>8s}{cost}")
     return lines
 
 
-def _besides(about: pd.Series) -> list[str]:
+def _besides(about: Mapping[str, Any]) -> list[str]:
     return [
-        f"regenerated {about['regenerated_percent']:.1f} % of the energy that left the battery, row by row; auxiliary "
-        f"loads {about['auxiliary_percent']:.1f} % of it",
+        f"regenerated {words.percent(about['regenerated_percent'], signed=False)} of the energy that left the battery, "
+        f"row by row; auxiliary loads {words.percent(about['auxiliary_percent'], signed=False)} of it",
         f"standing {about['standing_kwh']:.4g} kWh, of which parked (5 minutes or more) {about['parked_kwh']:.4g} kWh "
         f"in {about['parked_hours']:.3g} h",
     ]
 
 
 def _page(fitted: Fitted, found: Ledger, price: float | None, asked: Asked, notes: list[str], command: str) -> Page:
-    problem, whole, about = fitted.problem, found.rows[found.rows["level"] == "all"], found.about.iloc[0]
+    problem, whole, about = fitted.problem, _level(found.rows, "all"), records(found.about)[0]
     log = problem.log
-    weeks = found.rows[found.rows["level"] == "week"]
-    trips = found.about[found.about["level"] == "trip"].copy()
-    left = found.rows[(found.rows["level"] == "trip") & (found.rows["cause"] == UNEXPLAINED)]
+    weeks = _level(found.rows, "week")
+    trips = _level(found.about, "trip")
+    left = _level(found.rows, "trip").query("cause == @UNEXPLAINED")
     trips["model_per_100km"] = trips["kwh_per_100km"].to_numpy() - left["kwh_per_100km"].to_numpy()
     place = [log.trip_names.index(name) for name in trips["name"]]
     against = {k: (u, x[place]) for k, (u, x) in conditions(problem).items()
@@ -135,8 +140,8 @@ def _page(fitted: Fitted, found: Ledger, price: float | None, asked: Asked, note
     sections = [
         Section(
             "Where the energy goes",
-            "Forces count at the wheel; the driveline's loss is what its efficiency makes of their sum. What the causes "
-            "leave of the measured energy is unexplained; its interval has the noise of the trips besides.",
+            "Forces count at the wheel; the driveline's loss is what its efficiency makes of their sum. What the "
+            "causes leave of the measured energy is unexplained; its interval has the noise of the trips besides.",
             {"waterfall": (lambda: waterfall(whole), "Bars of energy by cause that add up to the measured energy.",
                            "Energy by cause over the whole log.")},
             (_causes(whole, price),),
@@ -152,7 +157,7 @@ def _page(fitted: Fitted, found: Ledger, price: float | None, asked: Asked, note
         ),
     ]  # fmt: skip
     for level, words_ in (("week", "Weeks"), ("vehicle", "Vehicles")):
-        part = found.about[found.about["level"] == level]
+        part = _level(found.about, level)
         if len(part):
             drawn = {"weeks": (lambda: by_week(weeks), "Stacked bars of energy by cause for each week.",
                                "Energy by cause, week by week (ISO 8601).")} if level == "week" else {}  # fmt: skip

@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.arguments import seed_of
 from hdev_jax.verbs.beside import beside_sheet, covariance_of
 from hdev_jax.verbs.energy.result import EnergyResult
+from hdev_jax.verbs.online import given_states
 from hdev_jax.verbs.opening import (
     Effects,
     Logs,
@@ -34,7 +35,9 @@ from hdev_jax.verbs.opening import (
 )
 from hdev_jax.verbs.result import Result
 
-__all__ = ["Asked", "answered", "battery_target", "fitted_for", "synthetic"]
+__all__ = ["Asked", "answered", "battery_target", "fitted_for", "problem_for", "synthetic"]
+
+KNOWN = 200.0  # degrees of freedom of a table's sd: as good as a normal
 
 
 @dataclass
@@ -80,7 +83,8 @@ class Asked:
             "adapter": None if self.adapter is None else str(self.adapter),
             "effects_file": None if self.effects is None else named(self.effects),
             "effects_sha256": digest_of_effects(self.effects) if kept else None,
-            "seed": self.seed, "of": list(self.positional), **self.options, "x64": bool(jax.config.read("jax_enable_x64")),
+            "seed": self.seed, "of": list(self.positional), **self.options,
+            "x64": bool(jax.config.read("jax_enable_x64")),
         }  # fmt: skip
 
     def command(self, out: str | Path | None) -> str:
@@ -111,31 +115,42 @@ def battery_target(log: Log, target: str | None) -> str:
         raise InputError(f"--target {target}: energy at the battery is what this is about; accepted: {able}")
     if target is None and not log.measured:
         raise InputError(
-            "the log measures no energy or power at the battery (energy_wh, battery_power_w, battery_power_kw), and this "
-            "answer is about that; hdev check shows what was read"
+            "the log measures no energy or power at the battery (energy_wh, battery_power_w, battery_power_kw), which "
+            "this answer is about; hdev check shows what was read"
         )
     return target or log.default_target
 
 
-def fitted_for(asked: Asked, vehicle: Vehicles, target: str, *, name: str = "vehicle", measured: bool = True) -> Fitted:
-    """The vehicle of a sheet with what is open: as a fit before left it beside the sheet, else calibrated on this log;
-    by its sds alone, where the log does not measure the target."""
-    sheet = asked.sheet(vehicle, name)
-    problem = prepare(asked.log, sheet, target, need_measured=measured)
+def problem_for(
+    asked: Asked, vehicle: Vehicles, target: str, *, name: str = "vehicle", measured: bool = True
+) -> Problem:
+    """Log, sheet and target together. Raises `InputError`."""
+    problem = prepare(asked.log, asked.sheet(vehicle, name), target, need_measured=measured)
     tried(problem, known_effects(asked.effects), asked.effects)
+    return problem
+
+
+def fitted_for(problem: Problem, vehicle: Vehicles, *, calibrate: bool = True) -> Fitted:
+    """The vehicle with what is open: as a fit before left it beside the sheet, else calibrated on this log; by its sds
+    alone where the log is not to `calibrate` it. Loads that switch are where the measured power shows them."""
     known, stale = _known(problem, vehicle)
-    if not known and measured:
+    notes = list(problem.notes)
+    if stale:
+        notes.append("predictive.json beside the sheet is not used: the sheet was changed after it was written")
+    if not known and calibrate:
         progress.step("calibrating")
         fitted = calibrated_on(problem)
-        if stale:
-            note = "predictive.json beside the sheet is not used: the sheet was changed after it was written"
-            fitted = Fitted(**{**vars(fitted), "notes": (*fitted.notes, note)})
-        return fitted
+        return replace(fitted, notes=(*fitted.notes, *notes[len(problem.notes) :]))
     spread = Spread(**known["spread"]) if known else None
-    freedom = spread.total_freedom if spread else 200.0
     how = "as fitted before (predictive.json beside the sheet)" if known else "as the sheet says, give or take its sds"
+    if calibrate and (given := given_states(problem, known)) is not None:
+        problem = given
+        notes.append(
+            "loads that switch are on where the measured power shows it; their intervals have no error of that"
+        )
     covariance = covariance_of(problem, known)
-    return Fitted(problem, problem.vehicle, covariance, max(freedom, 2.0), spread, how, problem.notes)
+    freedom = max(spread.total_freedom, 2.0) if spread else KNOWN
+    return Fitted(problem, problem.vehicle, covariance, freedom, spread, how, tuple(notes))
 
 
 def _known(problem: Problem, vehicle: Vehicles) -> tuple[Mapping[str, Any], bool]:

@@ -38,8 +38,8 @@ def roadload(
 
     From driving in service c_rr, a force linear in speed and C_d·A are estimated with the rest of the sheet, from the
     traction force where it is measured, else through the chain from the battery. A log in which nothing drives the
-    vehicle (force or torque 0 throughout, or only time and speed) is a coast-down: `hdev_jax.energy.coastdown`. What the
-    log cannot tell is in the notes.
+    vehicle (force or torque 0 throughout, or only time and speed) is a coast-down: `hdev_jax.energy.coastdown`. What
+    the log cannot tell is in the notes.
 
     **Arguments:** `mass` [kg] at which the load holds, by default the log's mean or the sheet's; `coastdown`: take the
     log as a coast-down whatever it measures. **Returns:** an `EnergyResult` with the tables `road_load` and `force`.

@@ -44,9 +44,7 @@ def saved(
     name, sheet = battery_target(asked.log, target), asked.sheet(vehicle)
     first, then = trips_of(asked.log, before, "--before"), trips_of(asked.log, after, "--after")
     if both := set(first) & set(then):
-        raise InputError(
-            f"--before and --after both have trip '{asked.log.trip_names[min(both)]}'; each once is expected"
-        )
+        raise InputError(f"--before and --after both have trip '{asked.log.trip_names[min(both)]}'; one is expected")
     for trips, option in ((first, "--before"), (then, "--after")):
         if len(trips) < LEAST_TRIPS:
             raise InputError(f"{option}: {len(trips)} trip; at least {LEAST_TRIPS} are expected")
@@ -72,7 +70,7 @@ def _verdict(found: Saving) -> str:
         f"with the trips before as they are no number of further trips after would settle it (they can show "
         f"{100 * found.least_share:.2g} % or more)"
         if found.more_after is None
-        else f"{found.more_after} further trips after would settle it with a chance of 80 %, if it is as large as it looks"
+        else f"{found.more_after} further trips after would settle it (80 % chance, if it is as large as it looks)"
     )
     return f"not settled: {more}; or {found.more_both} further trips before and as many after"
 
@@ -85,8 +83,8 @@ def _answer(
     notes = list(fitted.notes)
     if moved:
         notes.append(
-            f"what else changed: {', '.join(moved)}; the kernel takes them out as far as the sheet has their effects, but "
-            "what it lacks there would count as saved"
+            f"what else changed: {', '.join(moved)}; the kernel takes them out as far as the sheet has their effects, "
+            "but what it lacks there would count as saved"
         )
     kwh = [found.expected_kwh * x for x in (found.share, found.lower, found.upper)]
     summary = {
@@ -102,8 +100,10 @@ def _answer(
         f"{len(after)} trips after, by {len(before)} trips before: {kwh[0]:.4g} kWh ({kwh[1]:.4g} to {kwh[2]:.4g})"
     )
     lines = [sentence, _verdict(found), "", f"{'what else changed':24s} {'before':>10s} {'after':>10s} {'sd':>7s}"]
-    lines += [f"{f'{r.what} [{r.unit}]':24s} {r.before:10.4g} {r.after:10.4g} {r.difference_sd:+7.2f}"
-              f"{'  differs' if r.differs else ''}" for r in others.itertuples()]  # fmt: skip
+    for r in records(others):
+        size = "-" if r["difference_sd"] is None else f"{r['difference_sd']:+.2f}"
+        what, differs = f"{r['what']} [{r['unit']}]", "  differs" if r["differs"] else ""
+        lines.append(f"{what:24s} {r['before']:10.4g} {r['after']:10.4g} {size:>7s}{differs}")
     lines += [f"vehicle: {fitted.how}", *(f"note: {note}" for note in notes)]
     tables = {"trips": found.trips, "circumstances": others}
     page = _page(fitted, found, others, kwh, notes, command)
@@ -117,6 +117,7 @@ def _page(
     percents = (
         100 * trips[["saved_kwh", "lower", "upper"]].to_numpy(float) / trips[["expected_kwh"]].abs().to_numpy(float)
     )
+    needed = "settled" if found.shown else "–" if found.more_after is None else f"{found.more_after} trips"
     whole = (100 * found.share, 100 * found.lower, 100 * found.upper)
     shown = others.assign(difference_sd=[f"{x:+.2f}".replace("-", "−") for x in others["difference_sd"]],
                           differs=np.where(others["differs"], "differs", ""))  # fmt: skip
@@ -125,14 +126,13 @@ def _page(
         [("Saved ", False), (_percent(found.share), True),
          (f" ({_percent(found.lower)} to {_percent(found.upper)}) of what the vehicle as it was before would have "
           f"taken; {_verdict(found)}.", False)],
-        [("Energy saved", span(*kwh) + " kWh", "90 % interval, on the trips after"),
+        [("Energy saved", span(kwh[0], kwh[1], kwh[2]) + " kWh", "90 % interval, on the trips after"),
          ("Expected without the change", words.number(found.expected_kwh, 4, "kWh"), f"{len(trips)} trips after"),
-         ("To settle it", "settled" if found.shown else "–" if found.more_after is None else f"{found.more_after} trips",
-          "further ones after, 80 % chance")],
+         ("To settle it", needed, "further ones after, 80 % chance")],
         [Section(
             "Trips after the change", "Expected: by the vehicle calibrated on the trips before, on the same speeds, "
             "slopes, loads and weather. Intervals of a trip have its noise and what the coefficients leave open.",
-            {"trips": (lambda: trip_intervals(list(trips["trip_id"]), *percents.T, "saved [% of expected]",
+            {"trips": (lambda: trip_intervals(list(trips["trip_id"]), percents, "saved [% of expected]",
                                               "Saved on each trip", whole),
                        "Share saved on each trip with its interval.", "Saved on each trip after the change.")},
             (table_of(trips, "Trips after the change", {
@@ -142,7 +142,7 @@ def _page(
             "What else changed", "Means of trips; the difference in standard deviations of trips. A large one is no "
             "fault by itself: the kernel takes out what it has a term for.",
             {}, (table_of(shown, "Circumstances", {
-                "what": "What", "unit": "unit", "before": "before", "after": "after", "difference_sd": "difference [sd]",
-                "differs": ""}, text=2),))],
+                "what": "What", "unit": "unit", "before": "before", "after": "after",
+                "difference_sd": "difference [sd]", "differs": ""}, text=2),))],
         notes, command, fitted.how,
     )  # fmt: skip

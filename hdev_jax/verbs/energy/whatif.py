@@ -1,22 +1,25 @@
 """The verb `whatif`: what a change of the vehicle, its load or the weather would cost on the trips as driven."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from hdev_jax.energy.change import Changed, Step, changed, parse_changes
 from hdev_jax.energy.fitted import Fitted, interval
-from hdev_jax.energy.ledger import TOTAL
+from hdev_jax.energy.ledger import SUM
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import differences, label, trip_intervals
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
 
 __all__ = ["whatif"]
+
+NOTHING = 1e-9  # kWh/100 km: a cause that the change leaves alone
 
 
 def whatif(
@@ -46,8 +49,9 @@ def whatif(
     asked = Asked.of("whatif", logs, adapter, effects, seed, options, place)
     measured = bool(asked.log.measured)
     name = battery_target(asked.log, target) if measured else target or "energy_wh"
-    fitted = fitted_for(asked, vehicle, name, measured=measured)
-    steps = parse_changes(fitted.problem, wanted)
+    problem = problem_for(asked, vehicle, name, measured=measured)
+    steps = parse_changes(problem, wanted)
+    fitted = fitted_for(problem, vehicle, calibrate=measured)
     return answered(asked, out, lambda command: _answer(fitted, steps, asked, command))
 
 
@@ -71,14 +75,18 @@ def _answer(fitted: Fitted, steps: list[Step], asked: Asked, command: str) -> En
         f"{percent[0]:+.2f} % ({percent[1]:+.2f} to {percent[2]:+.2f} %)"
     )
     lines = [sentence, "", f"{'cause':34s} {'kWh/100 km':>11s} {'90 % interval':>23s}"]
-    lines += [f"{label(str(r.cause)):34s} {r.difference:+11.4g} {f'{r.lower:+.3g} to {r.upper:+.3g}':>23s}"
-              for r in causes.itertuples() if abs(r.difference) > 1e-9 or r.cause == TOTAL]  # fmt: skip
+    for r in (r for r in records(causes) if abs(r["difference"]) > NOTHING or r["cause"] == SUM):
+        lines.append(f"{label(r['cause']):34s} {r['difference']:+11.4g} {_between(r):>23s}")
     lines += ["", f"{'trip':40s} {'kWh':>9s} {'change':>9s} {'90 % interval':>23s}"]
-    lines += [f"{r.trip_id!s:40s} {r.before_kwh:9.4g} {r.change_kwh:+9.4g} {f'{r.lower:+.3g} to {r.upper:+.3g}':>23s}"
-              for r in trips.itertuples()]  # fmt: skip
+    for r in records(trips):
+        lines.append(f"{r['trip_id']:40s} {r['before_kwh']:9.4g} {r['change_kwh']:+9.4g} {_between(r):>23s}")
     lines += [f"vehicle: {fitted.how}", *(f"note: {note}" for note in fitted.notes)]
     tables = {"trips": trips, "causes": causes}
     return EnergyResult("whatif", "\n".join(lines), summary, tables, _page(fitted, text, whole, trips, causes, command))
+
+
+def _between(r: Mapping[str, Any]) -> str:
+    return f"{r['lower']:+.3g} to {r['upper']:+.3g}"
 
 
 def _row(found: Changed, member: np.ndarray) -> dict[str, float]:
@@ -111,7 +119,7 @@ def _causes(found: Changed, km: float) -> pd.DataFrame:
     value, drawn = per * found.by.value.sum(axis=0), per * found.by.drawn.sum(axis=1)
     value, drawn = np.append(value, value.sum()), np.column_stack([drawn, drawn.sum(axis=1)])
     low, high = interval(drawn)
-    return pd.DataFrame({"cause": [*found.by.causes, TOTAL], "difference": value, "lower": low, "upper": high})
+    return pd.DataFrame({"cause": [*found.by.causes, SUM], "difference": value, "lower": low, "upper": high})
 
 
 def _page(
@@ -122,9 +130,8 @@ def _page(
     answer = [(f"{text}: ", False), (share, True),
               (f" energy on the trips as driven ({words.percent(100 * whole['relative_lower'], decimals=2)} to "
                f"{words.percent(100 * whole['relative_upper'], decimals=2)}).", False)]  # fmt: skip
-    rows = [(label(c), f"{d:+.3g}".replace("-", "−"), span(d, a, b))
-            for c, d, a, b in causes.itertuples(index=False) if abs(d) > 1e-9 or c == TOTAL]  # fmt: skip
-    shown = causes[(causes["difference"].abs() > 1e-9) | (causes["cause"] == TOTAL)]
+    shown = pd.DataFrame(causes[(causes["difference"].abs() > NOTHING) | (causes["cause"] == SUM)])
+    rows = [(label(r["cause"]), span(r["difference"], r["lower"], r["upper"])) for r in records(shown)]
     percents = trips[["relative", "relative_lower", "relative_upper"]].to_numpy(float) * 100
     return Page(
         "whatif", sheet.name, f"with {text}", synthetic(log, [sheet.name]), answer,
@@ -135,11 +142,11 @@ def _page(
             "Where the change comes from", "The bars add up to the whole.",
             {"causes": (lambda: differences(shown, "kWh/100 km", "Change by cause; line: 90 % interval"),
                         "Bars of the change by cause.", "Change of the energy by cause over all trips.")},
-            (Table("Change by cause [kWh/100 km]", ("Cause", "change", "change (90 % interval)"), rows),)),
+            (Table("Change by cause [kWh/100 km]", ("Cause", "change (90 % interval)"), rows),)),
          Section(
             "Trips", "Both vehicles on the same trips, speeds and stops.",
             {"trips": (lambda: trip_intervals(
-                list(trips["trip_id"]), *percents.T, "change of the trip's energy [%]", "Change of each trip",
+                list(trips["trip_id"]), percents, "change of the trip's energy [%]", "Change of each trip",
                 (100 * whole["relative"], 100 * whole["relative_lower"], 100 * whole["relative_upper"])),
                 "Change of each trip with its interval.", "Change of each trip's energy.")},
             (table_of(trips, "Trips", {"trip_id": "Trip", "km": "km", "before_kwh": "before [kWh]",
