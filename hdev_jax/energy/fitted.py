@@ -99,4 +99,4 @@ def calibrated_on(problem: Problem, trips: Sequence[int] | None = None) -> Fitte
 def interval(drawn: Float[np.ndarray, "draw *rest"], level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper end of the central interval of draws (first axis)."""
     low, high = np.quantile(drawn, [0.5 - level / 2, 0.5 + level / 2], axis=0)
-    return low, high
+    return np.asarray(low), np.asarray(high)

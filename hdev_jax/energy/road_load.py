@@ -133,7 +133,7 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     abc = force @ np.linalg.pinv(x).T
     low, high = interval(abc[1:])
     f_low, f_high = interval(force[1:])
-    notes = [*fitted.notes, *_left_open(fitted, abc[1:], driven)]
+    notes = [*fitted.notes, *_left_open(fitted, abc[1:], driven, mass_kg)]
     if passing:
         notes.append(f"no part of the road load: {', '.join(passing)}")
     return RoadLoad(
@@ -173,7 +173,9 @@ def _share_of(car: Vehicle, problem: Problem, thetas: np.ndarray, rows: Segments
     return np.asarray(both(jnp.asarray(thetas)))
 
 
-def _left_open(fitted: Fitted, abc: Float[np.ndarray, "draw 3"], driven: tuple[float, float]) -> list[str]:
+def _left_open(
+    fitted: Fitted, abc: Float[np.ndarray, "draw 3"], driven: tuple[float, float], mass_kg: float
+) -> list[str]:
     """What this log cannot tell, in sentences."""
     out, table = [], fitted.problem.table
     correlation = np.corrcoef(abc.T)
@@ -193,10 +195,10 @@ def _left_open(fitted: Fitted, abc: Float[np.ndarray, "draw 3"], driven: tuple[f
             f"90 % of the way was driven at {driven[0]:.0f} to {driven[1]:.0f} km/h: forces at other speeds are "
             "extrapolated"
         )
-    return [*out, *_held(fitted)]
+    return [*out, *_held(fitted, mass_kg)]
 
 
-def _held(fitted: Fitted) -> list[str]:
+def _held(fitted: Fitted, mass_kg: float) -> list[str]:
     """By how much A would be another if what the sheet holds were: auxiliary load, efficiency."""
     problem, out = fitted.problem, []
     if not TARGETS[problem.target].of_battery:
@@ -215,10 +217,6 @@ def _held(fitted: Fitted) -> list[str]:
         noise = max(float(np.var(problem.measured - fitted.predicted)), 1e-12)
         moved = -np.linalg.solve(kept.T @ kept / noise + precision, kept.T @ slopes[:, at] / noise)
         k = [c.path for c in table.free].index("road.c_rr")
-        force = step * float(moved[k]) * float(np.median(_mass(problem))) * GRAVITY_MPS2
+        force = step * float(moved[k]) * mass_kg * GRAVITY_MPS2
         out.append(f"{path} is held: were it {words} higher, A would be {force:+.3g} N")
     return out
-
-
-def _mass(problem: Problem) -> np.ndarray:
-    return np.atleast_1d(np.asarray(problem.segments.get("mass_kg", problem.vehicle.mass_kg), dtype=float))
