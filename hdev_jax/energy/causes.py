@@ -24,6 +24,7 @@ from hdev_jax.segments import Segments, trip_slices
 
 __all__ = ["ByCause", "by_cause", "same"]
 
+NOTHING_KWH = 1e-9  # rounding of a loss that is none
 Change = Callable[[Vehicle, Segments], tuple[Vehicle, Segments]]
 _FIRST = ("rolling", "rolling_linear", "aero", "grade", "inertia", "traction")  # then the chain's order
 
@@ -50,6 +51,20 @@ class ByCause:
 
         arrays = (np.stack([column(x, c) for c in causes], axis=-1) for x in (self.value, self.drawn))
         return ByCause(causes, *arrays)
+
+    def split(self, cause: str, parts: "ByCause", rest: str) -> "ByCause":
+        """`cause` told in `parts`, and what they leave of it as the cause `rest`; the sum stays as it is."""
+        at = self.causes.index(cause)
+        there = np.max(np.abs(parts.drawn), axis=(0, 1)) > NOTHING_KWH
+        names = tuple(c for c, x in zip(parts.causes, there, strict=True) if x and c not in self.causes)
+        parts = parts.over(names)
+        many = len(self.drawn), *parts.drawn.shape[1:]  # a vehicle that is known has but one draw
+        arrays = []
+        for whole, part in ((self.value, parts.value), (self.drawn, np.resize(parts.drawn, many))):
+            left = whole[..., at] - part.sum(axis=-1)
+            kept = whole[..., :at], part, left[..., None], whole[..., at + 1 :]
+            arrays.append(np.concatenate(kept, axis=-1))
+        return ByCause((*self.causes[:at], *names, rest, *self.causes[at + 1 :]), *arrays)
 
     def grouped(self, member: np.ndarray) -> "ByCause":
         """Sums over groups of trips; `member` [group, trip] has 1 where the trip is in the group (or its weight)."""

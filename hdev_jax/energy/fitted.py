@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
@@ -89,9 +88,8 @@ def calibrated_on(problem: Problem, trips: Sequence[int] | None = None) -> Fitte
     notes = () if fit.converged else (f"the calibration stopped early: {fit.message}",)
     if not problem.table.free:
         how = "every coefficient of the sheet is known: nothing was calibrated"
-    vehicle = jax.tree.map(np.asarray, fit.vehicle)
     fitted = Fitted(
-        problem, vehicle, fit.covariance, max(clusters.count - 1.0, 2.0), spread, how, (*problem.notes, *notes)
+        problem, fit.vehicle, fit.covariance, max(clusters.count - 1.0, 2.0), spread, how, (*problem.notes, *notes)
     )
     return fitted if problem.table.free else replace(fitted, covariance=np.zeros((0, 0)))
 

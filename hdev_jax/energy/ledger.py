@@ -30,6 +30,7 @@ __all__ = [
     "ledger_of",
 ]
 
+TRACTION_REST = "traction_unexplained"
 UNEXPLAINED, TOTAL, SUM = "unexplained", "measured", "all causes"
 PARKED_S = 300.0  # a stop of at least so long is parking; traffic lights and bus stops are shorter
 STANDING_MPS = 0.1
@@ -87,7 +88,7 @@ def _by(level: str, label: Mapping[int, str], trips: int) -> Groups:
     return Groups(level, names, member)
 
 
-def ledger_of(fitted: Fitted, *, price: float | None = None, seed: int = 0) -> Ledger:
+def ledger_of(fitted: Fitted, *, price: float | None = None, road: Fitted | None = None, seed: int = 0) -> Ledger:
     """Energy by cause, with 90 % intervals, of a log that measures it.
 
     What the battery gave, by cause as `causes` attributes it; *unexplained* is measured less the sum of the causes, so
@@ -95,12 +96,18 @@ def ledger_of(fitted: Fitted, *, price: float | None = None, seed: int = 0) -> L
     the kernel; that of *unexplained* has the noise of the trips besides: where it holds 0, what is left is no more than
     noise and coefficients allow.
 
-    **Arguments:** `price` of a kWh, in any currency. **Raises:** `InputError` where the target is not the battery's.
+    **Arguments:** `price` of a kWh, in any currency; `road`, the same vehicle fitted to the traction force or the motor
+    torque where the log measures that: what the drive gave is then told by road forces, and what these leave of it
+    (friction brakes, what the model lacks) is a cause of its own.
+
+    **Raises:** `InputError` where the target is not the battery's.
     """
     problem = fitted.problem
     if not TARGETS[problem.target].of_battery:
         raise InputError(f"a ledger is of battery energy or power, and {problem.target} is measured before the battery")
     parts = by_cause(fitted, fitted.draws(seed))
+    if road is not None:
+        parts = parts.split("traction", by_cause(road, road.draws(seed + 1)), TRACTION_REST)
     log = problem.log
     measured_wh = np.asarray(log.target("energy_wh"))
     flows = _flows(log, measured_wh)

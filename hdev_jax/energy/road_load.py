@@ -15,7 +15,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import insert, linearised, padded
 from hdev_jax.inference.sheet import Sheet
 from hdev_jax.inference.sheet.schema import Declared
-from hdev_jax.physics import Vehicle
+from hdev_jax.physics import LIBRARY, Vehicle, unavailable
 from hdev_jax.physics.tyres import REFERENCE_TEMP_C
 from hdev_jax.problem import Problem
 from hdev_jax.segments import Segments
@@ -30,6 +30,16 @@ SHOWN_KMH = (50.0, 80.0)
 WIDE = 0.5  # of a coefficient that the sheet gives without an sd: the log decides
 B_SHARE = 0.2  # of A that B·v is expected to be at most, at 20 m/s (f₁ of UN GTR 15's default loads is 0)
 TOGETHER, UNSAID = 0.95, 0.9  # correlation; sd over the table's: beyond these it is said
+# effect, its parameter, value and sd: the physics as it is, give or take what a weather station is off by; of rolling
+# resistance K₀ = 8.6·10⁻³/K of c_rr (UN GTR 15, annex 4)
+WEATHER = (
+    ("headwind", "scale", 1.0, 0.5),
+    ("air_density", "scale", 1.0, 0.1),
+    ("rolling_temperature", "per_k", -8.6e-3, 4e-3),
+)
+# Loads at the battery, which would else be a force: buses' cabins lose 0.1 to 1 kW/K (`HvacPower`), trucks' less
+LOADS = (("hvac_power", "below_w_per_k", 0.0, 150.0), ("hvac_power", "above_w_per_k", 0.0, 150.0))
+AUXILIARY_SD_W = 3e3  # of an auxiliary load that the sheet gives without an sd
 # What the road load is without: no wind, no bends, dry, nobody ahead.
 STILL = {
     "wind_speed_mps": 0.0, "wind_from_rad": 0.0, "heading_rad": 0.0, "curvature_1pm": 0.0, "wet_road": 0.0,
@@ -73,8 +83,14 @@ def driven_range(segments: Segments) -> tuple[float, float]:
     return low, high
 
 
-def open_sheet(sheet: Sheet, mass_kg: float) -> tuple[Sheet, list[str]]:
+def open_sheet(
+    sheet: Sheet, mass_kg: float, segments: Segments | None = None, *, battery: bool = True
+) -> tuple[Sheet, list[str]]:
     """The sheet with c_rr, C_d·A and B estimated: a number without an sd, or one that came from a log, gets a wide one.
+
+    Weather that the log (`segments`) has, and the sheet no effect for, is corrected as a coast-down's would be: wind
+    along the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is what is
+    measured, loads that would pass for a force are estimated too: the auxiliary one, heating and cooling.
 
     **Raises:** `InputError` for a sheet without `road.c_rr` or `road.cda_m2`.
     """
@@ -93,14 +109,30 @@ def open_sheet(sheet: Sheet, mass_kg: float) -> tuple[Sheet, list[str]]:
         sd = B_SHARE * declared["road.c_rr"].value * mass_kg * GRAVITY_MPS2 / 20.0
         declared["road.b_n_per_mps"] = Declared(0.0, sd)
         notes.append(f"the sheet has no road.b_n_per_mps: it is estimated, as 0 ± {sd:.2g} N·s/m before the log")
+    load = declared.get("battery.auxiliary_w", Declared(0.0))
+    if battery and load.sd is None and not load.groups:
+        declared["battery.auxiliary_w"] = replace(load, sd=AUXILIARY_SD_W)
+        notes.append(
+            f"battery.auxiliary_w is estimated beside the load, as {load.value:g} ± {AUXILIARY_SD_W:g} W before"
+        )
+    added = []
+    for effect_id, parameter, value, sd in (*WEATHER, *(LOADS if battery else ())):
+        known = any(p.startswith(f"effects.{effect_id}.") for p in sheet.declared)
+        if segments is not None and not known and unavailable(LIBRARY[effect_id], segments, "road") is None:
+            size = declared["road.c_rr"].value if effect_id == "rolling_temperature" else 1.0
+            declared[f"effects.{effect_id}.{parameter}"] = Declared(value * size, sd * size)
+            added.append(effect_id)
+    if added:
+        both = ", ".join(dict.fromkeys(added))
+        notes.append(f"corrected for weather in the log, estimated beside the load: {both}")
     other = copy.copy(sheet)
     other.declared = declared
     return other, notes
 
 
 @eqx.filter_jit
-def _forces(vehicle: Vehicle, structure: Any, thetas: Array, rows: Segments) -> Array:
-    return jax.lax.map(lambda theta: insert(vehicle, structure, theta).force(rows), thetas)
+def _forces(vehicle: Vehicle, structure: Any, thetas: Array, rows: Segments, without: tuple[str, ...]) -> Array:
+    return jax.lax.map(lambda theta: insert(vehicle, structure, theta).minus(*without).force(rows), thetas)
 
 
 def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
@@ -123,12 +155,7 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     car = replace_mass(fitted.vehicle, mass_kg)
     thetas = fitted.draws(seed, DRAWS)
     rows = _steady(problem, kmh / 3.6, mass_kg)
-    # of all effects, so that coefficients stay where they are; then without those that are no part of it
-    force = np.asarray(_forces(car, problem.table.structure, jnp.asarray(thetas), rows))
-    for effect_id in passing:
-        without = [c for c in problem.table.free if c.path.startswith(f"effects.{effect_id}.")]
-        if without or car.has(effect_id):
-            force = force - _share_of(car, problem, thetas, rows, effect_id)
+    force = np.asarray(_forces(car, problem.table.structure, jnp.asarray(thetas), rows, tuple(passing)))
     x = np.vander(kmh / 3.6, 3, increasing=True)
     abc = force @ np.linalg.pinv(x).T
     low, high = interval(abc[1:])
@@ -156,21 +183,6 @@ def _steady(problem: Problem, v: np.ndarray, mass_kg: float) -> Segments:
         channels["mass_kg"] = mass_kg
     rows = Segments.from_arrays(duration_s=np.ones(len(v)), speed_start_mps=v, speed_end_mps=v, **channels)
     return padded(rows, np.zeros(len(v)), len(v)).segments
-
-
-def _share_of(car: Vehicle, problem: Problem, thetas: np.ndarray, rows: Segments, effect_id: str) -> np.ndarray:
-    """What an effect adds to the force of these rows at these coefficients."""
-    structure = problem.table.structure
-
-    @eqx.filter_jit
-    def both(values: Array) -> Array:
-        def one(theta: Array) -> Array:
-            there = insert(car, structure, theta)
-            return there.force(rows) - there.minus(effect_id).force(rows)
-
-        return jax.lax.map(one, values)
-
-    return np.asarray(both(jnp.asarray(thetas)))
 
 
 def _left_open(

@@ -114,7 +114,7 @@ def problem_of(seed: int, sheet: dict):
 
 def test_the_load_of_a_vehicle_is_its_coefficients():
     _, problem = problem_of(3, {**SHEET, "road": {**SHEET["road"], "b_n_per_mps": 12.0}})
-    known = Fitted(problem, problem.vehicle, 1e-18 * np.eye(2), 200.0, None, "known")
+    known = Fitted(problem, problem.vehicle, 1e-18 * np.eye(len(problem.table.free)), 200.0, None, "known")
     load = in_service(known, 20e3)
     np.testing.assert_allclose(load.abc, [0.006 * 20e3 * G, 12.0, 0.5 * RHO * 5.6], rtol=1e-9)
     k = list(load.speeds_kmh).index(50.0)
@@ -133,7 +133,7 @@ def test_driving_tells_the_force_within_its_interval():
             inside.append(load.force_lower[k] <= force <= load.force_upper[k])
     assert np.median(off) < 0.03
     assert np.mean(inside) > 0.75
-    assert any("auxiliary_w is held" in note for note in load.notes)
+    assert any("driveline.efficiency is held" in note for note in load.notes)
 
 
 def test_numbers_without_an_sd_are_opened_and_it_is_said():
@@ -141,5 +141,6 @@ def test_numbers_without_an_sd_are_opened_and_it_is_said():
     assert opened.declared["road.c_rr"].sd == pytest.approx(0.003)
     assert opened.declared["road.cda_m2"].sd == 0.5
     assert any("road.c_rr of the sheet has no sd" in note for note in notes)
+    assert opened.declared["battery.auxiliary_w"].sd > 0
     with pytest.raises(InputError, match=r"road.cda_m2 is missing"):
         open_sheet(sheet_of_sections({**SHEET, "road": {"c_rr": 0.006}}), 20e3)

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hdev_jax.energy.fitted import Fitted
+from hdev_jax.energy.fitted import Fitted, calibrated_on
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED, Ledger, ledger_of
 from hdev_jax.energy.saved import conditions
 from hdev_jax.errors import InputError
+from hdev_jax.logs import Log
+from hdev_jax.problem import prepare
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import by_week, consumption, label, waterfall
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
+from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
@@ -51,14 +54,29 @@ def ledger(
     return answered(asked, out, lambda command: _answer(fitted, price, asked, command))
 
 
+def _road_of(fitted: Fitted, log: Log) -> tuple[Fitted | None, list[str]]:
+    """The vehicle fitted to what the drive gave, where the chain is entered there; why it cannot be, for the notes."""
+    problem = fitted.problem
+    if problem.vehicle.entry == "road":
+        return None, []
+    target = {"wheel": "traction_force_n", "shaft": "motor_torque_nm"}[problem.vehicle.entry]
+    try:
+        road = prepare(log, problem.sheet, target)
+    except InputError as e:
+        return None, [f"road forces are one cause, traction: {e}"]
+    if road.vehicle.entry != "road":
+        return None, ["road forces are one cause, traction: both torque and force are measured"]
+    return calibrated_on(road), [f"road forces are fitted to {TARGETS[target].label}"]
+
+
 def _answer(fitted: Fitted, price: float | None, asked: Asked, command: str) -> EnergyResult:
-    found = ledger_of(fitted, price=price, seed=asked.seed)
+    road, said = _road_of(fitted, asked.log)
+    found = ledger_of(fitted, price=price, road=road, seed=asked.seed)
     whole, about = _level(found.rows, "all"), records(found.about)[0]
-    notes = list(fitted.notes)
+    told = [n for n in fitted.notes if road is None or not n.startswith("[road] is not used")]
+    notes = [*told, *said]
     if found.undated:
         notes.append(f"{found.undated} trips have no date in the log: they are in no week")
-    if fitted.problem.vehicle.entry != "road":
-        notes.append("the log measures the drive's torque or force: road forces are one cause, traction")
     summary = {
         "schema": "hdev-ledger/1",
         "target": fitted.problem.target,

@@ -15,6 +15,7 @@ from hdev_jax.problem import derivable, prepare
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import forces
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
+from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.energy.opening import Asked, answered, synthetic
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
@@ -84,10 +85,10 @@ def _coasted(log: Log, sheet: Sheet, mass: float | None) -> RoadLoad:
 
 def _driven(log: Log, sheet: Sheet, target: str | None, mass: float | None, seed: int) -> RoadLoad:
     at = _mass_of(log, sheet)
-    opened, notes = open_sheet(sheet, at)
     nearest = "traction_force_n"
     if target is None:
         target = nearest if nearest in log.targets or derivable_here(log, sheet, nearest) else log.default_target
+    opened, notes = open_sheet(sheet, at, log.segments, battery=TARGETS[target].of_battery)
     problem = prepare(log, opened, target)
     load = in_service(calibrated_on(problem), at if mass is None else mass, seed=seed)
     return RoadLoad(**{**vars(load), "notes": (*notes, *load.notes)})
