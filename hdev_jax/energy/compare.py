@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+from scipy import sparse
 
 from hdev_jax.energy.causes import ByCause, by_cause
 from hdev_jax.energy.fitted import Fitted, interval
@@ -25,15 +26,14 @@ def compare_trips(fitted: Fitted, a: tuple[int, ...], b: tuple[int, ...], *, see
     names = len(log.trip_names)
     km = np.bincount(log.trip, weights=np.asarray(log.segments.distance_m) / 1e3, minlength=names)
     kwh = np.bincount(log.trip, weights=np.asarray(log.target("energy_wh")) / 1e3, minlength=names)
-    member = np.zeros((2, names))
+    weight = np.zeros((2, names))
     for row, trips in enumerate((a, b)):
         if not km[list(trips)].sum() > 0:
             which = ", ".join(log.trip_names[i] for i in trips)
             raise InputError(f"{which}: never moves; trips that go somewhere are expected")
-        member[row, list(trips)] = 100.0 / km[list(trips)].sum()
-    noise = np.array([fitted.noise_kwh(log.trip == i) if np.any(log.trip == i) else 0.0 for i in range(names)])
-    wobble = np.random.default_rng(seed).standard_t(fitted.freedom, (len(parts.drawn), names)) * noise
-    return _table(parts.grouped(member), member @ kwh, wobble @ member.T)
+        weight[row, list(trips)] = 100.0 / km[list(trips)].sum()
+    wobble = np.random.default_rng(seed).standard_t(fitted.freedom, (len(parts.drawn), names)) * fitted.noise_kwh()
+    return _table(parts.grouped(sparse.csr_array(weight)), weight @ kwh, wobble @ weight.T)
 
 
 def compare_sheets(a: Fitted, b: Fitted, *, seed: int = 0) -> pd.DataFrame:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from hdev_jax.inference import Spread, calibrate, cluster_rows, covariance_root,
 from hdev_jax.inference.calibrate import inside
 from hdev_jax.physics import Vehicle
 from hdev_jax.problem import Problem
+from hdev_jax.targets import TARGETS
 
 __all__ = ["DRAWS", "LEVEL", "Fitted", "calibrated_on", "interval"]
 
@@ -57,17 +59,22 @@ class Fitted:
         inner = [[inside(float(x), c.lower, c.upper) for x, c in zip(row, free, strict=True)] for row in drawn]
         return np.concatenate([at[None, :], np.asarray(inner)])
 
-    def noise_kwh(self, rows: np.ndarray) -> float:
-        """Standard deviation of the measured energy of these rows (a mask) of one trip about the model [kWh]."""
-        if self.spread is None:
-            return 0.0
-        p, s = self.problem, self.spread
-        per_kwh = {"energy_wh": 1e3, "battery_power_kw": 3600.0}[p.target]
-        weight = p.weight()[rows] / per_kwh
-        each = weight * np.sqrt(s.scale**2 + (s.growth * self.predicted[rows]) ** 2)
-        return float(np.sqrt(s.together * np.sum(each**2) + (s.level * np.sum(each)) ** 2))
+    def by_trip(self, column: Float[np.ndarray, " row"]) -> Float[np.ndarray, " trip"]:
+        """Sums over the trips of the log of a column in the target's unit [kWh]."""
+        problem = self.problem
+        weight = problem.weight() / (TARGETS[problem.target].per_kwh or 1.0)
+        return np.bincount(problem.log.trip, weights=weight * column, minlength=len(problem.log.trip_names))
 
-    @property
+    def noise_kwh(self) -> Float[np.ndarray, " trip"]:
+        """Standard deviation of the measured energy of each trip about the model [kWh]; 0 where it is not known."""
+        if self.spread is None:
+            return np.zeros(len(self.problem.log.trip_names))
+        problem, s = self.problem, self.spread
+        each = np.sqrt(s.scale**2 + (s.growth * self.predicted) ** 2)
+        alone = self.by_trip(problem.weight() * each**2) / (TARGETS[problem.target].per_kwh or 1.0)
+        return np.sqrt(s.together * alone + (s.level * self.by_trip(each)) ** 2)
+
+    @cached_property
     def predicted(self) -> Float[np.ndarray, " row"]:
         """The target's column at the estimates."""
         return self.problem.predict(self.vehicle)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from scipy import sparse
 
 from hdev_jax.energy.causes import ByCause, by_cause
 from hdev_jax.energy.fitted import Fitted, interval
@@ -23,6 +23,7 @@ __all__ = [
     "STANDING_MPS",
     "SUM",
     "TOTAL",
+    "TRACTION_REST",
     "UNEXPLAINED",
     "Groups",
     "Ledger",
@@ -44,7 +45,7 @@ class Groups:
 
     level: str
     names: tuple[str, ...]
-    member: Float[np.ndarray, "group trip"]
+    member: sparse.csr_array
 
 
 @dataclass(frozen=True)
@@ -61,17 +62,16 @@ def groups_of(log: Log) -> tuple[list[Groups], int]:
     """All trips, each vehicle where there are several, each week (ISO 8601) of trips with a date, each trip; and how
     many trips have no date."""
     names = log.trip_names
-    there = [i for i in range(len(names)) if np.any(log.trip == i)]
-    every = np.zeros((1, len(names)))
-    every[0, there] = 1.0
-    out = [Groups("all", ("all",), every)]
-    whose = {i: log.vehicle_names[int(np.asarray(log.segments.vehicle)[np.argmax(log.trip == i)])] for i in there}
-    weeks = {i: _week(log.started_s[names[i]]) for i in there if names[i] in log.started_s}
+    there, first = np.unique(log.trip, return_index=True)
+    vehicle = np.asarray(log.segments.vehicle)[first]
+    whose = {int(i): log.vehicle_names[int(k)] for i, k in zip(there, vehicle, strict=True)}
+    weeks = {i: _week(log.started_s[names[i]]) for i in whose if names[i] in log.started_s}
+    out = [_by("all", dict.fromkeys(whose, "all"), len(names))]
     if len(set(whose.values())) > 1:
         out.append(_by("vehicle", whose, len(names)))
     if weeks:
         out.append(_by("week", dict(sorted(weeks.items(), key=lambda x: x[1])), len(names)))
-    out.append(_by("trip", {i: names[i] for i in there}, len(names)))
+    out.append(_by("trip", {i: names[i] for i in whose}, len(names)))
     return out, len(there) - len(weeks)
 
 
@@ -82,10 +82,9 @@ def _week(seconds: float) -> str:
 
 def _by(level: str, label: Mapping[int, str], trips: int) -> Groups:
     names = tuple(dict.fromkeys(label.values()))
-    member = np.zeros((len(names), trips))
-    for trip, name in label.items():
-        member[names.index(name), trip] = 1.0
-    return Groups(level, names, member)
+    place = {name: k for k, name in enumerate(names)}
+    at = [place[name] for name in label.values()], list(label)
+    return Groups(level, names, sparse.csr_array((np.ones(len(label)), at), shape=(len(names), trips)))
 
 
 def ledger_of(fitted: Fitted, *, price: float | None = None, road: Fitted | None = None, seed: int = 0) -> Ledger:
@@ -111,16 +110,17 @@ def ledger_of(fitted: Fitted, *, price: float | None = None, road: Fitted | None
     log = problem.log
     measured_wh = np.asarray(log.target("energy_wh"))
     flows = _flows(log, measured_wh)
-    noise = np.array([fitted.noise_kwh(log.trip == i) for i in range(len(log.trip_names))])
+    noise = fitted.noise_kwh()
     wobble = np.random.default_rng(seed).standard_t(fitted.freedom, (len(parts.drawn), len(noise))) * noise
     groups, undated = groups_of(log)
     rows, about = [], []
     for g in groups:
         block = parts.grouped(g.member)
-        km, total, size = (g.member @ flows[k] for k in ("km", "measured", "size"))
+        sums = {k: g.member @ x for k, x in flows.items()}
+        km, total, size = (sums[k] for k in ("km", "measured", "size"))
         low, high = interval(block.drawn)
         left = total - block.value.sum(axis=1)
-        off = interval(total - block.drawn.sum(axis=2) + wobble @ g.member.T)
+        off = interval(total - block.drawn.sum(axis=2) + (g.member @ wobble.T).T)
         for k, name in enumerate(g.names):
             lines = [(c, block.value[k, j], low[k, j], high[k, j]) for j, c in enumerate(block.causes)]
             lines += [(UNEXPLAINED, left[k], off[0][k], off[1][k]), (TOTAL, total[k], total[k], total[k])]
@@ -132,8 +132,9 @@ def ledger_of(fitted: Fitted, *, price: float | None = None, road: Fitted | None
                      100.0 * kwh / total[k] if shares else np.nan,
                      np.nan if price is None else price * kwh)
                 )  # fmt: skip
-            sums = {n: float(g.member[k] @ x) for n, x in flows.items()}
-            about.append({"level": g.level, "name": name, **_about(sums, block, k)})
+            about.append(
+                {"level": g.level, "name": name, **_about({n: float(x[k]) for n, x in sums.items()}, block, k)}
+            )
     return Ledger(pd.DataFrame(rows, columns=list(COLUMNS)), pd.DataFrame(about), undated)
 
 

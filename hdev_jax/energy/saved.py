@@ -25,7 +25,6 @@ from hdev_jax.energy.ledger import STANDING_MPS
 from hdev_jax.errors import InputError
 from hdev_jax.inference import linearised, padded
 from hdev_jax.logs import Log
-from hdev_jax.physics import Vehicle
 from hdev_jax.problem import Problem
 
 __all__ = ["LEAST_TRIPS", "Saving", "circumstances", "conditions", "saving", "trips_of"]
@@ -104,9 +103,9 @@ def saving(fitted: Fitted, after: tuple[int, ...], *, level: float = LEVEL) -> S
     problem = fitted.problem
     if len(after) < LEAST_TRIPS or fitted.spread is None:
         raise InputError(f"--after: {len(after)} trip; at least {LEAST_TRIPS} are expected")
-    predicted, x = _totals(problem, fitted.vehicle, after)
-    measured = _by_trip(problem, np.asarray(problem.log.target("energy_wh")) / 1e3, after)
-    own = np.array([fitted.noise_kwh(problem.log.trip == i) ** 2 for i in after])
+    predicted, measured = (fitted.by_trip(y)[list(after)] for y in (fitted.predicted, problem.measured))
+    x = _slopes(fitted)[list(after)]
+    own = fitted.noise_kwh()[list(after)] ** 2
     r, opened = measured - predicted, x @ fitted.covariance @ x.T
     inverse = np.linalg.inv(np.diag(own) + opened)
     information = float(predicted @ inverse @ predicted)
@@ -150,22 +149,13 @@ def _further(
     return (math.ceil(trips * max(noise / room - 1.0, 0.0)) if room > 0 else None), both, least
 
 
-def _by_trip(problem: Problem, x: np.ndarray, trips: tuple[int, ...]) -> np.ndarray:
-    names = len(problem.log.trip_names)
-    return np.bincount(problem.log.trip, weights=x, minlength=names)[list(trips)]
-
-
-def _totals(
-    problem: Problem, vehicle: Vehicle, trips: tuple[int, ...]
-) -> tuple[Float[np.ndarray, " trip"], Float[np.ndarray, "trip free"]]:
-    """Predicted energy of trips [kWh] and its derivative in the free coefficients."""
+def _slopes(fitted: Fitted) -> Float[np.ndarray, "trip free"]:
+    """Derivative of each trip's energy in the free coefficients [kWh]."""
+    problem = fitted.problem
     rows = padded(problem.segments, problem.measured)
-    value, slope = linearised(vehicle, problem.table, rows.segments, problem.target)
-    per_kwh = {"energy_wh": 1e3, "battery_power_kw": 3600.0}[problem.target]
-    weight = problem.weight() / per_kwh
-    slopes = [_by_trip(problem, weight * s, trips) for s in slope[: rows.rows].T]
-    x = np.stack(slopes, axis=1) if slopes else np.zeros((len(trips), 0))
-    return _by_trip(problem, weight * value[: rows.rows], trips), x
+    _, slopes = linearised(fitted.vehicle, problem.table, rows.segments, problem.target)
+    each = [fitted.by_trip(s) for s in slopes[: rows.rows].T]
+    return np.stack(each, axis=1) if each else np.zeros((len(problem.log.trip_names), 0))
 
 
 def circumstances(problem: Problem, before: tuple[int, ...], after: tuple[int, ...]) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from hdev_jax.energy.causes import by_cause
 from hdev_jax.energy.change import changed, parse_changes
 from hdev_jax.energy.compare import compare_sheets, compare_trips
 from hdev_jax.energy.fitted import Fitted, calibrated_on
-from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED, ledger_of
+from hdev_jax.energy.ledger import TOTAL, TRACTION_REST, UNEXPLAINED, ledger_of
 from hdev_jax.energy.saved import circumstances, saving, trips_of
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
@@ -119,6 +119,37 @@ def test_intervals_of_causes_hold_what_was_planted():
     assert 0.78 <= np.mean(inside) <= 0.98  # 90 %, give or take the chance of 25 logs
 
 
+def test_measured_traction_is_told_by_road_forces_and_the_sum_stays():
+    log = synthetic_log(seed=5, trips=TRIPS, rows_per_trip=ROWS, entry="wheel", noise_level=0.02)
+    machine = {"motoring_efficiency": (0.93, 0.05), "regenerating_efficiency": (0.93, 0.05)}
+    sheet = sheet_of_sections({"mass_kg": 29e3, "road": SHEET["road"], "machine": machine})
+    frame = Log.from_frame(log.frame)
+    fitted = calibrated_on(prepare(frame, sheet))
+    road = calibrated_on(prepare(frame, sheet, "traction_force_n"))
+    one, two = (ledger_of(fitted, road=r).rows.query("level == 'all'").set_index("cause") for r in (None, road))
+    assert "rolling" not in one.index
+    assert {"rolling", "aero", "grade", "inertia", TRACTION_REST} <= {*two.index}
+    told = two["kwh"][["rolling", "aero", "grade", "inertia", TRACTION_REST]].sum()
+    assert told == pytest.approx(one.loc["traction", "kwh"])
+    assert abs(two.loc[TRACTION_REST, "kwh"]) < 0.02 * told  # the force of this log is what the road asks for
+    hours = np.asarray(frame.segments.duration_s) / 3600
+    rolling = log.vehicle.c_rr * 9.80665 * np.asarray(frame.segments.channels["mass_kg"])
+    kwh = float(np.sum(rolling * np.asarray(frame.segments.speed_mps) * hours)) / 1e3
+    assert two.loc["rolling", "kwh"] == pytest.approx(kwh, rel=0.02)
+
+
+def test_each_vehicle_of_a_log_has_a_block(fitted):
+    log = fitted.problem.log
+    second = (log.trip >= 4).astype(np.int32)
+    segments = replace(log.segments, vehicle=second)
+    two = replace(log, segments=segments, vehicle_names=("one", "two"))
+    problem = replace(fitted.problem, log=two, segments=replace(fitted.problem.segments, vehicle=second))
+    rows = ledger_of(replace(fitted, problem=problem)).rows
+    by = rows[rows["cause"] == TOTAL].set_index(["level", "name"])["kwh"]
+    assert by["vehicle", "one"] + by["vehicle", "two"] == pytest.approx(by["all", "all"])
+    assert by["vehicle", "one"] == pytest.approx(sum(by["trip", f"T0{k}"] for k in (1, 2, 3, 4)))
+
+
 def test_a_ledger_is_of_battery_energy(fitted):
     force = replace(fitted, problem=replace(fitted.problem, target="traction_force_n"))
     with pytest.raises(InputError, match="battery energy or power"):
@@ -203,8 +234,8 @@ def test_what_would_settle_it_shrinks_with_what_is_saved(fitted):
     table = small.trips
     np.testing.assert_allclose(table["expected_kwh"] - table["measured_kwh"], table["saved_kwh"])
     assert small.expected_kwh == pytest.approx(table["expected_kwh"].sum())
-    scaled = replace(fitted.problem.log, measured={"energy_wh": 0.99 * fitted.problem.log.measured["energy_wh"]})
-    more = saving(replace(before, problem=replace(fitted.problem, log=scaled)), later)
+    less = replace(fitted.problem, measured=0.99 * fitted.problem.measured)
+    more = saving(replace(before, problem=less), later)
     assert more.share == pytest.approx(small.share + 0.01 * (1 - small.share), abs=1e-6)
     with pytest.raises(InputError, match="at least 2"):
         saving(before, (6,))
