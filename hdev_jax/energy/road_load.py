@@ -139,7 +139,7 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     """A, B, C of the fitted vehicle: the forces of its road effects at steady speeds through the kernel.
 
     Effects that fade or that only instruments have (tyres that warm up, a brake that drags, a slope's error) are no
-    part of it, nor is the weather: the air has the standard density, tyres are at 20 °C. **Raises:** `InputError` where
+    part of it, nor is the weather: the air has the standard density, and it is 20 °C. **Raises:** `InputError` where
     the chain is entered behind the road.
     """
     problem = fitted.problem
@@ -161,8 +161,8 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     low, high = interval(abc[1:])
     f_low, f_high = interval(force[1:])
     notes = [*fitted.notes, *_left_open(fitted, abc[1:], driven, mass_kg)]
-    if passing:
-        notes.append(f"no part of the road load: {', '.join(passing)}")
+    if fading := [e for e in passing if e != "air_density"]:
+        notes.append(f"no part of the road load: {', '.join(fading)}")
     return RoadLoad(
         abc[0], low, high, kmh, force[0], f_low, f_high, mass_kg, driven,
         f"{fitted.how}, from {TARGETS[problem.target].label}", tuple(notes),

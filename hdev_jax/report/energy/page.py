@@ -74,7 +74,9 @@ def table_of(frame: pd.DataFrame, caption: str, columns: dict[str, str], *, text
     """Columns of a frame under other names, numbers to three digits."""
 
     def cell(x: Any) -> str:
-        return x if isinstance(x, str) else "–" if x is None or x != x else words.number(x)
+        if isinstance(x, str | int):
+            return str(x)
+        return "–" if x is None or x != x else words.number(x)
 
     rows = [tuple(cell(x) for x in row) for row in frame[list(columns)].itertuples(index=False)]
     return Table(caption, tuple(columns.values()), rows, text, file)

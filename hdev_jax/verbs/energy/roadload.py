@@ -120,21 +120,23 @@ def _answer(load: RoadLoad, sheet: Sheet, log: Log, command: str) -> EnergyResul
     lines += [f"{v:g} km/h: {load.force[k]:.5g} N, {load.force_lower[k]:.5g} to {load.force_upper[k]:.5g}"
               for v, k in zip(SHOWN_KMH, shown, strict=True)]  # fmt: skip
     lines += [f"note: {note}" for note in load.notes]
-    pieces = [(f"{n} = {words.number(v, digits, u)}", True) for n, v, u in zip(NAMES, load.abc, UNITS, strict=True)]
+    pieces = [(f"{n} = {words.number(v, 3, u)}", True) for n, v, u in zip(NAMES, load.abc, UNITS, strict=True)]
     answer = [p for k, piece in enumerate(pieces) for p in (((", ", False), piece) if k else (piece,))]
     answer.append((f" at {load.mass_kg:,.0f} kg on a flat road in still air.", False))
-    rows = [(n, span(v, a, b, digits), u)
+    rows = [(n, span(v, a, b), u)
             for n, v, a, b, u in zip(NAMES, load.abc, load.lower, load.upper, UNITS, strict=True)]  # fmt: skip
+    whole = force.assign(speed_kmh=force["speed_kmh"].astype(int))
     page = Page(
         "roadload", sheet.name, "its road load", synthetic(log, [sheet.name]), answer,
         [(f"Force at {v:g} km/h", span(load.force[k], load.force_lower[k], load.force_upper[k], digits), "N")
          for v, k in zip(SHOWN_KMH, shown, strict=True)],
         [Section(
-            "Road load", "Dry, straight and flat road, still air of the standard density, warm tyres.",
+            "Road load",
+            "Dry, straight and flat road at 20 °C, still air of the standard density, tyres as they were driven.",
             {"forces": (lambda: forces(load), "Force against speed with its interval.",
                         "Road load; what lies outside the grey band is extrapolated.")},
             (Table("Coefficients", ("Coefficient", "value (90 % interval)", "unit"), rows),
-             table_of(force, "Force", {"speed_kmh": "km/h", "force_n": "N", "lower": "from", "upper": "to"}, text=0)),
+             table_of(whole, "Force", {"speed_kmh": "km/h", "force_n": "N", "lower": "from", "upper": "to"}, text=0)),
         )],
         load.notes, command, load.how,
     )  # fmt: skip

@@ -66,13 +66,16 @@ def _verdict(found: Saving) -> str:
     """Whether it is settled, and what would settle it."""
     if found.shown:
         return "the interval does not hold 0: settled"
-    more = (
-        f"with the trips before as they are no number of further trips after would settle it (they can show "
-        f"{100 * found.least_share:.2g} % or more)"
-        if found.more_after is None
-        else f"{found.more_after} further trips after would settle it (80 % chance, if it is as large as it looks)"
+    both = f"{found.more_both} further trips before and as many after"
+    if found.more_after is None:
+        return (
+            f"not settled: further trips after alone would not settle it, since these trips before can show "
+            f"{100 * found.least_share:.2g} % or more; {both} would"
+        )
+    return (
+        f"not settled: {found.more_after} further trips after would settle it (80 % chance, if it is as large as it "
+        f"looks), or {both}"
     )
-    return f"not settled: {more}; or {found.more_both} further trips before and as many after"
 
 
 def _answer(
