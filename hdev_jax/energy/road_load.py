@@ -140,11 +140,13 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
 
     Effects that fade or that only instruments have (tyres that warm up, a brake that drags, a slope's error) are no
     part of it, nor is the weather: the air has the standard density, and it is 20 °C. **Raises:** `InputError` where
-    the chain is entered behind the road.
+    the chain is entered behind the road, or the log never moves.
     """
     problem = fitted.problem
     if problem.vehicle.entry != "road":
         raise InputError("the log measures torque or force without what separates them from the road: see hdev check")
+    if not np.any(np.asarray(problem.segments.distance_m)):
+        raise InputError("the log never moves; a log of driving is expected")
     driven = driven_range(problem.segments)
     kmh = speeds_kmh(driven)
     passing = [

@@ -25,8 +25,9 @@ def label(cause: str) -> str:
     return cause if cause in (UNEXPLAINED, TOTAL, SUM) else names.effect(cause)
 
 
-def waterfall(rows: pd.DataFrame, per: str = "kwh_per_100km", unit: str = "kWh/100 km") -> Any:
-    """Bars that begin where the one before ended, from nothing to the measured energy; one block of the ledger."""
+def waterfall(rows: pd.DataFrame, per: str, unit: str) -> Any:
+    """Bars that begin where the one before ended, from nothing to the measured energy; one block of the
+    ledger, by its column `per`."""
     lines = {str(r["cause"]): r for r in rows.to_dict("records")}
     total = lines.pop(TOTAL)
     k = total[per] / total["kwh"] if total["kwh"] else 1.0

@@ -155,12 +155,13 @@ def _page(fitted: Fitted, found: Ledger, price: float | None, asked: Asked, note
     place = [log.trip_names.index(name) for name in trips["name"]]
     against = {k: (u, x[place]) for k, (u, x) in conditions(problem).items()
                if k in ("speed in motion", "outside temperature", "mass")}  # fmt: skip
+    per = ("kwh_per_100km", "kWh/100 km") if about["km"] > 0 else ("kwh", "kWh")
     sections = [
         Section(
             "Where the energy goes",
             "Forces count at the wheel; the driveline's loss is what its efficiency makes of their sum. What the "
             "causes leave of the measured energy is unexplained; its interval has the noise of the trips besides.",
-            {"waterfall": (lambda: waterfall(whole), "Bars of energy by cause that add up to the measured energy.",
+            {"waterfall": (lambda: waterfall(whole, *per), "Bars of energy by cause that add up to what was measured.",
                            "Energy by cause over the whole log.")},
             (_causes(whole, price),),
         ),

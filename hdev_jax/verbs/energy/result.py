@@ -35,7 +35,7 @@ class EnergyResult:
         page: Page | Path,
     ):
         self.verb = verb
-        self.summary: dict[str, Any] = dict(summary)
+        self.summary: dict[str, Any] = _plain(dict(summary))
         self.tables: dict[str, pd.DataFrame] = dict(tables)
         self._answer, self._page = answer, page
 
@@ -99,8 +99,13 @@ class EnergyResult:
 
 def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:
     """Rows of a frame as JSON has them: plain numbers, None for what is none."""
-    out = []
-    for row in frame.to_dict("records"):
-        plain = {str(k): v.item() if hasattr(v, "item") else v for k, v in row.items()}
-        out.append({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in plain.items()})
-    return out
+    return _plain(frame.to_dict("records"))
+
+
+def _plain(x: Any) -> Any:
+    if isinstance(x, Mapping):
+        return {str(k): _plain(v) for k, v in x.items()}
+    if isinstance(x, list | tuple):
+        return [_plain(v) for v in x]
+    x = x.item() if hasattr(x, "item") else x
+    return None if isinstance(x, float) and not math.isfinite(x) else x

@@ -10,6 +10,7 @@ import pandas as pd
 from hdev_jax.energy.change import Changed, Step, changed, parse_changes
 from hdev_jax.energy.fitted import Fitted, interval
 from hdev_jax.energy.ledger import SUM
+from hdev_jax.errors import InputError
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import differences, label, trip_intervals
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
@@ -51,6 +52,8 @@ def whatif(
     name = battery_target(asked.log, target) if measured else target or "energy_wh"
     problem = problem_for(asked, vehicle, name, measured=measured)
     steps = parse_changes(problem, wanted)
+    if not np.any(np.asarray(asked.log.segments.distance_m)):
+        raise InputError("the log never moves; a log of driving is expected")
     fitted = fitted_for(problem, vehicle, calibrate=measured)
     return answered(asked, out, lambda command: _answer(fitted, steps, asked, command))
 
