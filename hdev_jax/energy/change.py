@@ -12,7 +12,7 @@ from hdev_jax.energy.causes import ByCause, by_cause
 from hdev_jax.energy.fitted import Fitted
 from hdev_jax.errors import InputError
 from hdev_jax.inference.parameters import leaf_of
-from hdev_jax.inference.sheet.schema import KEYS
+from hdev_jax.inference.sheet.schema import KEYS, effect_key
 from hdev_jax.logs.adapter import near
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
 from hdev_jax.problem import Problem
@@ -97,6 +97,10 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
 
 def _in_range(problem: Problem, step: Step) -> None:
     key = KEYS.get(step.key)
+    if step.key.startswith("effects."):
+        _, effect_id, name = step.key.split(".")
+        effect = problem.sheet.library[effect_id]
+        key = effect_key(effect, next(p for p in effect.parameters if p.name == name))
     if key is None:
         return
     old = problem.segments.channels[step.key] if step.channel else leaf_of(problem.vehicle, step.key)

@@ -1,5 +1,6 @@
 """A vehicle with the uncertainty of its coefficients: calibrated on a log, or as a fit before has left it."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,13 +11,15 @@ from scipy import stats
 
 from hdev_jax.inference import Spread, calibrate, cluster_rows, covariance_root, left_out, padded
 from hdev_jax.inference.calibrate import inside
+from hdev_jax.inference.sheet import Sheet
 from hdev_jax.physics import Vehicle
 from hdev_jax.problem import Problem
 from hdev_jax.targets import TARGETS
 
-__all__ = ["DRAWS", "LEVEL", "Fitted", "calibrated_on", "interval"]
+__all__ = ["DRAWS", "LEVEL", "WIDE", "Fitted", "calibrated_on", "forgotten", "interval"]
 
 DRAWS = 256  # points of a Sobol sequence: quantiles of 5 and 95 % are within about 2 % of a standard deviation
+WIDE = 0.5  # sd over value of a coefficient of which nothing is to be known before the log
 LEVEL = 0.9  # probability inside every interval
 
 
@@ -99,6 +102,25 @@ def calibrated_on(problem: Problem, trips: Sequence[int] | None = None) -> Fitte
         problem, fit.vehicle, fit.covariance, max(clusters.count - 1.0, 2.0), spread, how, (*problem.notes, *notes)
     )
     return fitted if problem.table.free else replace(fitted, covariance=np.zeros((0, 0)))
+
+
+def forgotten(sheet: Sheet) -> tuple[Sheet, list[str]]:
+    """The sheet with estimates that came from a log, perhaps from this very one, as rough values: half of each is its
+    sd, so that a calibration decides by its own trips; and a note that says so."""
+    declared, names = dict(sheet.declared), []
+    for path, d in sheet.declared.items():
+        if d.estimated and (d.sd is not None or d.groups):
+            groups = {k: (x, _rough(x, sd)) for k, (x, sd) in d.groups.items()}
+            declared[path] = replace(d, sd=_rough(d.value, d.sd), groups=groups)
+            names.append(path)
+    other = copy.copy(sheet)
+    other.declared = declared
+    what = f"{', '.join(names)} of the sheet came from a log: estimated anew from these trips alone"
+    return (other, [what]) if names else (sheet, [])
+
+
+def _rough(value: float, sd: float | None) -> float | None:
+    return None if sd is None else max(WIDE * abs(value), sd)
 
 
 def interval(drawn: Float[np.ndarray, "draw *rest"], level: float = LEVEL) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hdev_jax.energy.fitted import DRAWS, Fitted, interval
+from hdev_jax.energy.fitted import DRAWS, WIDE, Fitted, forgotten, interval
 from hdev_jax.errors import InputError
 from hdev_jax.inference import insert, linearised, padded
 from hdev_jax.inference.sheet import Sheet
@@ -27,7 +27,6 @@ __all__ = ["NAMES", "SHOWN_KMH", "UNITS", "RoadLoad", "driven_range", "in_servic
 NAMES = ("A", "B", "C")
 UNITS = ("N", "N/(m/s)", "N/(m/s)²")
 SHOWN_KMH = (50.0, 80.0)
-WIDE = 0.5  # of a coefficient that the sheet gives without an sd: the log decides
 B_SHARE = 0.2  # of A that B·v is expected to be at most, at 20 m/s (f₁ of UN GTR 15's default loads is 0)
 TOGETHER, UNSAID = 0.95, 0.9  # correlation; sd over the table's: beyond these it is said
 # effect, its parameter, value and sd: the physics as it is, give or take what a weather station is off by; of rolling
@@ -94,17 +93,17 @@ def open_sheet(
 
     **Raises:** `InputError` for a sheet without `road.c_rr` or `road.cda_m2`.
     """
-    declared, notes = dict(sheet.declared), []
+    sheet, notes = forgotten(sheet)
+    declared = dict(sheet.declared)
     for path in ("road.c_rr", "road.cda_m2"):
         if path not in declared:
             raise sheet.fail(path, "the road load is estimated from it on")
         d = declared[path]
         if d.groups or d.per_vehicle:
             raise InputError(f"sheet {sheet.path}: {path} is per vehicle; the sheet of one vehicle is expected")
-        if d.sd is None or d.estimated:
-            declared[path] = replace(d, sd=WIDE * max(abs(d.value), 1e-4), estimated=False)
-            why = "came from a log" if d.estimated else "has no sd"
-            notes.append(f"{path} of the sheet {why}: it is estimated from this log alone, from {d.value:g} on")
+        if d.sd is None:
+            declared[path] = replace(d, sd=WIDE * max(abs(d.value), 1e-4))
+            notes.append(f"{path} of the sheet has no sd: it is estimated from this log alone, from {d.value:g} on")
     if not {"road.b_n_per_mps", "effects.rolling_linear.n_per_mps"} & {*declared}:
         sd = B_SHARE * declared["road.c_rr"].value * mass_kg * GRAVITY_MPS2 / 20.0
         declared["road.b_n_per_mps"] = Declared(0.0, sd)

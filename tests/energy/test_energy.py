@@ -8,7 +8,7 @@ import pytest
 from hdev_jax.energy.causes import by_cause
 from hdev_jax.energy.change import changed, parse_changes
 from hdev_jax.energy.compare import compare_sheets, compare_trips
-from hdev_jax.energy.fitted import Fitted, calibrated_on
+from hdev_jax.energy.fitted import Fitted, calibrated_on, forgotten
 from hdev_jax.energy.ledger import TOTAL, TRACTION_REST, UNEXPLAINED, ledger_of
 from hdev_jax.energy.saved import circumstances, saving, trips_of
 from hdev_jax.errors import InputError
@@ -239,6 +239,16 @@ def test_what_would_settle_it_shrinks_with_what_is_saved(fitted):
     assert more.share == pytest.approx(small.share + 0.01 * (1 - small.share), abs=1e-6)
     with pytest.raises(InputError, match="at least 2"):
         saving(before, (6,))
+
+
+def test_what_a_log_told_is_forgotten_before_a_calibration_on_part_of_it():
+    from_log = {"value": 0.0061, "sd": 0.0001, "estimated": True}
+    sheet = sheet_of_sections({**SHEET, "road": {"c_rr": from_log, "cda_m2": (5.6, 0.5)}})
+    opened, (note,) = forgotten(sheet)
+    assert opened.declared["road.c_rr"].sd == pytest.approx(0.5 * 0.0061)
+    assert opened.declared["road.cda_m2"] == sheet.declared["road.cda_m2"]
+    assert "road.c_rr of the sheet came from a log" in note
+    assert forgotten(opened_table := sheet_of_sections(SHEET)) == (opened_table, [])
 
 
 def test_what_else_changed_is_in_standard_deviations_of_trips(fitted):

@@ -11,8 +11,15 @@ import pytest
 
 import hdev_jax
 from hdev_jax import cli
+from hdev_jax.energy.causes import by_cause
+from hdev_jax.energy.fitted import Fitted
 from hdev_jax.fleet import SyntheticLog, synthetic_log
+from hdev_jax.inference.sheet import sheet_of_sections
+from hdev_jax.inference.states import Switching
+from hdev_jax.logs import Log
 from hdev_jax.options.energy import ENERGY_VERBS
+from hdev_jax.problem import prepare
+from hdev_jax.verbs.online import given_states, states_of
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +134,27 @@ def test_a_coast_down_is_known_by_what_it_lacks(tmp_path):
     force = found.tables["force"].set_index("speed_kmh")
     assert force.loc[50.0, "force_n"] == pytest.approx(160.0 + 0.4 * (50 / 3.6) ** 2, rel=0.03)
     assert any("no road.rotating_mass_factor" in note for note in found.summary["notes"])
+
+
+def test_a_load_that_switches_is_on_where_the_power_shows_it():
+    rng = np.random.default_rng(1)
+    on = np.zeros(600)
+    on[100:250] = on[400:480] = 1.0
+    sheet = {"mass_kg": 2e4, "road": {"c_rr": 0.006, "cda_m2": 5.6}, "driveline": {"efficiency": 0.9}}
+    switching = {"power_w": 8e3, "memory_s": 60.0, **{f"share_{k}c": 0.4 for k in (0, 10, 20, 30)}}
+    frame = {"time_s": np.arange(600.0), "speed_mps": np.full(600, 12.0), "battery_power_kw": np.ones(600)}
+    plain = prepare(Log.from_frame(frame), sheet_of_sections(sheet))
+    frame["battery_power_kw"] = plain.predict(plain.vehicle) + 8.0 * on + 0.3 * rng.normal(size=600)
+    problem = prepare(Log.from_frame(frame), sheet_of_sections({**sheet, "effects": {"switching_load": switching}}))
+    model = Switching(np.array([8e3]), 0.0, np.full(2, 400.0), np.full((1, 4), 0.4), np.full(1, 60.0))
+    given = given_states(problem, {"states": states_of(("switching_load",), model)})
+    assert given is not None
+    np.testing.assert_allclose(np.asarray(given.segments.channels["derived:switching_load"]), on, atol=0.05)
+    fitted = Fitted(given, given.vehicle, np.zeros((0, 0)), 200.0, None, "known")
+    parts = by_cause(fitted, fitted.draws(0))
+    assert parts.value[0, parts.causes.index("switching_load")] == pytest.approx(8.0 * on.sum() / 3600, rel=0.02)
+    assert given_states(problem, {}) is None
+    assert given_states(plain, {"states": states_of(("switching_load",), model)}) is None
 
 
 REFUSED = {

@@ -25,6 +25,7 @@ from hdev_jax.verbs.opening import (
     Effects,
     Logs,
     Vehicles,
+    digest,
     digest_of_effects,
     digest_of_vehicle,
     known_effects,
@@ -33,7 +34,7 @@ from hdev_jax.verbs.opening import (
     sheet_of,
     tried,
 )
-from hdev_jax.verbs.result import Result
+from hdev_jax.verbs.result import PREDICTIVE, Result
 
 __all__ = ["Asked", "answered", "battery_target", "fitted_for", "problem_for", "synthetic"]
 
@@ -77,7 +78,7 @@ class Asked:
         for name, (vehicle, sheet) in self.sheets.items():
             sheets |= {name: named(vehicle), f"{name}_sha256": digest_of_vehicle(vehicle, sheet)}
             if isinstance(vehicle, str | Path):
-                sheets[f"{name}_beside"] = str(beside_sheet(Path(vehicle)))
+                sheets[f"{name}_beside_sha256"] = digest(Path(vehicle).parent / PREDICTIVE)
         return {
             "verb": self.verb, "logs": [named(p) for p in logs], "log_sha256": self.log.fingerprint(), **sheets,
             "adapter": None if self.adapter is None else str(self.adapter),

@@ -1,11 +1,12 @@
 """The verb `saved`: what a change has saved, by the trips before it and after it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from hdev_jax.energy.fitted import Fitted, calibrated_on
+from hdev_jax.energy.fitted import Fitted, calibrated_on, forgotten
 from hdev_jax.energy.saved import LEAST_TRIPS, Saving, circumstances, saving, trips_of
 from hdev_jax.errors import InputError
 from hdev_jax.problem import prepare
@@ -48,11 +49,13 @@ def saved(
     for trips, option in ((first, "--before"), (then, "--after")):
         if len(trips) < LEAST_TRIPS:
             raise InputError(f"{option}: {len(trips)} trip; at least {LEAST_TRIPS} are expected")
-    problem = prepare(asked.log, sheet, name)
+    opened, notes = forgotten(sheet)
+    problem = prepare(asked.log, opened, name)
     tried(problem, known_effects(effects), effects)
 
     def work(command: str) -> EnergyResult:
         fitted = calibrated_on(problem, first)
+        fitted = replace(fitted, notes=(*notes, *fitted.notes))
         return _answer(fitted, saving(fitted, then), first, then, command)
 
     return answered(asked, out, work)
