@@ -21,13 +21,15 @@ from hdev_jax.energy.fitted import Fitted
 from hdev_jax.inference import Shapes, chunks_of_fit, insert, padded
 from hdev_jax.physics import DECLARED, LIBRARY, Vehicle
 from hdev_jax.physics.effect import STAGES
+from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
+from hdev_jax.physics.tyres import RollingLinear
 from hdev_jax.segments import Segments, trip_slices
 
 __all__ = ["ByCause", "by_cause", "same"]
 
 NOTHING_KWH = 1e-9  # rounding of a loss that is none
 Change = Callable[[Vehicle, Segments], tuple[Vehicle, Segments]]
-_FIRST = ("rolling", "rolling_linear", "aero", "grade", "inertia", "traction")  # then the chain's order
+_FIRST = (*(c.id for c in (Rolling, RollingLinear, Aero, Grade, Inertia)), "traction")  # then the chain's order
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from hdev_jax.inference.parameters import leaf_of
 from hdev_jax.inference.sheet.schema import KEYS, effect_key
 from hdev_jax.logs.adapter import near
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
+from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.problem import Problem
 from hdev_jax.segments import Segments
 
@@ -61,7 +62,7 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
     coefficients = [c.path for c in problem.table.rows]
     if problem.vehicle.entry == "road":
         coefficients += [p for p in ("mass_kg", "road.rotating_mass_factor") if p not in coefficients]
-    if "battery.auxiliary_w" not in coefficients and problem.vehicle.has("auxiliary"):
+    if "battery.auxiliary_w" not in coefficients and problem.vehicle.has(Auxiliary.id):
         coefficients.append("battery.auxiliary_w")
     channels = [k for k in problem.segments.channels if k not in _MEASURED and ":" not in k]
     out = []

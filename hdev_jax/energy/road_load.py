@@ -15,8 +15,10 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import insert, linearised, padded
 from hdev_jax.inference.sheet import Sheet
 from hdev_jax.inference.sheet.schema import Declared
-from hdev_jax.physics import LIBRARY, Vehicle, unavailable
-from hdev_jax.physics.tyres import REFERENCE_TEMP_C
+from hdev_jax.physics import Vehicle, unavailable
+from hdev_jax.physics.loads import HvacPower
+from hdev_jax.physics.road import AirDensity, Headwind
+from hdev_jax.physics.tyres import REFERENCE_TEMP_C, RollingLinear, RollingTemperature
 from hdev_jax.problem import Problem
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS
@@ -32,12 +34,12 @@ TOGETHER, UNSAID = 0.95, 0.9  # correlation; sd over the table's: beyond these i
 # effect, its parameter, value and sd: the physics as it is, give or take what a weather station is off by; of rolling
 # resistance K₀ = 8.6·10⁻³/K of c_rr (UN GTR 15, annex 4)
 WEATHER = (
-    ("headwind", "scale", 1.0, 0.5),
-    ("air_density", "scale", 1.0, 0.1),
-    ("rolling_temperature", "per_k", -8.6e-3, 4e-3),
+    (Headwind, "scale", 1.0, 0.5),
+    (AirDensity, "scale", 1.0, 0.1),
+    (RollingTemperature, "per_k", -8.6e-3, 4e-3),
 )
 # Loads at the battery, which would else be a force: buses' cabins lose 0.1 to 1 kW/K (`HvacPower`), trucks' less
-LOADS = (("hvac_power", "below_w_per_k", 0.0, 150.0), ("hvac_power", "above_w_per_k", 0.0, 150.0))
+LOADS = ((HvacPower, "below_w_per_k", 0.0, 150.0), (HvacPower, "above_w_per_k", 0.0, 150.0))
 AUXILIARY_SD_W = 3e3  # of an auxiliary load that the sheet gives without an sd
 # What the road load is without: no wind, no bends, dry, nobody ahead.
 STILL = {
@@ -104,7 +106,7 @@ def open_sheet(
         if d.sd is None:
             declared[path] = replace(d, sd=WIDE * max(abs(d.value), 1e-4))
             notes.append(f"{path} of the sheet has no sd: it is estimated from this log alone, from {d.value:g} on")
-    if not {"road.b_n_per_mps", "effects.rolling_linear.n_per_mps"} & {*declared}:
+    if not {"road.b_n_per_mps", f"effects.{RollingLinear.id}.n_per_mps"} & {*declared}:
         sd = B_SHARE * declared["road.c_rr"].value * mass_kg * GRAVITY_MPS2 / 20.0
         declared["road.b_n_per_mps"] = Declared(0.0, sd)
         notes.append(f"the sheet has no road.b_n_per_mps: it is estimated, as 0 ± {sd:.2g} N·s/m before the log")
@@ -115,12 +117,12 @@ def open_sheet(
             f"battery.auxiliary_w is estimated beside the load, as {load.value:g} ± {AUXILIARY_SD_W:g} W before"
         )
     added = []
-    for effect_id, parameter, value, sd in (*WEATHER, *(LOADS if battery else ())):
-        known = any(p.startswith(f"effects.{effect_id}.") for p in sheet.declared)
-        if segments is not None and not known and unavailable(LIBRARY[effect_id], segments, "road") is None:
-            size = declared["road.c_rr"].value if effect_id == "rolling_temperature" else 1.0
-            declared[f"effects.{effect_id}.{parameter}"] = Declared(value * size, sd * size)
-            added.append(effect_id)
+    for effect, parameter, value, sd in (*WEATHER, *(LOADS if battery else ())):
+        known = any(p.startswith(f"effects.{effect.id}.") for p in sheet.declared)
+        if segments is not None and not known and unavailable(effect, segments, "road") is None:
+            size = declared["road.c_rr"].value if effect is RollingTemperature else 1.0
+            declared[f"effects.{effect.id}.{parameter}"] = Declared(value * size, sd * size)
+            added.append(effect.label)
     if added:
         both = ", ".join(dict.fromkeys(added))
         notes.append(f"corrected for weather in the log, estimated beside the load: {both}")
@@ -151,7 +153,7 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     passing = [
         e.id
         for e in fitted.vehicle.effects
-        if e.id == "air_density" or any(e.overrides(h) for h in ("derive", "across", "sense", "observe"))
+        if e.id == AirDensity.id or any(e.overrides(h) for h in ("derive", "across", "sense", "observe"))
     ]
     car = replace_mass(fitted.vehicle, mass_kg)
     thetas = fitted.draws(seed, DRAWS)
@@ -162,7 +164,7 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     low, high = interval(abc[1:])
     f_low, f_high = interval(force[1:])
     notes = [*fitted.notes, *_left_open(fitted, abc[1:], driven, mass_kg)]
-    if fading := [e for e in passing if e != "air_density"]:
+    if fading := [e for e in passing if e != AirDensity.id]:
         notes.append(f"no part of the road load: {', '.join(fading)}")
     return RoadLoad(
         abc[0], low, high, kmh, force[0], f_low, f_high, mass_kg, driven,
