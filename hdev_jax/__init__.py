@@ -12,6 +12,12 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.check import check
     from hdev_jax.verbs.diagnose import diagnose
     from hdev_jax.verbs.effects import effects
+    from hdev_jax.verbs.energy.compare import compare
+    from hdev_jax.verbs.energy.ledger import ledger
+    from hdev_jax.verbs.energy.result import EnergyResult
+    from hdev_jax.verbs.energy.roadload import roadload
+    from hdev_jax.verbs.energy.saved import saved
+    from hdev_jax.verbs.energy.whatif import whatif
     from hdev_jax.verbs.init import init
     from hdev_jax.verbs.predict import predict
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
@@ -22,6 +28,7 @@ __version__ = "0.1.0"
 __all__ = [
     "CalibrationResult",
     "Diagnosis",
+    "EnergyResult",
     "Log",
     "Prediction",
     "Segments",
@@ -30,18 +37,24 @@ __all__ = [
     "__version__",
     "calibrate",
     "check",
+    "compare",
     "diagnose",
     "effects",
     "init",
+    "ledger",
     "predict",
     "read_log",
     "read_sheet",
+    "roadload",
+    "saved",
     "simulate",
+    "whatif",
 ]
 
 _HOME = {
     "CalibrationResult": "hdev_jax.verbs.result",
     "Diagnosis": "hdev_jax.verbs.result",
+    "EnergyResult": "hdev_jax.verbs.energy.result",
     "Log": "hdev_jax.logs",
     "Prediction": "hdev_jax.verbs.result",
     "Sheet": "hdev_jax.inference.sheet",
@@ -54,6 +67,11 @@ _HOME = {
     "diagnose": "hdev_jax.verbs.diagnose",
     "effects": "hdev_jax.verbs.effects",
     "init": "hdev_jax.verbs.init",
+    "compare": "hdev_jax.verbs.energy.compare",
+    "saved": "hdev_jax.verbs.energy.saved",
+    "whatif": "hdev_jax.verbs.energy.whatif",
+    "roadload": "hdev_jax.verbs.energy.roadload",
+    "ledger": "hdev_jax.verbs.energy.ledger",
     "predict": "hdev_jax.verbs.predict",
     "simulate": "hdev_jax.verbs.simulate",
 }

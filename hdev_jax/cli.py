@@ -21,7 +21,19 @@ import shtab
 from hdev_jax import __version__
 from hdev_jax.compiling import compile_quickly, compiles_long, keep_compiled
 from hdev_jax.errors import InputError
-from hdev_jax.targets import TARGETS
+from hdev_jax.options.common import (
+    count,
+    effects_option,
+    file_argument,
+    log_files,
+    logs_and_sheet,
+    names,
+    out_options,
+    share,
+    split_options,
+    target_option,
+)
+from hdev_jax.options.energy import ENERGY_VERBS, energy_parsers
 
 __all__ = ["main", "parser"]
 
@@ -82,8 +94,8 @@ def parser() -> argparse.ArgumentParser:
         epilog="examples:\n  hdev check trips.csv\n  hdev check day1.csv.gz day2.csv.gz --vehicle truck.toml\n"
         "  hdev check other.mat --skeleton > adapter.toml",
     )
-    _logs(check, vehicle_required=False)
-    _effects(check)
+    logs_and_sheet(check, vehicle_required=False)
+    effects_option(check)
     check.add_argument(
         "--skeleton", action="store_true", help="print an adapter for these files, to be filled in, and stop"
     )
@@ -95,7 +107,7 @@ def parser() -> argparse.ArgumentParser:
         "with comments. Where the log's columns have other names, write NAME.adapter.toml instead, to be filled in.",
         epilog="examples:\n  hdev init trips.csv\n  hdev init other.csv --adapter other.adapter.toml",
     )
-    _log_files(init)
+    log_files(init)
     init.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="the folder (default: this one)")
 
     diagnose = verbs.add_parser(
@@ -108,20 +120,20 @@ def parser() -> argparse.ArgumentParser:
         "The folder gets report.html, diagnosis.json, figures/ and augmented_vehicle.toml, a sheet with the effects\n"
         "in it. A run that was stopped goes on with the same command.",
     )
-    _logs(diagnose)
-    _split(diagnose)
-    _effects(diagnose)
-    diagnose.add_argument("--only", type=_names, metavar="ID,ID", help="search only these effects")
-    diagnose.add_argument("--exclude", type=_names, metavar="ID,ID", help="leave these effects out of the search")
+    logs_and_sheet(diagnose)
+    split_options(diagnose)
+    effects_option(diagnose)
+    diagnose.add_argument("--only", type=names, metavar="ID,ID", help="search only these effects")
+    diagnose.add_argument("--exclude", type=names, metavar="ID,ID", help="leave these effects out of the search")
     diagnose.add_argument(
         "--fdr",
-        type=_share,
+        type=share,
         default=0.05,
         metavar="Q",
         help="highest FDR-adjusted p-value of an added effect (default: 0.05)",
     )
     diagnose.add_argument("--trust", action="store_true", help="search even where a unit or a sign is suspected")
-    _out(diagnose)
+    out_options(diagnose)
 
     calibrate = verbs.add_parser(
         "calibrate",
@@ -131,9 +143,9 @@ def parser() -> argparse.ArgumentParser:
         epilog="examples:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated\n"
         "  hdev calibrate trips.csv --vehicle truck.toml --method nuts --noise student_t --out drawn",
     )
-    _logs(calibrate)
-    _split(calibrate)
-    _effects(calibrate)
+    logs_and_sheet(calibrate)
+    split_options(calibrate)
+    effects_option(calibrate)
     calibrate.add_argument(
         "--method",
         choices=["map", "linear", "nuts"],
@@ -147,7 +159,7 @@ def parser() -> argparse.ArgumentParser:
         default="normal",
         help="student_t: outliers count less (default: normal)",
     )
-    _out(calibrate)
+    out_options(calibrate)
 
     predict = verbs.add_parser(
         "predict",
@@ -157,9 +169,9 @@ def parser() -> argparse.ArgumentParser:
         "and noise for the intervals beside it.",
         epilog="example:\n  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out predicted.csv",
     )
-    _logs(predict)
-    _target(predict)
-    _effects(predict)
+    logs_and_sheet(predict)
+    target_option(predict)
+    effects_option(predict)
     predict.add_argument(
         "--out",
         type=Path,
@@ -168,7 +180,7 @@ def parser() -> argparse.ArgumentParser:
         help="the file to write (.csv, .csv.gz or .parquet): trip_id, time_s, predicted, lower, upper, level",
     )
     level = "probability inside the interval (default: 0.9)"
-    predict.add_argument("--level", type=_share, default=0.9, metavar="P", help=level)
+    predict.add_argument("--level", type=share, default=0.9, metavar="P", help=level)
     predict.add_argument("--online", action="store_true", help="loads that switch follow the power of the rows before")
 
     simulate = verbs.add_parser(
@@ -179,7 +191,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="examples:\n  hdev simulate configs/studies/fleet.toml --out out/fleet\n"
         "  hdev check out/fleet/log.parquet/A.parquet --vehicle out/fleet/sheets/A.toml",
     )
-    _file(simulate, "config", "CONFIG", "what to simulate: a TOML file with at least a seed")
+    file_argument(simulate, "config", "CONFIG", "what to simulate: a TOML file with at least a seed")
     simulate.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
 
     demo = verbs.add_parser(
@@ -191,7 +203,9 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--out", type=Path, default=Path("hdev_demo"), metavar="DIR", help="the folder (default: hdev_demo)"
     )
-    demo.add_argument("--seed", type=_count, default=3, metavar="N", help="random seed of the log (default: 3)")
+    demo.add_argument("--seed", type=count, default=3, metavar="N", help="random seed of the log (default: 3)")
+
+    energy_parsers(verbs)
 
     verbs.add_parser(
         "effects",
@@ -199,76 +213,6 @@ def parser() -> argparse.ArgumentParser:
         description="List the effects that a diagnosis searches and a vehicle sheet can declare.",
     )
     return top
-
-
-def _file(verb: argparse.ArgumentParser, name: str, metavar: str, text: str, **options: Any) -> None:
-    """An argument that a shell completes with files."""
-    verb.add_argument(name, type=Path, metavar=metavar, help=text, **options).complete = shtab.FILE  # type: ignore[attr-defined]
-
-
-def _log_files(verb: argparse.ArgumentParser) -> None:
-    _file(verb, "logs", "LOG", "log files (.csv, .csv.gz, .parquet, .mat), read as one log", nargs="+")
-    _file(verb, "--adapter", "A.toml", "how to read files whose columns have other names or units")
-
-
-def _logs(verb: argparse.ArgumentParser, *, vehicle_required: bool = True) -> None:
-    _log_files(verb)
-    _file(verb, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=vehicle_required)
-
-
-def _target(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--target", choices=tuple(TARGETS), help="the signal to explain (default: the measured one nearest the battery)"
-    )
-
-
-def _split(verb: argparse.ArgumentParser) -> None:
-    _target(verb)
-    verb.add_argument(
-        "--train-trips",
-        type=_names,
-        metavar="A,B",
-        help="training trips; without --test-trips all others are test trips",
-    )
-    verb.add_argument(
-        "--test-trips",
-        type=_names,
-        metavar="C,D",
-        help="held-out test trips; without --train-trips all others are for training; with neither, "
-        "every third trip is held out",
-    )
-
-
-def _effects(verb: argparse.ArgumentParser) -> None:
-    _file(verb, "--effects", "FILE.py", "effects of your own, for the search and for the sheet")
-
-
-def _out(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
-    verb.add_argument("--seed", type=_count, default=0, metavar="N", help="random seed (default: 0)")
-
-
-def _names(text: str) -> tuple[str, ...]:
-    names = tuple(part.strip() for part in text.split(","))
-    if not all(names):
-        raise argparse.ArgumentTypeError(f"expected names with commas between them, found {text!r}")
-    return names
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < 1.0:
-        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, found {text!r}")
-    return value
-
-
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) < 2**32):
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 2^32 - 1, found {text!r}")
-    return int(text)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -298,7 +242,8 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
     with progress.shown():
-        return getattr(import_module(f"hdev_jax.verbs.{verb}"), verb)(**arguments)
+        home = f"energy.{verb}" if verb in ENERGY_VERBS else verb
+        return getattr(import_module(f"hdev_jax.verbs.{home}"), verb)(**arguments)
 
 
 def _print(result: Any) -> None:

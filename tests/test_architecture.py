@@ -25,9 +25,9 @@ LAYERS = [
     {"logs", "physics"},
     {"inference", "learn", "fleet"},
     {"problem"},
-    {"diagnosis"},
+    {"diagnosis", "energy"},
     {"report"},
-    {"verbs"},
+    {"options", "verbs"},
     {"cli", "experiments"},
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.physics import DECLARED, Effect, Grouped, Shape, Size, Vehicle
+from hdev_jax.physics import DECLARED, LIBRARY, Effect, Grouped, Shape, Size, Vehicle
 
-__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert", "insert_by"]
+__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert", "insert_by", "leaf_of"]
 
 # path in the sheet → (effect that holds it, its field)
-_DECLARED = {path: (c.id, field) for c in DECLARED for field, path in c.declared.items()}
+_DECLARED = {path: (c.id, field) for c in (*DECLARED, *LIBRARY.values()) for field, path in c.declared.items()}
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Coefficient:
         return f"{self.path}[{self.label}]" if self.group is not None else self.path
 
 
-def _leaf(vehicle: Vehicle, path: str) -> Any:
+def leaf_of(vehicle: Vehicle, path: str) -> Any:
     """The leaf at a path. Raises `KeyError` for a path that the vehicle does not have."""
     if path == "mass_kg":
         return vehicle.mass_kg
@@ -97,7 +97,7 @@ class ParameterTable:
 
     def values(self, vehicle: Vehicle) -> Float[np.ndarray, " free"]:
         """The free coefficients as they are in the vehicle."""
-        return np.array([_pick(_leaf(vehicle, c.path), c.group) for c in self.free], dtype=float)
+        return np.array([_pick(leaf_of(vehicle, c.path), c.group) for c in self.free], dtype=float)
 
     def insert(self, vehicle: Vehicle, values: Any) -> Vehicle:
         """A vehicle with these values for the free coefficients; traceable in `values`."""
@@ -111,11 +111,11 @@ def _pick(leaf: Any, group: int | None) -> Any:
 def insert(vehicle: Vehicle, structure: Any, values: Any) -> Vehicle:
     """`ParameterTable.insert` from the table's static structure."""
     for k, (path, group, _, _) in enumerate(structure):
-        where = lambda v, p=path: _leaf(v, p)  # noqa: E731
+        where = lambda v, p=path: leaf_of(v, p)  # noqa: E731
         if group is None:
             new: Any = values[k]
         else:
-            old = _leaf(vehicle, path)
+            old = leaf_of(vehicle, path)
             new = Grouped(jnp.asarray(old.values).at[group].set(values[k]), old.by)
         vehicle = eqx.tree_at(where, vehicle, new, is_leaf=lambda x: isinstance(x, Grouped))
     return vehicle
@@ -133,7 +133,7 @@ def insert_by(vehicle: Vehicle, structure: Any, values: Any, by: str) -> Vehicle
             effect = vehicle.effect(path.split(".")[1])
             if effect.overrides("across") or effect.overrides("observe"):
                 raise ValueError(f"{path} acts across rows; one value for all groups is accepted")
-        where = lambda v, p=path: _leaf(v, p)  # noqa: E731
+        where = lambda v, p=path: leaf_of(v, p)  # noqa: E731
         vehicle = eqx.tree_at(where, vehicle, Grouped(values[:, k], by))
     return vehicle
 

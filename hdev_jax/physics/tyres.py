@@ -1,5 +1,6 @@
 """What tyres and the road's surface cost beside the declared rolling resistance."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ class RollingSpeed(Effect):
 
 
 class RollingLinear(Effect):
-    """A force linear in speed, the B of a road load: b·v.
+    """A force linear in speed, the B of a road load: b·v. A sheet declares it as `[road] b_n_per_mps`.
 
     Oil in hubs and gears. Where the motor's speed goes with the vehicle's it is nearly iron loss in ω², and over a
     narrow range of speeds the linear part of a headwind.
@@ -55,6 +56,7 @@ class RollingLinear(Effect):
     )
     mistaken_for: ClassVar[Names] = ("iron_loss", "driveline_drag", "constant_headwind")
     separated_by: ClassVar[str] = "a coast-down from high speed in neutral and in gear"
+    declared: ClassVar[Mapping[str, str]] = {"n_per_mps": "road.b_n_per_mps"}
     n_per_mps: Any
 
     def force(self, row: Row, car: Car) -> Real:

@@ -17,6 +17,7 @@ _SUFFIXES = {"w", "s", "m", "mps", "nm", "n", "ohm", "rad", "c", "v", "mps2", "k
 _COEFFICIENTS = {
     "mass_kg": ("mass", "kg"),
     "road.c_rr": ("rolling resistance coefficient", ""),
+    "road.b_n_per_mps": ("force linear in speed", "N·s/m"),
     "road.cda_m2": ("drag area", "m²"),
     "road.rotating_mass_factor": ("rotating mass factor", ""),
     "driveline.efficiency": ("driveline efficiency", ""),

@@ -32,8 +32,8 @@ from hdev_jax.verbs.arguments import names_of, seed_of
 from hdev_jax.verbs.result import Result
 
 __all__ = [
-    "Effects", "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest", "known_effects", "log_of",
-    "opened", "sheet_of", "tried",
+    "Effects", "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest", "digest_of_effects",
+    "digest_of_vehicle", "known_effects", "log_of", "named", "opened", "sheet_of", "tried",
 ]  # fmt: skip
 
 Logs = Any  # a path or several, a `Log`, or a table in memory (pandas, polars, pyarrow, a mapping of arrays)
@@ -227,18 +227,18 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
-def _named(given: Any) -> str:
+def named(given: Any) -> str:
     """What a configuration calls an argument: a path as given, a thing in memory by its kind."""
     return str(given) if isinstance(given, str | Path) else type(given).__name__
 
 
-def _digest_of_vehicle(vehicle: Vehicles, sheet: Sheet) -> str:
+def digest_of_vehicle(vehicle: Vehicles, sheet: Sheet) -> str:
     if isinstance(vehicle, str | Path):
         return digest(Path(vehicle))
     return hashlib.sha256(augmented_sheet(sheet, {}, {}).encode()).hexdigest()
 
 
-def _digest_of_effects(effects: Effects) -> str | None:
+def digest_of_effects(effects: Effects) -> str | None:
     """Of the file, or of the files that hold the classes; raises `InputError` for a class that stands in none."""
     if effects is None or isinstance(effects, str | Path):
         return None if effects is None else digest(Path(effects))
@@ -295,10 +295,10 @@ def opened(
     tried(problem, known, effects, *candidates)
     config = {
         "verb": verb,
-        "logs": [_named(p) for p in (logs if isinstance(logs, list | tuple) else [logs])],
+        "logs": [named(p) for p in (logs if isinstance(logs, list | tuple) else [logs])],
         "log_sha256": problem.log.fingerprint(),
-        "vehicle": _named(vehicle),
-        "vehicle_sha256": _digest_of_vehicle(vehicle, sheet),
+        "vehicle": named(vehicle),
+        "vehicle_sha256": digest_of_vehicle(vehicle, sheet),
         "map_sha256": None if sheet.map_path is None else digest(sheet.map_path),
         "adapter": None if adapter is None else str(adapter),
         "target": problem.target,
@@ -306,8 +306,8 @@ def opened(
         "test_trips": split.names(split.test),
         "asked_train": None if train_trips is None else list(train_trips),
         "asked_test": None if test_trips is None else list(test_trips),
-        "effects_file": None if effects is None else _named(effects),
-        "effects_sha256": _digest_of_effects(effects) if kept else None,
+        "effects_file": None if effects is None else named(effects),
+        "effects_sha256": digest_of_effects(effects) if kept else None,
         "seed": seed,
         "x64": bool(jax.config.read("jax_enable_x64")),
     }

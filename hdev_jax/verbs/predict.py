@@ -1,9 +1,8 @@
 """The verb `predict`: what a sheet predicts of a log, with intervals for rows and trips outside the fit."""
 
 import hashlib
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +14,9 @@ from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, l
 from hdev_jax.problem import Problem, Split, derivable, prepare
 from hdev_jax.rundir import atomic_file
 from hdev_jax.targets import TARGETS
+from hdev_jax.verbs.beside import beside_sheet, covariance_of
 from hdev_jax.verbs.online import one_step_ahead
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles, digest, known_effects, log_of, sheet_of, tried
+from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of, tried
 from hdev_jax.verbs.result import PREDICTIVE, Prediction, Result
 
 __all__ = ["predict", "predictive_of", "sheet_digest", "strongly_correlated"]
@@ -102,7 +102,7 @@ def predict(
     sheet = sheet_of(vehicle, library)
     beside = vehicle.predictive if isinstance(vehicle, Result) else {}
     if isinstance(vehicle, str | Path):
-        beside = _beside(Path(vehicle))
+        beside = beside_sheet(Path(vehicle))
     if target is not None and target not in TARGETS:
         raise InputError(f"unknown target '{target}'; accepted: {', '.join(TARGETS)}")
     measures = target in log.targets if target else bool(log.targets)
@@ -114,7 +114,7 @@ def predict(
     rows = padded(problem.segments, problem.measured)
     jac = jacobian(problem.vehicle, problem.table, rows.segments, problem.target)[: len(log)]
     known = beside if beside.get("target") == problem.target and not beside.get("stale") else {}
-    x = jac @ _root(problem, known)
+    x = jac @ covariance_root(covariance_of(problem, known))
     spread = _spread(problem, predicted, x, known, measures)
     half = np.linalg.norm(x, axis=1)
     half = reach * half if spread is None else spread.rows(level, half, predicted)
@@ -172,52 +172,6 @@ def _warnings(problem: Problem, spread: Spread | None, beside: dict[str, Any], k
             "intervals may be wrong"
         )
     return out
-
-
-def _beside(sheet: Path) -> dict[str, Any]:
-    """The file beside a fitted sheet; `stale` alone where the sheet was changed since.
-
-    Raises `InputError` where the file is there and cannot be used.
-    """
-    path = sheet.parent / PREDICTIVE
-    try:
-        found = json.loads(path.read_text())
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as e:
-        raise InputError(f"{path}: does not read as JSON: {e}; fit the sheet again, or delete the file") from e
-    try:
-        same = found["sheet_sha256"] == digest(sheet)
-        names, matrix = found["covariance"]["names"], np.asarray(found["covariance"]["matrix"], dtype=float)
-        spread = {k: float(v) for k, v in found["spread"].items()}
-        right = (
-            found["target"] in TARGETS
-            and matrix.size == len(names) ** 2
-            and np.all(np.isfinite(matrix))
-            and {f.name for f in fields(Spread)} == set(spread)
-            and np.all(np.isfinite(list(spread.values())))
-            and min(spread["scale"], spread["freedom"], spread["total_freedom"], spread["row_s"]) > 0
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
-        raise InputError(f"{path}: {type(e).__name__}: {e}; fit the sheet again, or delete the file") from e
-    if not right:
-        raise InputError(
-            f"{path}: covariance or spread is not as hdev writes it; fit the sheet again, or delete the file"
-        )
-    return found if same else {"target": found["target"], "stale": True}
-
-
-def _root(problem: Problem, known: dict[str, Any]) -> Float[np.ndarray, "free free"]:
-    """A root of the coefficients' covariance, in the table's order; from their sds alone where there is no other."""
-    free = problem.table.free
-    names = known.get("covariance", {}).get("names", [])
-    covariance = np.diag([(c.sd or 0.0) ** 2 for c in free]).reshape(len(free), len(free))
-    there = [k for k, c in enumerate(free) if c.name in names]
-    if there:
-        at = [names.index(free[k].name) for k in there]
-        matrix = np.asarray(known["covariance"]["matrix"], dtype=float).reshape(len(names), len(names))
-        covariance[np.ix_(there, there)] = matrix[np.ix_(at, at)]
-    return covariance_root(covariance)
 
 
 def _spread(

@@ -137,6 +137,10 @@ REFUSED = {
     "effect without parameters": ("[effects.headwind]", ["effects.headwind", "scale"]),
     "effect at its null": ("[effects.headwind]\nscale = 0.0", ["effects.headwind", "scale", "not 0"]),
     "effect with shapes only": ("[effects.tyre_warmup]\ndistance_m = 5000.0", ["effects.tyre_warmup", "excess"]),
+    "a linear force twice": (
+        "[road]\nb_n_per_mps = 5.0\n[effects.rolling_linear]\nn_per_mps = 5.0",
+        ["road.b_n_per_mps", "effects.rolling_linear.n_per_mps", "one of them"],
+    ),
     "shape out of range": (
         "[effects.cabin_warmup]\npower_w = 900.0\ntau_s = -3.0", ["effects.cabin_warmup.tau_s", "-3", "60 or more"],
     ),

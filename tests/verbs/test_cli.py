@@ -15,9 +15,14 @@ import pytest
 import hdev_jax
 from hdev_jax import cli, progress
 from hdev_jax.errors import InputError
+from hdev_jax.options.energy import ENERGY_VERBS
 
-VERBS = ("check", "init", "diagnose", "calibrate", "predict", "simulate", "demo", "effects")
+VERBS = ("check", "init", "diagnose", "calibrate", "predict", "simulate", "demo", "effects", *ENERGY_VERBS)
 SHEET = ["--vehicle", "v.toml"]
+
+
+def home_of(verb: str) -> str:
+    return f"hdev_jax.verbs.{'energy.' if verb in ENERGY_VERBS else ''}{verb}"
 
 
 @pytest.fixture
@@ -36,7 +41,7 @@ def api(monkeypatch):
         return call
 
     for verb in VERBS:
-        module = types.ModuleType(f"hdev_jax.verbs.{verb}")
+        module = types.ModuleType(home_of(verb))
         setattr(module, verb, answer(verb))
         monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.delenv("HDEV_DEBUG", raising=False)
@@ -109,7 +114,7 @@ def test_each_verb_is_the_function_of_that_name_and_arguments():
     assert set(subparsers.choices) == set(VERBS)
     for verb, sub in subparsers.choices.items():
         options = {a.dest: a for a in sub._actions if a.dest != "help"}
-        parameters = inspect.signature(getattr(importlib.import_module(f"hdev_jax.verbs.{verb}"), verb)).parameters
+        parameters = inspect.signature(getattr(importlib.import_module(home_of(verb)), verb)).parameters
         assert set(options) == set(parameters), verb
         for name, option in options.items():
             if not option.required:

@@ -26,6 +26,7 @@ from hdev_jax.physics.driveline import WHEEL_RADIUS_M
 from hdev_jax.physics.effect import STAGES
 from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
+from hdev_jax.physics.tyres import RollingLinear
 from hdev_jax.physics.vehicle import Entry
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS, TargetName
@@ -124,12 +125,15 @@ class _Builder:
         why = f"{_MEASURED['road']}, so the road forces are computed"
         if self.target.last_stage == "road":
             why = f"the target {self.target} is the sum of the road forces"
-        return [
+        road: list[Effect] = [
             Inertia(self._take("road.rotating_mass_factor", default=1.0)),
             Grade(),
             Rolling(self._take("road.c_rr", why)),
             Aero(self._take("road.cda_m2", why)),
         ]
+        if "road.b_n_per_mps" in self.sheet.declared:
+            road.append(RollingLinear(self._take("road.b_n_per_mps")))
+        return road
 
     def _mass(self) -> Any:
         declared = self.sheet.declared.get("mass_kg")

@@ -74,6 +74,7 @@ SECTIONS: dict[str, dict[str, Key]] = {
     },
     "road": {
         "c_rr": Key("coefficient", "1", 0.0, 0.5, support=_POSITIVE),
+        "b_n_per_mps": Key("coefficient", "N·s/m"),
         "cda_m2": Key("coefficient", "m²", 0.0, support=_POSITIVE),
         "rotating_mass_factor": Key("coefficient", "1", 0.0, above=True, support=_POSITIVE),
     },
@@ -134,6 +135,10 @@ def parse(
         *coefficients, *others
     }:  # fmt: skip
         raise InputError(f"{where}: driveline.regenerating_efficiency: found without an efficiency or map beside it")
+    for path in (p for p in coefficients if p.startswith("effects.")):
+        _, effect_id, name = path.split(".")
+        if (same := effects[effect_id].declared.get(name)) in coefficients:
+            raise InputError(f"{where}: {same} and {path} are both there, and are one force; one of them is accepted")
     _say_something(where, coefficients, effects)
     return coefficients, others
 

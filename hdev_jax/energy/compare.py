@@ -1,0 +1,72 @@
+"""Where a difference in energy comes from: two sets of trips, or two vehicle sheets on one log."""
+
+import numpy as np
+import pandas as pd
+from scipy import sparse
+
+from hdev_jax.energy.causes import ByCause, by_cause
+from hdev_jax.energy.fitted import Fitted, interval
+from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
+from hdev_jax.errors import InputError
+
+__all__ = ["compare_sheets", "compare_trips"]
+
+COLUMNS = ["cause", "a", "b", "difference", "lower", "upper"]
+
+
+def compare_trips(fitted: Fitted, a: tuple[int, ...], b: tuple[int, ...], *, seed: int = 0) -> pd.DataFrame:
+    """Energy of trips `a` and `b` by cause [kWh/100 km], b less a with its 90 % interval.
+
+    The differences of the causes and of what is unexplained add up to that of the measured energy exactly. Intervals
+    are draws of the coefficients, the same for both; that of *unexplained* has the noise of the trips besides.
+    **Raises:** `InputError` for trips that never move.
+    """
+    problem = fitted.problem
+    log, parts = problem.log, by_cause(fitted, fitted.draws(seed))
+    names = len(log.trip_names)
+    km = np.bincount(log.trip, weights=np.asarray(log.segments.distance_m) / 1e3, minlength=names)
+    kwh = np.bincount(log.trip, weights=np.asarray(log.target("energy_wh")) / 1e3, minlength=names)
+    weight = np.zeros((2, names))
+    for row, trips in enumerate((a, b)):
+        if not km[list(trips)].sum() > 0:
+            which = ", ".join(log.trip_names[i] for i in trips)
+            raise InputError(f"{which}: never moves; trips that go somewhere are expected")
+        weight[row, list(trips)] = 100.0 / km[list(trips)].sum()
+    wobble = np.random.default_rng(seed).standard_t(fitted.freedom, (len(parts.drawn), names)) * fitted.noise_kwh()
+    return _table(parts.grouped(sparse.csr_array(weight)), weight @ kwh, wobble @ weight.T)
+
+
+def compare_sheets(a: Fitted, b: Fitted, *, seed: int = 0) -> pd.DataFrame:
+    """Energy of one log by cause, by two vehicles [kWh/100 km], b less a with its 90 % interval.
+
+    What was measured is the same, so that the differences of all causes and of what is unexplained add up to 0. The
+    coefficients of the two are drawn independently.
+    """
+    log = a.problem.log
+    km = float(np.sum(np.asarray(log.segments.distance_m))) / 1e3
+    if not km > 0:
+        raise InputError("the log never moves; a log of driving is expected")
+    one, two = by_cause(a, a.draws(seed)), by_cause(b, b.draws(seed + 1))
+    causes = tuple(dict.fromkeys((*one.causes, *two.causes)))
+    many = max(len(one.drawn), len(two.drawn))  # a vehicle that is known has but one draw
+    value, drawn = [], []
+    for part in (one.over(causes), two.over(causes)):
+        value.append(100.0 / km * part.value.sum(axis=0))
+        drawn.append(np.resize(100.0 / km * part.drawn.sum(axis=1), (many, len(causes))))
+    measured = np.zeros(2)
+    if log.measured:
+        measured += 100.0 / km * float(np.sum(np.asarray(log.target("energy_wh")))) / 1e3
+    both = ByCause(causes, np.stack(value), np.stack(drawn, axis=1))
+    table = _table(both, measured, np.zeros((many, 2)))
+    return table if log.measured else pd.DataFrame(table[:-2])
+
+
+def _table(parts: ByCause, measured: np.ndarray, wobble: np.ndarray) -> pd.DataFrame:
+    value = np.column_stack([parts.value, measured - parts.value.sum(axis=1), measured])
+    drawn = np.concatenate(
+        [parts.drawn, (measured - parts.drawn.sum(axis=2) + wobble)[:, :, None],
+         np.broadcast_to(measured[None, :, None], (*parts.drawn.shape[:2], 1))], axis=2
+    )  # fmt: skip
+    low, high = interval(drawn[:, 1] - drawn[:, 0])
+    rows = zip((*parts.causes, UNEXPLAINED, TOTAL), value[0], value[1], value[1] - value[0], low, high, strict=True)
+    return pd.DataFrame(list(rows), columns=COLUMNS)

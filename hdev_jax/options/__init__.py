@@ -1,0 +1,3 @@
+"""Options of the command line: those that verbs share, and the parsers of the verbs about energy."""
+
+__all__ = []

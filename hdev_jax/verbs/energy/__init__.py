@@ -1,0 +1,3 @@
+"""The verbs that answer about energy: ledger, roadload, whatif, saved, compare."""
+
+__all__ = []
