@@ -26,7 +26,7 @@ LAYERS = [
     {"inference", "learn", "fleet"},
     {"problem"},
     {"diagnosis"},
-    {"report"},
+    {"online", "report"},
     {"verbs"},
     {"cli", "experiments"},
 ]

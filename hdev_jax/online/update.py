@@ -1,0 +1,299 @@
+"""One row more: a pure function of state and row, for one call a row, for `jax.lax.scan` over a log, for `jax.vmap`
+over vehicles.
+
+With z = [x | r] of a row, x the kernel's Jacobian and r measured − predicted from the tabular values, the errors
+e = r − xδ are e_i = ρ·e_{i−1} + ε_i. Whitened rows (z_i − ρ^n·z_{i−n})/√q, n rows after the last one used and q the
+variance of what came in between over that of ε, are added to the sums of each correlation ρ; its posterior is
+(Λ₀ + G/σ²)⁻¹. Correlations are weighed by the likelihood of what they predicted (West and Harrison, Bayesian
+Forecasting and Dynamic Models, 1997, section 12.2: multi-process models).
+
+**What is approximate:** x is taken at the estimate before the row, once (extended Kalman filter); rows that have been
+used stay as they were linearised. Efficiencies and their switch between driving and braking are the non-linear ones:
+within their tables' sds the second-order term is some per cent of a step. A coefficient that is linear has no error.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from scipy import stats
+
+from hdev_jax.inference.calibrate import STUDENT_DF, UNBOUNDED
+from hdev_jax.inference.parameters import insert
+from hdev_jax.logs.limits import GAP_SAMPLES, MAX_SPEED_MPS, REVERSE_MPS
+from hdev_jax.online.form import COUNTS, NEEDED, Form
+from hdev_jax.online.state import Now, State
+from hdev_jax.segments import Segments
+from hdev_jax.targets import TARGETS
+from hdev_jax.units import J_PER_WH
+
+__all__ = ["expected", "levels_prior", "one_row", "scan", "update", "whole_posterior"]
+
+SHARE = 0.1  # of the target's root mean square: what a row's noise is believed to be before any is seen
+LEVEL_SHARE = 0.03  # the same of what a trip's rows have in common: a payload or a road that is off by so much
+ENOUGH = 20.0  # rows that show the noise, from which on correlations are weighed by what they predict
+# what a row of Student t tells of the mean, over what its weight says (Lange, Little and Taylor, JASA 84, 1989)
+INFORMATION = (STUDENT_DF + 1.0) / (STUDENT_DF + 3.0)
+BELIEVED = 4.0  # rows that this counts for; `inference.linear.LEAST_ROWS`
+TRIPS = 2.0  # trips that the size of a level counts for before any is finished
+FAULT = 6.0  # scales: beyond, a row is an instrument's fault; it is no neighbour of the next (`inference.predictive`)
+TINY = 1e-300
+EDGE = 1e-6  # of a bounded support, that estimates are kept off its ends
+
+
+def one_row(form: Form, row: Float[Array, " column"]) -> Segments:
+    """A row's vector as `Segments` of one row."""
+    by = {name: row[i][None] for i, name in enumerate(form.columns)}
+    zero = jnp.zeros(1, dtype=int)
+    return Segments(
+        trip=zero, vehicle=zero, time_s=by["time_s"], duration_s=by["duration_s"], distance_m=by["distance_m"],
+        speed_start_mps=by["speed_start_mps"], speed_end_mps=by["speed_end_mps"],
+        channels={c: by[c] for c in form.channels},
+    )  # fmt: skip
+
+
+def expected(state: State, step: Float[Array, " size"], row: Float[Array, " column"]) -> tuple[Array, Array]:
+    """What the kernel predicts of a row at the tabular values, to first order about `step`; and the row's columns x.
+
+    **Returns:** f(θ) − x·δ, and x `[size]`: the Jacobian [target's unit per step], then the levels' columns.
+    """
+    form, k = state.form, len(state.form.names)
+    lower, upper = (jnp.asarray([s[i] for s in form.structure], dtype=float) for i in (2, 3))
+    bounded = (upper < UNBOUNDED) & jnp.isfinite(lower)
+    edge = EDGE * jnp.where(bounded, jnp.where(bounded, upper - lower, 1.0), state.scale)
+    theta = jnp.clip(state.centre + state.scale * step[:k], lower + edge, upper - edge)
+    segments = one_row(form, row)
+
+    def predict(delta: Array) -> tuple[Array, Array]:
+        y = insert(state.vehicle, form.structure, theta + state.scale * delta).predict(segments, form.target)[0]
+        return y, y
+
+    x, y = jax.jacfwd(predict, has_aux=True)(jnp.zeros(k))
+    at = (theta - state.centre) / state.scale
+    return y - x @ at, jnp.concatenate([x, _level_columns(form, row)])
+
+
+def _level_columns(form: Form, row: Float[Array, " column"]) -> Float[Array, " level"]:
+    """What one unit of each level is in the row: of a load 1 kW, of a force 100 N, else of the target itself."""
+    if not form.levels:
+        return jnp.zeros(0)
+    if form.levels == ("constant",):
+        return jnp.ones(1)
+    at = {c: row[form.columns.index(c)] for c in ("duration_s", "distance_m")}
+    joules = jnp.stack([1e3 * at["duration_s"], 100.0 * at["distance_m"]])
+    return joules / (J_PER_WH if TARGETS[form.target].weight == "row" else 1e3 * at["duration_s"])
+
+
+def levels_prior(state: State) -> Float[Array, " level"]:
+    """Variance of each level over trips: what finished trips had, and a share of the target for the first."""
+    n, square, columns = state.sums[0], state.sums[1], state.sums[2:]
+    usual = LEVEL_SHARE**2 * square / jnp.maximum(columns, 1e-12 * jnp.maximum(square, 1e-12))
+    trips = state.counts[COUNTS.index("trips")] - 1.0  # finished
+    seen = jnp.maximum(trips, 0.0)
+    return jnp.where(n > 0, (TRIPS * usual + state.level_squares) / (TRIPS + seen), 1.0)
+
+
+def whole_posterior(state: State) -> State:
+    """The state with mean, covariance and noise of each correlation worked out from its sums."""
+    form, n = state.form, state.sums[0]
+    rho = jnp.asarray(form.memories)
+    prior = jnp.concatenate([jnp.ones(len(form.names)), 1.0 / jnp.maximum(levels_prior(state), TINY)])
+    usual = SHARE**2 * state.sums[1] / jnp.maximum(n, 1.0) * (1.0 - rho**2)
+    eye = jnp.eye(form.size)
+
+    def one(gram: Array, variance: Array) -> tuple[Array, Array, Array]:
+        g, b, square = gram[:-1, :-1], gram[:-1, -1], gram[-1, -1]
+        precision = g / variance + jnp.diag(prior)
+        d = jnp.sqrt(jnp.diagonal(precision))
+        root = jnp.linalg.cholesky(precision / (d[:, None] * d[None, :]))
+        half = jax.scipy.linalg.solve_triangular(root, eye, lower=True) / d[None, :]
+        covariance = half.T @ half
+        mean = covariance @ (b / variance)
+        return mean, covariance, jnp.maximum(square - mean @ (2.0 * b - g @ mean), 0.0)
+
+    before = jnp.maximum(jnp.where(state.variance > 0, state.variance, usual), TINY)
+    mean, covariance, left = jax.vmap(one)(state.gram, _of_mean(form, before))
+    variance = before if form.known_noise else jnp.maximum((BELIEVED * usual + left) / (BELIEVED + n), TINY)
+    return eqx.tree_at(lambda s: (s.mean, s.covariance, s.variance), state, (mean, covariance, variance))
+
+
+def _of_mean(form: Form, variance: Array) -> Array:
+    """Variance that a weighed row counts with for the coefficients."""
+    return variance / INFORMATION if form.robust else variance
+
+
+def _new_trip(state: State) -> State:
+    """What each trip has anew taken out of the sums (its Schur complement); what it was, added to the levels' sizes."""
+    form, anew = state.form, jnp.asarray(state.form.anew, dtype=int)
+    k = len(form.names)
+    state = eqx.tree_at(lambda s: s.since, state, jnp.full_like(state.since, jnp.inf))
+    if not form.anew:
+        return state
+    prior = jnp.concatenate([jnp.ones(k), 1.0 / jnp.maximum(levels_prior(state), TINY)])[anew]
+    stays = jnp.all(jnp.arange(form.size + 1)[:, None] != anew[None, :], axis=1)
+
+    def one(gram: Array, variance: Array) -> Array:
+        across = gram[anew]
+        less = across.T @ jnp.linalg.solve(gram[anew][:, anew] + variance * jnp.diag(prior), across)
+        return jnp.where(stays[:, None] & stays[None, :], gram - less, 0.0)
+
+    mean, covariance = state.steps
+    squares = state.level_squares + (mean**2 + jnp.diagonal(covariance))[k:]
+    gram = jax.vmap(one)(state.gram, _of_mean(form, jnp.maximum(state.variance, TINY)))
+    counts = state.counts.at[COUNTS.index("trips")].add(1.0)
+    new = eqx.tree_at(lambda s: (s.gram, s.level_squares, s.counts), state, (gram, squares, counts))
+    return eqx.tree_at(lambda s: s.counts, whole_posterior(new), state.counts)
+
+
+def _faded(state: State, x: Float[Array, "memory size"], hours: Array) -> Float[Array, "memory z z"]:
+    """The sums after coefficients have wandered for so long, in the direction that the row sees.
+
+    A random walk of variance Q makes the row's own prediction less certain by xᵀQx. All of that is put in the one
+    direction g = Qx/√(xᵀQx), in which the row is measured; combinations that it does not see (v with vᵀQx = 0) keep
+    what is known of them, so that nothing drifts where a drive does not excite it (directional forgetting: Cao and
+    Schwartz, Automatica 36, 2000). The sums of a likelihood whose coefficients have moved by g·N(0, 1) are
+    G − G·g·gᵀ·G/(σ² + gᵀGg). The table does not fade.
+    """
+    variance = state.drift**2 * hours
+
+    def one(gram: Array, x: Array, noise: Array) -> Array:
+        q = variance * x
+        g = jnp.append(q / jnp.sqrt(jnp.maximum(x @ q, TINY)), 0.0)
+        along = gram @ g
+        return gram - along[:, None] * along[None, :] / (jnp.maximum(noise, TINY) + g @ along)
+
+    return jax.vmap(one)(state.gram, x, _of_mean(state.form, state.variance))
+
+
+def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
+    """The row with its channels' last values where it has none; whether it can be used; what was held."""
+    form = state.form
+    at = {name: i for i, name in enumerate(form.columns)}
+    duration, v0, v1 = row[at["duration_s"]], row[at["speed_start_mps"]], row[at["speed_end_mps"]]
+    good = jnp.isfinite(duration) & (duration > 0) & jnp.isfinite(row[at["trip"]])
+    for v in (v0, v1):
+        good &= (v >= -REVERSE_MPS) & (v <= MAX_SPEED_MPS)  # false for NaN
+    duration = jnp.where(good, duration, 1.0)
+    v0, v1 = (jnp.where(good, jnp.maximum(v, 0.0), 0.0) for v in (v0, v1))
+    distance = row[at["distance_m"]]
+    lost = ~(jnp.isfinite(distance) & (distance >= 0) & (distance <= 2.0 * MAX_SPEED_MPS * duration))
+    distance = jnp.where(lost, 0.5 * (v0 + v1) * duration, distance)
+    channels, before = row[len(NEEDED) :], state.last[len(NEEDED) :]
+    gone = ~jnp.isfinite(channels)
+    channels = jnp.where(gone, before, channels)
+    good &= jnp.all(jnp.isfinite(channels))
+    channels = jnp.where(jnp.isfinite(channels), channels, 0.0)
+    whole = row.at[len(NEEDED) :].set(channels)
+    for name, value in (("duration_s", duration), ("distance_m", distance), ("speed_start_mps", v0),
+                        ("speed_end_mps", v1)):  # fmt: skip
+        whole = whole.at[at[name]].set(value)
+    whole = whole.at[at["time_s"]].set(jnp.where(jnp.isfinite(row[at["time_s"]]), row[at["time_s"]], _next(state, at)))
+    return whole, good, jnp.concatenate([lost[None], gone])
+
+
+def _next(state: State, at: dict[str, int]) -> Array:
+    """When the row after the last begins."""
+    end = state.last[at["time_s"]] + state.last[at["duration_s"]]
+    return jnp.where(jnp.isfinite(end), end, 0.0)
+
+
+def update(state: State, row: Float[Any, " column"]) -> tuple[State, Now]:
+    """The state after one row, and what is known now. What cannot be used is counted, and never NaN in the state.
+
+    **Arguments:** `row`, `[column]` as `Form.columns` names them (`packed`); `measured` is the target, `trip` a number
+    that changes from trip to trip. NaN: missing. A missing channel keeps its last value; a row without the target is
+    predicted alone. A gap longer than ten rows, or a clock that goes back, ends the correlation of errors.
+    """
+    form = state.form
+    row = jnp.asarray(row, dtype=state.gram.dtype)
+    at = {name: i for i, name in enumerate(form.columns)}
+    whole, good, held = _whole_row(state, row)
+    last = state.last[at["trip"]]
+    opens = whole[at["trip"]] != last  # also where there was none
+    begun = jax.lax.cond(opens & jnp.isfinite(last), _new_trip, lambda s: s, state)
+    duration = whole[at["duration_s"]]
+    late = whole[at["time_s"]] - _next(state, at)
+    usual = jnp.maximum(state.last[at["duration_s"]], duration)
+    gap = ~opens & (late > (GAP_SAMPLES - 1.0) * usual * (1.0 + 1e-9))
+    jumps = ~opens & (whole[at["time_s"]] < state.last[at["time_s"]])
+    since = jnp.where(opens | gap | jumps, jnp.inf, begun.since + 1.0)
+
+    mean = begun.weights @ begun.mean
+    base, x = expected(begun, mean, whole)
+    heard = jnp.isfinite(row[at["measured"]]) & good
+    y = jnp.where(heard, row[at["measured"]], 0.0)
+    z = jnp.append(x, y - base)
+    rho, n = jnp.asarray(form.memories), begun.sums[0]
+    fades = jnp.where(jnp.isfinite(since), rho ** jnp.where(jnp.isfinite(since), since, 1.0), 0.0)
+    q = (1.0 - fades**2) / (1.0 - rho**2)
+    white = (z[None, :] - fades[:, None] * begun.before[None, :]) / jnp.sqrt(q)[:, None]
+    xs, rs = white[:, :-1], white[:, -1]
+    # what the rows before say of this one
+    own = jnp.where(begun.variance > 0, begun.variance, jnp.maximum((SHARE * base) ** 2, TINY) * (1.0 - rho**2))
+    width = own + jnp.einsum("mi,mij,mj->m", xs, begun.covariance, xs)
+    told = base + begun.mean @ x + fades * (begun.before[-1] - begun.mean @ begun.before[:-1])
+    weights = begun.weights
+    predicted = weights @ told
+    spread = weights @ (q * width + (told - predicted) ** 2)
+    half = _reach(form) * jnp.sqrt(spread)
+    # what it says of them
+    far = (y - predicted) ** 2 / spread
+    sure = form.robust & (n > 0)  # of the first row nothing is known that it could be far from
+    weight = jnp.where(sure, (STUDENT_DF + 1.0) / (STUDENT_DF + far), 1.0) * heard
+    fault = heard & sure & (far > FAULT**2)
+    near = heard & ~fault
+    error, scale = rs - jnp.sum(xs * begun.mean, axis=1), jnp.sqrt(width)
+    density = jax.scipy.stats.t.logpdf(error / scale, STUDENT_DF) if form.robust else -0.5 * (error / scale) ** 2
+    density = jnp.where(heard & (n >= ENOUGH), density - jnp.log(scale) - 0.5 * jnp.log(q), 0.0)
+    evidence = begun.evidence + density
+    clipped = jnp.where(sure, jnp.minimum(error**2, FAULT**2 * width), error**2) * own / width
+    gram = _faded(begun, xs, duration / 3600.0) if form.drifts else begun.gram
+    squares = jnp.concatenate([jnp.ones(1), y[None] ** 2, x[len(form.names) :] ** 2])
+    used = eqx.tree_at(
+        lambda s: (s.gram, s.evidence, s.before, s.since, s.wide, s.sums), begun,
+        (gram + weight * white[:, :, None] * white[:, None, :], evidence - jnp.max(evidence),
+         jnp.where(near, z, begun.before), jnp.where(near, 0.0, since),
+         jnp.where(heard, (n * begun.wide + clipped) / (n + 1.0), begun.wide), begun.sums + heard * squares),
+    )  # fmt: skip
+    after = whole_posterior(used)
+    each = _counted(held, good, heard, fault, gap, jumps, opens)
+    lasting = jnp.where(good, whole.at[at["measured"]].set(0.0), state.last)
+    new = jax.tree.map(lambda a, b: jnp.where(good, a, b), after, state)
+    new = eqx.tree_at(lambda s: (s.counts, s.last), new, (state.counts + each, lasting))
+    seen: dict[str, Array] = {
+        "predicted": predicted, "lower": predicted - half, "upper": predicted + half, "model": base + mean @ x,
+        "energy_wh": predicted * _wh(form, whole),
+    }  # fmt: skip
+    return new, Now(
+        **{k: jnp.where(good, v, jnp.nan) for k, v in seen.items()}, values=new.values, sd=new.sd, sigma=new.sigma,
+        memory=new.memory, weight=weight,
+    )  # fmt: skip
+
+
+def _reach(form: Form) -> float:
+    """Half the interval, in scales of a row."""
+    p = 0.5 + form.level / 2.0
+    return float(stats.t.ppf(p, STUDENT_DF)) if form.robust else float(stats.norm.ppf(p))
+
+
+def _wh(form: Form, row: Array) -> Array:
+    """Wh that one unit of the target is in the row."""
+    target = TARGETS[form.target]
+    weight = {"row": 1.0, "duration": row[form.columns.index("duration_s")],
+              "distance": row[form.columns.index("distance_m")]}[target.weight]  # fmt: skip
+    return weight * 1e3 / target.per_kwh if target.per_kwh else jnp.asarray(jnp.nan)
+
+
+def _counted(held: Any, good: Any, heard: Any, fault: Any, gap: Any, jumps: Any, opens: Any) -> Array:
+    """What became of the row, in the order of `Form.counts`."""
+    own = {"rows": jnp.asarray(True), "used": heard, "unusable": ~good, "unmeasured": good & ~heard,
+           "outliers": fault, "gaps": gap & good, "clock_jumps": jumps & good, "trips": opens & good}  # fmt: skip
+    return jnp.concatenate([jnp.stack([own[c] for c in COUNTS]), held & good]).astype(float)
+
+
+@eqx.filter_jit
+def scan(state: State, rows: Float[Any, "row column"]) -> tuple[State, Now]:
+    """`update` over rows, one after the other: the state after them, and what was known at each `[row]`."""
+    return jax.lax.scan(update, state, jnp.asarray(rows))
