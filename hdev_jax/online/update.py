@@ -3,9 +3,12 @@ over vehicles.
 
 With z = [x | r] of a row, x the kernel's Jacobian and r measured − predicted from the tabular values, the errors
 e = r − xδ are e_i = ρ·e_{i−1} + ε_i. Whitened rows (z_i − ρ^n·z_{i−n})/√q, n rows after the last one used and q the
-variance of what came in between over that of ε, are added to the sums of each correlation ρ; its posterior is
-(Λ₀ + G/σ²)⁻¹. Correlations are weighed by the likelihood of what they predicted (West and Harrison, Bayesian
-Forecasting and Dynamic Models, 1997, section 12.2: multi-process models).
+variance of what came in between over that of ε, are added to the sums of each model of the noise; its posterior is
+(Λ₀ + G/σ²)⁻¹. Models are weighed by the likelihood of what they predicted (West and Harrison, Bayesian Forecasting and
+Dynamic Models, 1997, section 12.2: multi-process models).
+
+What neighbouring rows have in common is a level l that wanders about 0 (Ornstein-Uhlenbeck: sd s, for a time τ): of two
+rows dt apart the earlier level is φ·l + N(0, s²(1 − φ²)), φ = exp(−dt/τ), given the later one.
 
 **What is approximate:** x is taken at the estimate before the row, once (extended Kalman filter); rows that have been
 used stay as they were linearised. Efficiencies and their switch between driving and braking are the non-linear ones:
@@ -25,22 +28,18 @@ from hdev_jax.inference.parameters import insert
 from hdev_jax.logs.limits import GAP_SAMPLES, MAX_SPEED_MPS, REVERSE_MPS
 from hdev_jax.online.form import COUNTS, NEEDED, Form
 from hdev_jax.online.state import Now, State
+from hdev_jax.online.sums import SHARE, TINY, aged, faded, on_a_new_trip, whole_posterior
+from hdev_jax.online.watch import WATCH_ROWS, watched
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS
 from hdev_jax.units import J_PER_WH
 
-__all__ = ["expected", "levels_prior", "one_row", "scan", "update", "whole_posterior"]
+__all__ = ["expected", "one_row", "scan", "update", "wh_per_unit"]
 
-SHARE = 0.1  # of the target's root mean square: what a row's noise is believed to be before any is seen
-LEVEL_SHARE = 0.03  # the same of what a trip's rows have in common: a payload or a road that is off by so much
-ENOUGH = 20.0  # rows that show the noise, from which on correlations are weighed by what they predict
-# what a row of Student t tells of the mean, over what its weight says (Lange, Little and Taylor, JASA 84, 1989)
-INFORMATION = (STUDENT_DF + 1.0) / (STUDENT_DF + 3.0)
-BELIEVED = 4.0  # rows that this counts for; `inference.linear.LEAST_ROWS`
-TRIPS = 2.0  # trips that the size of a level counts for before any is finished
+ENOUGH = 20.0  # rows that show the noise, from which on models of it are weighed by what they predict
 FAULT = 6.0  # scales: beyond, a row is an instrument's fault; it is no neighbour of the next (`inference.predictive`)
-TINY = 1e-300
 EDGE = 1e-6  # of a bounded support, that estimates are kept off its ends
+NORMAL_SCORE = 0.774  # mean square of a weighed normal error over the scale that a Student t of 4 degrees gives it
 
 
 def one_row(form: Form, row: Float[Array, " column"]) -> Segments:
@@ -86,87 +85,6 @@ def _level_columns(form: Form, row: Float[Array, " column"]) -> Float[Array, " l
     return joules / (J_PER_WH if TARGETS[form.target].weight == "row" else 1e3 * at["duration_s"])
 
 
-def levels_prior(state: State) -> Float[Array, " level"]:
-    """Variance of each level over trips: what finished trips had, and a share of the target for the first."""
-    n, square, columns = state.sums[0], state.sums[1], state.sums[2:]
-    usual = LEVEL_SHARE**2 * square / jnp.maximum(columns, 1e-12 * jnp.maximum(square, 1e-12))
-    trips = state.counts[COUNTS.index("trips")] - 1.0  # finished
-    seen = jnp.maximum(trips, 0.0)
-    return jnp.where(n > 0, (TRIPS * usual + state.level_squares) / (TRIPS + seen), 1.0)
-
-
-def whole_posterior(state: State) -> State:
-    """The state with mean, covariance and noise of each correlation worked out from its sums."""
-    form, n = state.form, state.sums[0]
-    rho = jnp.asarray(form.memories)
-    prior = jnp.concatenate([jnp.ones(len(form.names)), 1.0 / jnp.maximum(levels_prior(state), TINY)])
-    usual = SHARE**2 * state.sums[1] / jnp.maximum(n, 1.0) * (1.0 - rho**2)
-    eye = jnp.eye(form.size)
-
-    def one(gram: Array, variance: Array) -> tuple[Array, Array, Array]:
-        g, b, square = gram[:-1, :-1], gram[:-1, -1], gram[-1, -1]
-        precision = g / variance + jnp.diag(prior)
-        d = jnp.sqrt(jnp.diagonal(precision))
-        root = jnp.linalg.cholesky(precision / (d[:, None] * d[None, :]))
-        half = jax.scipy.linalg.solve_triangular(root, eye, lower=True) / d[None, :]
-        covariance = half.T @ half
-        mean = covariance @ (b / variance)
-        return mean, covariance, jnp.maximum(square - mean @ (2.0 * b - g @ mean), 0.0)
-
-    before = jnp.maximum(jnp.where(state.variance > 0, state.variance, usual), TINY)
-    mean, covariance, left = jax.vmap(one)(state.gram, _of_mean(form, before))
-    variance = before if form.known_noise else jnp.maximum((BELIEVED * usual + left) / (BELIEVED + n), TINY)
-    return eqx.tree_at(lambda s: (s.mean, s.covariance, s.variance), state, (mean, covariance, variance))
-
-
-def _of_mean(form: Form, variance: Array) -> Array:
-    """Variance that a weighed row counts with for the coefficients."""
-    return variance / INFORMATION if form.robust else variance
-
-
-def _new_trip(state: State) -> State:
-    """What each trip has anew taken out of the sums (its Schur complement); what it was, added to the levels' sizes."""
-    form, anew = state.form, jnp.asarray(state.form.anew, dtype=int)
-    k = len(form.names)
-    state = eqx.tree_at(lambda s: s.since, state, jnp.full_like(state.since, jnp.inf))
-    if not form.anew:
-        return state
-    prior = jnp.concatenate([jnp.ones(k), 1.0 / jnp.maximum(levels_prior(state), TINY)])[anew]
-    stays = jnp.all(jnp.arange(form.size + 1)[:, None] != anew[None, :], axis=1)
-
-    def one(gram: Array, variance: Array) -> Array:
-        across = gram[anew]
-        less = across.T @ jnp.linalg.solve(gram[anew][:, anew] + variance * jnp.diag(prior), across)
-        return jnp.where(stays[:, None] & stays[None, :], gram - less, 0.0)
-
-    mean, covariance = state.steps
-    squares = state.level_squares + (mean**2 + jnp.diagonal(covariance))[k:]
-    gram = jax.vmap(one)(state.gram, _of_mean(form, jnp.maximum(state.variance, TINY)))
-    counts = state.counts.at[COUNTS.index("trips")].add(1.0)
-    new = eqx.tree_at(lambda s: (s.gram, s.level_squares, s.counts), state, (gram, squares, counts))
-    return eqx.tree_at(lambda s: s.counts, whole_posterior(new), state.counts)
-
-
-def _faded(state: State, x: Float[Array, "memory size"], hours: Array) -> Float[Array, "memory z z"]:
-    """The sums after coefficients have wandered for so long, in the direction that the row sees.
-
-    A random walk of variance Q makes the row's own prediction less certain by xᵀQx. All of that is put in the one
-    direction g = Qx/√(xᵀQx), in which the row is measured; combinations that it does not see (v with vᵀQx = 0) keep
-    what is known of them, so that nothing drifts where a drive does not excite it (directional forgetting: Cao and
-    Schwartz, Automatica 36, 2000). The sums of a likelihood whose coefficients have moved by g·N(0, 1) are
-    G − G·g·gᵀ·G/(σ² + gᵀGg). The table does not fade.
-    """
-    variance = state.drift**2 * hours
-
-    def one(gram: Array, x: Array, noise: Array) -> Array:
-        q = variance * x
-        g = jnp.append(q / jnp.sqrt(jnp.maximum(x @ q, TINY)), 0.0)
-        along = gram @ g
-        return gram - along[:, None] * along[None, :] / (jnp.maximum(noise, TINY) + g @ along)
-
-    return jax.vmap(one)(state.gram, x, _of_mean(state.form, state.variance))
-
-
 def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
     """The row with its channels' last values where it has none; whether it can be used; what was held."""
     form = state.form
@@ -199,25 +117,27 @@ def _next(state: State, at: dict[str, int]) -> Array:
     return jnp.where(jnp.isfinite(end), end, 0.0)
 
 
-def update(state: State, row: Float[Any, " column"]) -> tuple[State, Now]:
+def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " candidate"] = ()) -> tuple[State, Now]:
     """The state after one row, and what is known now. What cannot be used is counted, and never NaN in the state.
 
     **Arguments:** `row`, `[column]` as `Form.columns` names them (`packed`); `measured` is the target, `trip` a number
     that changes from trip to trip. NaN: missing. A missing channel keeps its last value; a row without the target is
     predicted alone. A gap longer than ten rows, or a clock that goes back, ends the correlation of errors.
+    `candidates`, where effects are watched: what each would add to the row (`Watch.columns`).
     """
     form = state.form
-    row = jnp.asarray(row, dtype=state.gram.dtype)
+    row, c = (jnp.asarray(v, dtype=state.sums.gram.dtype) for v in (row, candidates))
     at = {name: i for i, name in enumerate(form.columns)}
     whole, good, held = _whole_row(state, row)
     last = state.last[at["trip"]]
     opens = whole[at["trip"]] != last  # also where there was none
-    begun = jax.lax.cond(opens & jnp.isfinite(last), _new_trip, lambda s: s, state)
-    duration = whole[at["duration_s"]]
-    late = whole[at["time_s"]] - _next(state, at)
+    begun = jax.lax.cond(opens & jnp.isfinite(last), on_a_new_trip, lambda s: s, state)
+    duration, step = whole[at["duration_s"]], whole[at["time_s"]] - state.last[at["time_s"]]
     usual = jnp.maximum(state.last[at["duration_s"]], duration)
+    late = whole[at["time_s"]] - _next(state, at)
     gap = ~opens & (late > (GAP_SAMPLES - 1.0) * usual * (1.0 + 1e-9))
-    jumps = ~opens & (whole[at["time_s"]] < state.last[at["time_s"]])
+    jumps = ~opens & (step < 0.0)
+    begun = aged(begun, jnp.where(opens, 0.0, jnp.maximum(step, 0.0)))
     since = jnp.where(opens | gap | jumps, jnp.inf, begun.since + 1.0)
 
     mean = begun.weights @ begun.mean
@@ -225,10 +145,11 @@ def update(state: State, row: Float[Any, " column"]) -> tuple[State, Now]:
     heard = jnp.isfinite(row[at["measured"]]) & good
     y = jnp.where(heard, row[at["measured"]], 0.0)
     z = jnp.append(x, y - base)
-    rho, n = jnp.asarray(form.memories), begun.sums[0]
+    rho, n = jnp.asarray(form.memories), begun.totals[0]
     fades = jnp.where(jnp.isfinite(since), rho ** jnp.where(jnp.isfinite(since), since, 1.0), 0.0)
     q = (1.0 - fades**2) / (1.0 - rho**2)
-    white = (z[None, :] - fades[:, None] * begun.before[None, :]) / jnp.sqrt(q)[:, None]
+    white, white_c = ((new[None, :] - fades[:, None] * old[None, :]) / jnp.sqrt(q)[:, None]
+                      for new, old in ((z, begun.before), (c, begun.candidate)))  # fmt: skip
     xs, rs = white[:, :-1], white[:, -1]
     # what the rows before say of this one
     own = jnp.where(begun.variance > 0, begun.variance, jnp.maximum((SHARE * base) ** 2, TINY) * (1.0 - rho**2))
@@ -249,22 +170,30 @@ def update(state: State, row: Float[Any, " column"]) -> tuple[State, Now]:
     density = jnp.where(heard & (n >= ENOUGH), density - jnp.log(scale) - 0.5 * jnp.log(q), 0.0)
     evidence = begun.evidence + density
     clipped = jnp.where(sure, jnp.minimum(error**2, FAULT**2 * width), error**2) * own / width
-    gram = _faded(begun, xs, duration / 3600.0) if form.drifts else begun.gram
+    score = jnp.where(sure, (weight * error / scale) ** 2, NORMAL_SCORE)
+
+    def running(mean: Array, new: Array) -> Array:
+        return jnp.where(heard, (n * mean + new) / (n + 1.0), mean)
+
+    sums = faded(begun, xs, duration / 3600.0) if form.drifts else begun.sums
     squares = jnp.concatenate([jnp.ones(1), y[None] ** 2, x[len(form.names) :] ** 2])
+    wh = wh_per_unit(form, whole)
     used = eqx.tree_at(
-        lambda s: (s.gram, s.evidence, s.before, s.since, s.wide, s.sums), begun,
-        (gram + weight * white[:, :, None] * white[:, None, :], evidence - jnp.max(evidence),
-         jnp.where(near, z, begun.before), jnp.where(near, 0.0, since),
-         jnp.where(heard, (n * begun.wide + clipped) / (n + 1.0), begun.wide), begun.sums + heard * squares),
+        lambda s: (s.sums, s.evidence, s.before, s.candidate, s.since, s.wide, s.score, s.totals, s.cost_wh),
+        begun,
+        (sums.plus(white, white_c, weight), evidence - jnp.max(evidence), jnp.where(near, z, begun.before),
+         jnp.where(near, c, begun.candidate), jnp.where(near, 0.0, since), running(begun.wide, clipped),
+         running(begun.score, score), begun.totals + heard * squares, begun.cost_wh + c * wh),
     )  # fmt: skip
-    after = whole_posterior(used)
-    each = _counted(held, good, heard, fault, gap, jumps, opens)
-    lasting = jnp.where(good, whole.at[at["measured"]].set(0.0), state.last)
+    counts = state.counts + _counted(held, good, heard, fault, gap, jumps, opens)
+    after = eqx.tree_at(lambda s: s.driven_s, whole_posterior(used), used.driven_s + duration)
+    after = watched(after, (n >= WATCH_ROWS) & heard, counts[0])
     new = jax.tree.map(lambda a, b: jnp.where(good, a, b), after, state)
-    new = eqx.tree_at(lambda s: (s.counts, s.last), new, (state.counts + each, lasting))
+    lasting = jnp.where(good, whole.at[at["measured"]].set(0.0), state.last)
+    new = eqx.tree_at(lambda s: (s.counts, s.last), new, (counts, lasting))
     seen: dict[str, Array] = {
         "predicted": predicted, "lower": predicted - half, "upper": predicted + half, "model": base + mean @ x,
-        "energy_wh": predicted * _wh(form, whole),
+        "energy_wh": predicted * wh,
     }  # fmt: skip
     return new, Now(
         **{k: jnp.where(good, v, jnp.nan) for k, v in seen.items()}, values=new.values, sd=new.sd, sigma=new.sigma,
@@ -278,12 +207,12 @@ def _reach(form: Form) -> float:
     return float(stats.t.ppf(p, STUDENT_DF)) if form.robust else float(stats.norm.ppf(p))
 
 
-def _wh(form: Form, row: Array) -> Array:
+def wh_per_unit(form: Form, row: Array) -> Array:
     """Wh that one unit of the target is in the row."""
     target = TARGETS[form.target]
     weight = {"row": 1.0, "duration": row[form.columns.index("duration_s")],
               "distance": row[form.columns.index("distance_m")]}[target.weight]  # fmt: skip
-    return weight * 1e3 / target.per_kwh if target.per_kwh else jnp.asarray(jnp.nan)
+    return jnp.asarray(weight * 1e3 / target.per_kwh if target.per_kwh else jnp.nan)
 
 
 def _counted(held: Any, good: Any, heard: Any, fault: Any, gap: Any, jumps: Any, opens: Any) -> Array:
@@ -294,6 +223,11 @@ def _counted(held: Any, good: Any, heard: Any, fault: Any, gap: Any, jumps: Any,
 
 
 @eqx.filter_jit
-def scan(state: State, rows: Float[Any, "row column"]) -> tuple[State, Now]:
-    """`update` over rows, one after the other: the state after them, and what was known at each `[row]`."""
-    return jax.lax.scan(update, state, jnp.asarray(rows))
+def scan(state: State, rows: Float[Any, "row column"], candidates: Any = None) -> tuple[State, Now]:
+    """`update` over rows, one after the other: the state after them, and what was known at each `[row]`.
+
+    **Arguments:** `candidates` `[row, candidate]`, where effects are watched.
+    """
+    rows = jnp.asarray(rows)
+    each = jnp.zeros((len(rows), 0)) if candidates is None else jnp.asarray(candidates)
+    return jax.lax.scan(lambda s, row: update(s, *row), state, (rows, each))

@@ -115,7 +115,7 @@ def test_faults_of_a_stream_are_survived_and_counted(log):
         "rows": 100, "used": 96, "unusable": 3, "unmeasured": 1, "outliers": 1, "gaps": 1, "clock_jumps": 1, "trips": 3,
         "held mass_kg": 1, "held distance_m": 1,
     }  # fmt: skip
-    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((end.gram, end.mean, end.covariance, end.last)))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((end.sums, end.mean, end.covariance, end.last)))
     assert np.flatnonzero(np.isnan(now.predicted)).tolist() == [14, 16, 45]
     assert float(now.weight[20]) < 1e-6
     clean = scan(state, good)[0]
