@@ -155,7 +155,8 @@ class Now(eqx.Module):
     **Fields:** `predicted` in the target's unit with its interval, from the rows before; `model`, the same without
     what the error of the row before tells; `energy_wh` of the row where the target is the battery's, else its work;
     `values` and `sd` of the coefficients after the row; `sigma`, `memory`, as of the state; `weight` of the row (1: in
-    full, 0: not used). A row that cannot be used has NaN.
+    full, 0: not used); `alarm`, not 0 once an effect is certain that the sheet lacks. Of a row that cannot be used NaN,
+    and of the first one no interval.
     """
 
     predicted: Float[Array, "*row"]
@@ -168,6 +169,7 @@ class Now(eqx.Module):
     sigma: Float[Array, "*row"]
     memory: Float[Array, "*row"]
     weight: Float[Array, "*row"]
+    alarm: Float[Array, "*row"]
 
 
 def acts_across_rows(effect: type[Effect] | Effect) -> bool:

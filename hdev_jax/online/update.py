@@ -101,14 +101,12 @@ def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
     channels, before = row[len(NEEDED) :], state.last[len(NEEDED) :]
     gone = ~jnp.isfinite(channels)
     channels = jnp.where(gone, before, channels)
-    good &= jnp.all(jnp.isfinite(channels))
-    channels = jnp.where(jnp.isfinite(channels), channels, 0.0)
     whole = row.at[len(NEEDED) :].set(channels)
     for name, value in (("duration_s", duration), ("distance_m", distance), ("speed_start_mps", v0),
                         ("speed_end_mps", v1)):  # fmt: skip
         whole = whole.at[at[name]].set(value)
     whole = whole.at[at["time_s"]].set(jnp.where(jnp.isfinite(row[at["time_s"]]), row[at["time_s"]], _next(state, at)))
-    return whole, good, jnp.concatenate([lost[None], gone])
+    return whole, good, jnp.concatenate([lost[None], gone & jnp.isfinite(before)])
 
 
 def _next(state: State, at: dict[str, int]) -> Array:
@@ -142,6 +140,9 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
 
     mean = begun.weights @ begun.mean
     base, x = expected(begun, mean, whole)
+    good &= jnp.isfinite(base) & jnp.all(
+        jnp.isfinite(x)
+    )  # NaN where the vehicle reads a channel that never had a value
     heard = jnp.isfinite(row[at["measured"]]) & good
     y = jnp.where(heard, row[at["measured"]], 0.0)
     z = jnp.append(x, y - base)
@@ -158,7 +159,7 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     weights = begun.weights
     predicted = weights @ told
     spread = weights @ (q * width + (told - predicted) ** 2)
-    half = _reach(form) * jnp.sqrt(spread)
+    half = jnp.where(n > 0, _reach(form) * jnp.sqrt(spread), jnp.nan)  # of the first row the noise is not known
     # what it says of them
     far = (y - predicted) ** 2 / spread
     sure = form.robust & (n > 0)  # of the first row nothing is known that it could be far from
@@ -197,7 +198,7 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     }  # fmt: skip
     return new, Now(
         **{k: jnp.where(good, v, jnp.nan) for k, v in seen.items()}, values=new.values, sd=new.sd, sigma=new.sigma,
-        memory=new.memory, weight=weight,
+        memory=new.memory, weight=weight, alarm=jnp.max(new.alarm_at, initial=0.0),
     )  # fmt: skip
 
 
