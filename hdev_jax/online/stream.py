@@ -21,6 +21,7 @@ from hdev_jax.units import J_PER_WH
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
 KINEMATICS = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
+Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")
 READ = ("mass_kg", "grade_rad", "air_density_kgpm3", "gear", "motor_torque_nm", "motor_speed_radps", "traction_force_n",
         "voltage_v", "soc")  # fmt: skip
