@@ -177,9 +177,11 @@ def parser() -> argparse.ArgumentParser:
         help="rows of a vehicle as they arrive: its energy, its coefficients, what its sheet lacks",
         description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
         "is predicted from those before it, and tells more of the sheet's coefficients.",
-        epilog="examples:\n  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
+        epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
+        "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
         "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
     )
+    _file(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
     _file(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
     _file(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
     _file(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")

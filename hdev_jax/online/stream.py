@@ -173,8 +173,6 @@ def _interval(
     distance = row.get("distance_m", np.nan)
     out = {k: x for k, x in row.items() if k != "speed_mps"} | ends | {"duration_s": duration}
     out["distance_m"] = distance if np.isfinite(distance) else v * duration
-    if "time_s" in row:
-        out["time_s"] = row["time_s"] - (0.5 * back if before is not None else 0.0)
     return out
 
 

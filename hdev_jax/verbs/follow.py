@@ -30,15 +30,13 @@ Records = Iterable[Mapping[str, Any]]
 
 def follow(
     vehicle: Vehicles,
-    rows: Records | BinaryIO | None = None,
+    rows: str | Path | Records | BinaryIO | None = None,
     state: str | Path | None = None,
     adapter: str | Path | Adapter | None = None,
     target: str | None = None,
     effects: Effects = None,
     json: bool = False,
     watch: bool = True,
-    *,
-    say: Callable[[str], None] | None = None,
 ) -> str | None:
     """Follow one vehicle row by row: energy of each row before it is measured, coefficients after it, alarms.
 
@@ -46,19 +44,19 @@ def follow(
     row later, when it is known how long they lasted. What a row lacks keeps its last value; rows that cannot be used
     are counted, and told at the end.
 
-    **Arguments:** `vehicle`: a sheet's path or a `Sheet`; `rows`: mappings, or a stream of bytes (standard input by
-    default); `state`: a file that keeps what is known, every few seconds and at the end: the same command goes on from
-    it as if it had never stopped, and rows that it has had are left out. `json`: a line of JSON for each row. `watch`:
-    name effects of the library that the sheet lacks. `say`: what to do with each line (print it).
+    **Arguments:** `vehicle`: a sheet's path or a `Sheet`; `rows`: a file, mappings, or a stream of bytes (standard
+    input by default); `state`: a file that keeps what is known, every few seconds and at the end: the same command goes
+    on from it as if it had never stopped, and rows that it has had are left out. `json`: a line of JSON for each row.
+    `watch`: name effects of the library that the sheet lacks.
 
     **Returns:** the estimates and what became of the rows, as text; None where each row was told as JSON. **Raises:**
     `InputError`.
     """
     sheet, rules = sheet_of(vehicle, known_effects(effects)), adapter_of(adapter)
-    with _terminal(say, live=not json) as tell, _stopped_by_signal():
+    with _opened(rows) as source, _terminal(live=not json) as tell, _stopped_by_signal():
         following = _Following(sheet, rules, target, state, tell, json, watch)
         try:
-            for batch in _batches(sys.stdin.buffer if rows is None else rows):
+            for batch in _batches(source):
                 following.take(batch)
         except KeyboardInterrupt:
             pass
@@ -195,6 +193,22 @@ class _Following:
         return "\n".join(lines)
 
 
+@contextlib.contextmanager
+def _opened(rows: str | Path | Records | BinaryIO | None) -> Iterator[Records | BinaryIO]:
+    """Where rows come from. Raises `InputError` for a file that cannot be read."""
+    if rows is None:
+        yield sys.stdin.buffer
+    elif isinstance(rows, str | Path):
+        try:
+            file = open(rows, "rb")  # noqa: SIM115
+        except OSError as e:
+            raise InputError(f"{rows}: cannot be read ({e.strerror or e})") from e
+        with file:
+            yield file
+    else:
+        yield rows
+
+
 def _number(x: Any) -> float | None:
     value = float(x)
     return value if np.isfinite(value) else None
@@ -245,11 +259,9 @@ def _lines(stream: BinaryIO) -> Iterator[list[bytes]]:
 
 
 @contextlib.contextmanager
-def _terminal(say: Callable[[str], None] | None, *, live: bool) -> Iterator[Callable[[str], None]]:
+def _terminal(*, live: bool) -> Iterator[Callable[[str], None]]:
     """What becomes of a line: on a terminal one line that lives, elsewhere a line each."""
-    if say is not None:
-        yield say
-    elif live and sys.stdout.isatty():
+    if live and sys.stdout.isatty():
         from rich.console import Console
         from rich.live import Live as Shown
         from rich.text import Text

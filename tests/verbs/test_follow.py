@@ -1,5 +1,6 @@
 """`hdev follow`: rows as they arrive, from a pipe, in anybody's columns; a stop costs nothing."""
 
+import contextlib
 import io
 import json
 import subprocess
@@ -11,8 +12,11 @@ import pytest
 
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
+from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.logs import log_from_frame
+from hdev_jax.online import Watch
 from hdev_jax.online.stream import Stream
+from hdev_jax.physics import LIBRARY
 from hdev_jax.verbs.follow import follow
 
 SHEET = {"mass_kg": 29e3, "road": {"c_rr": (0.006, 0.0008), "cda_m2": (5.6, 0.5)}, "driveline": {"efficiency": 0.91}}
@@ -31,10 +35,18 @@ def text(frame) -> str:
 
 def told(rows, **options):
     """Lines of JSON, parsed; `rows` a text as it would come from a pipe, or records."""
-    lines = []
     given = io.BytesIO(rows.encode()) if isinstance(rows, str) else rows
-    follow(SHEET, given, json=True, watch=False, say=lines.append, **options)
-    return [json.loads(line) for line in lines]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert follow(SHEET, given, json=True, watch=False, **options) is None
+    return [json.loads(line) for line in out.getvalue().splitlines()]
+
+
+def summed_up(rows, **options) -> str:
+    """What is said at the end."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        said = follow(SHEET, rows, watch=False, **options)
+    assert said is not None
+    return said
 
 
 def test_rows_in_csv_json_and_memory_are_the_same(frame):
@@ -46,8 +58,7 @@ def test_rows_in_csv_json_and_memory_are_the_same(frame):
     assert set(one[-1]["values"]) == {"road.c_rr", "road.cda_m2"}
     inside = [r["lower"] <= r["measured"] <= r["upper"] for r in one[20:]]
     assert np.mean(inside) > 0.8
-    said = follow(SHEET, frame.to_dict("records"), watch=False, say=lambda _: None)
-    assert said is not None
+    said = summed_up(frame.to_dict("records"))
     assert "120 rows, 120 used, 2 trips" in said
 
 
@@ -86,8 +97,7 @@ def test_a_stop_costs_nothing(frame, tmp_path, sampled):
         parts += told(text(rows), state=tmp_path / "parts.state")
     assert parts == whole
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
-    said = follow(SHEET, frame.to_dict("records"), state=tmp_path / "parts.state", watch=False, say=lambda _: None)
-    assert said is not None
+    said = summed_up(frame.to_dict("records"), state=tmp_path / "parts.state")
     assert "repeated" in said
     with pytest.raises(InputError, match="of another sheet; name another file, or delete it"):
         follow(SHEET | {"mass_kg": 20e3}, [], state=tmp_path / "parts.state", watch=False)
@@ -99,14 +109,15 @@ def test_a_stop_costs_nothing(frame, tmp_path, sampled):
 def test_samples_are_the_intervals_of_a_log(frame):
     """Those that a log makes of them, but at the ends of a trip, where it looks at five samples."""
     speed = np.asarray(frame.speed_start_mps)
-    samples = pd.DataFrame({"trip_id": frame.trip_id, "time_s": np.r_[np.arange(60.0), 100.0 + np.arange(60.0)],
+    samples = pd.DataFrame({"trip_id": frame.trip_id, "time_s": np.arange(120.0),
                             "speed_mps": speed, "battery_power_kw": 50.0})  # fmt: skip
     log = log_from_frame(samples).segments
     stream = Stream()
     rows = [row for _, row in stream.intervals(stream.read(samples.to_dict("records")))]
     rows += [row for _, row in stream.flush()]
     assert len(rows) == 120
-    inner = np.r_[1:59, 61:119]
+    other = np.flatnonzero(frame.trip_id.to_numpy()[1:] != frame.trip_id.to_numpy()[:-1])
+    inner = np.setdiff1d(np.arange(1, 119), np.r_[other, other + 1])
     for name in ("duration_s", "speed_start_mps", "speed_end_mps", "distance_m", "time_s"):
         np.testing.assert_allclose([rows[i][name] for i in inner], np.asarray(getattr(log, name))[inner], atol=1e-9)
 
@@ -117,8 +128,7 @@ def test_what_does_not_read_is_counted_and_the_rest_used(frame):
     lines[40] = lines[40].replace(lines[40].split(",")[4], "broken")
     lines[50] = "half a li"
     lines.insert(60, lines[0])  # a logger that began again
-    said = follow(SHEET, io.BytesIO("\n".join(lines).encode()), watch=False, say=lambda _: None)
-    assert said is not None
+    said = summed_up(io.BytesIO("\n".join(lines).encode()))
     assert "118 rows, 118 used, 2 trips, 1 held mass_kg, 2 unreadable" in said
 
 
@@ -133,26 +143,33 @@ def test_what_does_not_read_is_counted_and_the_rest_used(frame):
 )
 def test_rows_that_cannot_be_followed_are_one_line(rows, what):
     with pytest.raises(InputError, match=what):
-        follow(SHEET, io.BytesIO(rows.encode()), watch=False, say=lambda _: None)
+        summed_up(io.BytesIO(rows.encode()))
 
 
-def test_from_a_pipe_with_an_alarm(tmp_path):
-    made = synthetic_log(
-        seed=3, trips=4, rows_per_trip=100, effects={"standstill_load": {"power_w": 9e3}}, noise_rms=3.0
-    )
-    made.frame[KEPT].to_csv(tmp_path / "log.csv", index=False)
-    sheet = tmp_path / "truck.toml"
-    sheet.write_text(made.sheet)
-    command = [sys.executable, "-m", "hdev_jax.cli", "follow", "--vehicle", str(sheet)]
-    with open(tmp_path / "log.csv", "rb") as rows:
-        done = subprocess.run(command, stdin=rows, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
+def test_an_effect_that_the_sheet_lacks_is_told_once(monkeypatch, capsys):
+    few = {k: LIBRARY[k] for k in ("standstill_load", "rotating_mass")}  # the whole library takes long to compile
+    monkeypatch.setattr(Watch, "of", staticmethod(lambda state, _: Watch.beside(state.vehicle, state.form, few)))
+    planted = {"standstill_load": {"power_w": 9e3}}
+    made = synthetic_log(seed=3, trips=4, rows_per_trip=100, effects=planted, noise_rms=3.0).frame[KEPT]
+    said = follow(SHEET, made.to_dict("records"))
+    lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("T0") for line in lines) == 400
-    assert (
-        sum(line.startswith("ALARM standstill_load: power_w = ") for line in lines) == 2
-    )  # when it came, and at the end
-    bad = subprocess.run([*command, "--target", "traction_force_n"], input="time_s,speed_mps,energy_wh\n0,1,1\n",
-                         capture_output=True, text=True)  # fmt: skip
+    assert sum(line.startswith("ALARM standstill_load: power_w = ") for line in lines) == 1
+    assert said is not None
+    assert "\nALARM standstill_load: power_w = " in said
+    follow(SHEET, made.to_dict("records"), json=True)
+    alarms = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith('{"alarm"')]
+    assert [a["alarm"]["effect"] for a in alarms] == ["standstill_load"]
+
+
+def test_from_a_pipe(frame, tmp_path):
+    sheet = tmp_path / "truck.toml"
+    sheet.write_text(augmented_sheet(Sheet(**SHEET), {}, {}))
+    command = [sys.executable, "-m", "hdev_jax.cli", "follow", "--vehicle", str(sheet), "--no-watch"]
+    done = subprocess.run(command, input=text(frame), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert sum(line.startswith("T0") for line in done.stdout.splitlines()) == 120
+    assert "120 rows, 120 used, 2 trips" in done.stdout
+    bad = subprocess.run([*command, "--target", "traction_force_n"], input=text(frame), capture_output=True, text=True)
     assert bad.returncode == 2
     assert "--target traction_force_n: the rows do not measure it" in bad.stderr
