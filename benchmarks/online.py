@@ -23,6 +23,7 @@ from hdev_jax.online import State, Watch, scan, start, update
 from hdev_jax.online.live import Live
 
 LIMITS = {"one_row_us": 200.0, "vehicles_core": 0.5}
+PAGE = Path(__file__).parents[1] / "docs" / "online_speed.md"
 CHANNELS = ("mass_kg", "grade_rad", "ambient_temp_c", "wind_speed_mps", "wind_from_rad", "heading_rad", "soc")
 
 
@@ -41,20 +42,47 @@ def rows_of(state: State, seed: int = 1) -> np.ndarray:
     return np.stack([np.asarray(named.get(c, frame.get(c)), float) for c in state.form.columns], axis=1)
 
 
+def page(m: dict[str, Any]) -> str:
+    """The measurements as a page of the site."""
+    rows = [
+        ("one row from Python (`Live`), median", f"{m['one_row_us']:.0f} µs", f"{LIMITS['one_row_us']:.0f} µs"),
+        (f"the same with {m['candidates']} forms of effects watched", f"{m['one_row_watched_us']:.0f} µs", ""),
+        ("what these would add to one row, by the kernel", f"{m['columns_of_one_row_us'] / 1e3:.1f} ms", ""),
+        ("one row of a log, by `scan`", f"{m['scan_us']:.1f} µs", ""),
+        ("the same by the recursive closed form of `inference/linear.py`: white noise, no levels, no kernel",
+         f"{m['closed_form_scan_us']:.1f} µs", ""),
+        (f"{m['vehicles']:,} vehicles at once, by `vmap`", f"{m['vehicles_rows_per_s']:,.0f} rows a second", ""),
+        ("10,000 vehicles at 1 Hz", f"{m['vehicles_core']:.2f} of a core", f"{LIMITS['vehicles_core']:g}"),
+        ("compiling: one row, one row watched, many vehicles",
+         f"{m['one_row_compile_s']:.1f} s, {m['one_row_watched_compile_s']:.1f} s, {m['vehicles_compile_s']:.1f} s", ""),
+    ]  # fmt: skip
+    lines = [
+        "# Row by row: time", "",
+        "Made by `python benchmarks/online.py --write`: a truck with four coefficients and seven channels, float64, "
+        f"{m['cores']} cores, one thread, load of the machine before it {m['load']:.1f}. A row is predicted, weighed and "
+        f"absorbed by {m['members']} models of its noise.", "",
+        "| | measured | at most |", "|---|---:|---:|",
+        *(f"| {what} | {value} | {limit} |" for what, value, limit in rows),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
 def main(argv: list[str] | None = None) -> int:
     """Print what was measured; 1 where a limit is missed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--vehicles", type=int, default=10_000)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--write", action="store_true", help="write docs/online_speed.md")
     given = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    out: dict[str, Any] = {"cores": os.cpu_count(), "vehicles": given.vehicles}
+    out: dict[str, Any] = {"cores": os.cpu_count(), "vehicles": given.vehicles, "load": os.getloadavg()[0]}
     state, _ = start(sheet(), CHANNELS)
     watch = Watch.of(state)
     watching, _ = start(sheet(), CHANNELS, candidates=watch.candidates)
     rows = rows_of(state)
     columns = watch.columns(rows)
+    out["members"] = len(state.form.members)
     out["candidates"] = len(watch.candidates)
     for name, begun, each in (("one_row", state, np.zeros((len(rows), 0))), ("one_row_watched", watching, columns)):
         live = Live(begun)
@@ -112,6 +140,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}")
     if given.json:
         given.json.write_text(json.dumps(out, indent=1) + "\n")
+    if given.write:
+        PAGE.write_text(page(out))
     missed = [f"{k} {out[k]:.3g}, at most {limit:g}" for k, limit in LIMITS.items() if out[k] > limit]
     print("within the limits" if not missed else "MISSED\n  " + "\n  ".join(missed))
     return 1 if missed else 0
