@@ -54,13 +54,13 @@ def page(m: dict[str, Any]) -> str:
         (f"{m['vehicles']:,} vehicles at once, by `vmap`", f"{m['vehicles_rows_per_s']:,.0f} rows a second", ""),
         ("10,000 vehicles at 1 Hz", f"{m['vehicles_core']:.2f} of a core", f"{LIMITS['vehicles_core']:g}"),
         ("compiling: one row, one row watched, many vehicles",
-         f"{m['one_row_compile_s']:.1f} s, {m['one_row_watched_compile_s']:.1f} s, {m['vehicles_compile_s']:.1f} s", ""),
+         ", ".join(f"{m[k]:.1f} s" for k in ("one_row_compile_s", "one_row_watched_compile_s", "vehicles_compile_s")), ""),
     ]  # fmt: skip
     lines = [
         "# Row by row: time", "",
         "Made by `python benchmarks/online.py --write`: a truck with four coefficients and seven channels, float64, "
-        f"{m['cores']} cores, one thread, load of the machine before it {m['load']:.1f}. A row is predicted, weighed and "
-        f"absorbed by {m['members']} models of its noise.", "",
+        f"{m['cores']} cores, one thread, load of the machine before it {m['load']:.1f}. A row is predicted, weighed "
+        f"and absorbed by {m['members']} models of its noise.", "",
         "| | measured | at most |", "|---|---:|---:|",
         *(f"| {what} | {value} | {limit} |" for what, value, limit in rows),
     ]  # fmt: skip
