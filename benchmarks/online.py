@@ -54,7 +54,7 @@ def page(m: dict[str, Any]) -> str:
         (f"{m['vehicles']:,} vehicles at once, by `vmap`", f"{m['vehicles_rows_per_s']:,.0f} rows a second", ""),
         ("10,000 vehicles at 1 Hz", f"{m['vehicles_core']:.2f} of a core", f"{LIMITS['vehicles_core']:g}"),
         ("compiling: one row, one row watched, many vehicles",
-         ", ".join(f"{m[k]:.1f} s" for k in ("one_row_compile_s", "one_row_watched_compile_s", "vehicles_compile_s")), ""),
+         ", ".join(f"{m[f'{k}_compile_s']:.1f} s" for k in ("one_row", "one_row_watched", "vehicles")), ""),
     ]  # fmt: skip
     lines = [
         "# Row by row: time", "",
