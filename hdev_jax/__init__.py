@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.energy.roadload import roadload
     from hdev_jax.verbs.energy.saved import saved
     from hdev_jax.verbs.energy.whatif import whatif
+    from hdev_jax.verbs.live.follow import follow
     from hdev_jax.verbs.init import init
     from hdev_jax.verbs.predict import predict
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
@@ -40,6 +41,7 @@ __all__ = [
     "compare",
     "diagnose",
     "effects",
+    "follow",
     "init",
     "ledger",
     "predict",
@@ -66,6 +68,7 @@ _HOME = {
     "check": "hdev_jax.verbs.check",
     "diagnose": "hdev_jax.verbs.diagnose",
     "effects": "hdev_jax.verbs.effects",
+    "follow": "hdev_jax.verbs.live.follow",
     "init": "hdev_jax.verbs.init",
     "compare": "hdev_jax.verbs.energy.compare",
     "saved": "hdev_jax.verbs.energy.saved",

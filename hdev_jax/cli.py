@@ -183,6 +183,26 @@ def parser() -> argparse.ArgumentParser:
     predict.add_argument("--level", type=share, default=0.9, metavar="P", help=level)
     predict.add_argument("--online", action="store_true", help="loads that switch follow the power of the rows before")
 
+    follow = verbs.add_parser(
+        "follow",
+        help="rows of a vehicle as they arrive: its energy, its coefficients, what its sheet lacks",
+        description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
+        "is predicted from those before it, and tells more of the sheet's coefficients.",
+        epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
+        "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
+        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
+    )
+    file_argument(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
+    file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
+    file_argument(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
+    file_argument(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
+    target_option(follow)
+    effects_option(follow)
+    follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
+    follow.add_argument(
+        "--no-watch", dest="watch", action="store_false", help="do not look for effects that the sheet lacks"
+    )
+
     simulate = verbs.add_parser(
         "simulate",
         help="a synthetic fleet with known truth: logs, what was true, vehicle sheets",
@@ -242,7 +262,7 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
     with progress.shown():
-        home = f"energy.{verb}" if verb in ENERGY_VERBS else verb
+        home = f"energy.{verb}" if verb in ENERGY_VERBS else "live.follow" if verb == "follow" else verb
         return getattr(import_module(f"hdev_jax.verbs.{home}"), verb)(**arguments)
 
 

@@ -26,7 +26,7 @@ LAYERS = [
     {"inference", "learn", "fleet"},
     {"problem"},
     {"diagnosis", "energy"},
-    {"report"},
+    {"online", "report"},
     {"options", "verbs"},
     {"cli", "experiments"},
 ]

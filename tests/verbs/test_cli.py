@@ -17,7 +17,9 @@ from hdev_jax import cli, progress
 from hdev_jax.errors import InputError
 from hdev_jax.options.energy import ENERGY_VERBS
 
-VERBS = ("check", "init", "diagnose", "calibrate", "predict", "simulate", "demo", "effects", *ENERGY_VERBS)
+VERBS = (
+    "check", "init", "diagnose", "calibrate", "predict", "follow", "simulate", "demo", "effects", *ENERGY_VERBS
+)  # fmt: skip
 SHEET = ["--vehicle", "v.toml"]
 
 

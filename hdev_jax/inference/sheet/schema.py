@@ -87,7 +87,11 @@ SECTIONS: dict[str, dict[str, Key]] = {
         "wheel_radius_m": _LENGTH,
     },
     "machine": {"motoring_efficiency": _EFFICIENCY, "regenerating_efficiency": _EFFICIENCY},
-    "battery": {"auxiliary_w": Key("coefficient", "W"), "nominal_voltage_v": Key("number", "V", 0.0, above=True)},
+    "battery": {
+        "auxiliary_w": Key("coefficient", "W"),
+        "nominal_voltage_v": Key("number", "V", 0.0, above=True),
+        "capacity_wh": Key("number", "Wh", 0.0, above=True),
+    },
 }
 KEYS: dict[str, Key] = {f"{s}.{k}" if s else k: key for s, keys in SECTIONS.items() for k, key in keys.items()}
 _FIELDS = ("value", "sd", "per_vehicle", "estimated", "vehicles")

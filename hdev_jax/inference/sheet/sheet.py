@@ -53,6 +53,7 @@ class Sheet:
         self.final_drive: float | None = others.get("driveline.final_drive")
         self.wheel_radius_m: float | None = others.get("driveline.wheel_radius_m")
         self.nominal_voltage_v: float | None = others.get("battery.nominal_voltage_v")
+        self.capacity_wh: float | None = others.get("battery.capacity_wh")
         self.map_path: Path | None = self.path.parent / others["driveline.map"] if "driveline.map" in others else None
         self.efficiency_map: EfficiencyMap | None = None if self.map_path is None else read_map(self.map_path)
         self.source: str = others.get("source", "")

@@ -87,6 +87,7 @@ def _write(sheet: Sheet, declared: Mapping[str, Declared], units: Mapping[str, s
         "driveline.final_drive": sheet.final_drive,
         "driveline.wheel_radius_m": sheet.wheel_radius_m,
         "battery.nominal_voltage_v": sheet.nominal_voltage_v,
+        "battery.capacity_wh": sheet.capacity_wh,
     }
     if sheet.map_path is not None:
         others["driveline.map"] = map_file or str(sheet.map_path.resolve())

@@ -1,0 +1,3 @@
+"""The verbs of a vehicle on the road: follow."""
+
+__all__ = []
