@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.energy.roadload import roadload
     from hdev_jax.verbs.energy.saved import saved
     from hdev_jax.verbs.energy.whatif import whatif
-    from hdev_jax.verbs.live.follow import follow
     from hdev_jax.verbs.init import init
+    from hdev_jax.verbs.live.follow import follow
     from hdev_jax.verbs.predict import predict
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
     from hdev_jax.verbs.simulate import simulate

@@ -35,7 +35,12 @@ from hdev_jax.options.common import (
 )
 from hdev_jax.options.energy import ENERGY_VERBS, energy_parsers
 
-__all__ = ["main", "parser"]
+__all__ = ["FOLDERS", "main", "parser"]
+
+FOLDERS = {
+    **dict.fromkeys(ENERGY_VERBS, "energy."),
+    "follow": "live.",
+}  # of `verbs`, of those that are not in it itself
 
 _ABOUT = """\
 Give it a measured log of an electric vehicle and a sheet of what you know about
@@ -262,8 +267,7 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
     with progress.shown():
-        home = f"energy.{verb}" if verb in ENERGY_VERBS else "live.follow" if verb == "follow" else verb
-        return getattr(import_module(f"hdev_jax.verbs.{home}"), verb)(**arguments)
+        return getattr(import_module(f"hdev_jax.verbs.{FOLDERS.get(verb, '')}{verb}"), verb)(**arguments)
 
 
 def _print(result: Any) -> None:

@@ -24,7 +24,7 @@ SHEET = ["--vehicle", "v.toml"]
 
 
 def home_of(verb: str) -> str:
-    return f"hdev_jax.verbs.{'energy.' if verb in ENERGY_VERBS else ''}{verb}"
+    return f"hdev_jax.verbs.{cli.FOLDERS.get(verb, '')}{verb}"
 
 
 @pytest.fixture
