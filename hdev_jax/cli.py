@@ -40,7 +40,7 @@ __all__ = ["FOLDERS", "main", "parser"]
 FOLDERS = {
     **dict.fromkeys(ENERGY_VERBS, "energy."),
     "follow": "live.",
-}  # of `verbs`, of those that are not in it itself
+}  # within `verbs`
 
 _ABOUT = """\
 Give it a measured log of an electric vehicle and a sheet of what you know about
