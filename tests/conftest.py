@@ -6,6 +6,7 @@ import os
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import jax
@@ -17,23 +18,24 @@ import PIL.Image
 import pytest
 from jax._src.lru_cache import LRUCache
 
-# One folder of compiled programs for all workers and for the processes that tests start: they compile the same few
-# programs for log after log. Only the first process makes it, so that it outlives every other and is removed with it.
-# Where `JAX_COMPILATION_CACHE_DIR` names a folder, that is used and kept for the next run.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _COMPILED = tempfile.TemporaryDirectory(prefix="hdev-compiled-", ignore_cleanup_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _COMPILED.name
-for _name, _value in {
-    "jax_compilation_cache_dir": os.environ["JAX_COMPILATION_CACHE_DIR"],
-    "jax_persistent_cache_min_compile_time_secs": 0.0,
-    "jax_persistent_cache_min_entry_size_bytes": -1,
-}.items():
-    jax.config.update(_name, _value)
-    os.environ[_name.upper()] = str(_value)
+# One folder of compiled programs for all workers: they compile the same few programs for log after log. The first
+# process makes it, so that it outlives every other and goes with it; `HDEV_TEST_PROGRAMS` names one that is kept for
+# the next run. What a test starts has a folder of its own, for JAX does not write an entry in one step.
+if "HDEV_TEST_PROGRAMS" not in os.environ:
+    _programs = tempfile.TemporaryDirectory(prefix="hdev-compiled-", ignore_cleanup_errors=True)
+    os.environ["HDEV_TEST_PROGRAMS"] = _programs.name
+_COMPILED = Path(os.environ["HDEV_TEST_PROGRAMS"])
+for _name, _here, _started in (
+    ("jax_compilation_cache_dir", str(_COMPILED), str(_COMPILED / str(os.getpid()))),
+    ("jax_persistent_cache_min_compile_time_secs", 0.0, "0.0"),
+    ("jax_persistent_cache_min_entry_size_bytes", -1, "-1"),
+):
+    jax.config.update(_name, _here)
+    os.environ[_name.upper()] = _started
 
 
 def _put(self: LRUCache, key: str, value: bytes) -> None:
-    """JAX's own writes an entry where another process may be reading it; this one is there at once or not at all."""
+    """In the place of JAX's own, which writes an entry while another worker may be reading it."""
     with tempfile.NamedTemporaryFile(dir=self.path, prefix=".", delete=False) as file:
         file.write(value)
     os.replace(file.name, self.path / f"{key}-cache")
@@ -101,10 +103,11 @@ def _plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(matplotlib.figure.Figure, "savefig", _save_noise)
 
 
-def _save_noise(self: matplotlib.figure.Figure, to: str | os.PathLike | io.BytesIO, **options) -> None:
-    if options.get("format") != "png":
-        return _savefig(self, to, **options)
-    to.write(_picture())
+def _save_noise(self: matplotlib.figure.Figure, to: Any, **options: Any) -> None:
+    if options.get("format") == "png":
+        to.write(_picture())
+    else:
+        _savefig(self, to, **options)
 
 
 @pytest.fixture(scope="session")

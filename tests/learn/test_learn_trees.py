@@ -50,7 +50,7 @@ def known() -> tuple[np.ndarray, np.ndarray]:
 
 
 def same(path, predict, thresholds, classes=None) -> None:
-    """The library's probabilities and ours, on 120,000 rows, most of them at thresholds (each several times), and on few."""
+    """The library's probabilities and ours, on 120,000 rows, most of them at thresholds, and on few."""
     trees = read_trees(path, classes)
     x = np.concatenate([rows(20_000, 1), at_thresholds(rows(100_000, 2), thresholds)])
     expected, f = predict(x), jax.jit(lambda x: trees.probabilities(x))
