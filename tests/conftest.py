@@ -98,7 +98,8 @@ def _picture() -> bytes:
 
 @pytest.fixture(autouse=True)
 def _plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plots are made, and only tests marked `drawn` lay them out and draw their pixels: half of the time of a page."""
+    """Plots are made, and only tests marked `drawn` lay them out and draw their pixels: half of the time of a page.
+    What a module or a session shares is drawn."""
     if request.node.get_closest_marker("drawn") is None:
         monkeypatch.setattr(matplotlib.figure.Figure, "savefig", _save_noise)
 
