@@ -7,6 +7,9 @@ READY := $(VENV)/.ready
 CUT_OFF := $(VENV)/.installing
 PIP := $(PY) -m pip --disable-pip-version-check --no-input install -qq -c constraints.txt
 
+# What one process has compiled to bytecode the others read, where the environment says otherwise too.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: demo paper test lint types docs FORCE
 .DELETE_ON_ERROR:
 

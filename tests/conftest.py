@@ -1,25 +1,47 @@
 """Every test runs with float64, without silent rank promotion, and with the shapes in annotations checked."""
 
+import gc
+import io
 import os
 import tempfile
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import jax
 import jaxtyping
 import matplotlib as mpl
+import matplotlib.figure
+import numpy as np
+import PIL.Image
 import pytest
+from jax._src.lru_cache import LRUCache
 
-# One cache of compiled programs for a test process and the processes that it starts: the tests compile the same few
-# programs for log after log. A folder of its own for each worker, for JAX does not write an entry in one step.
-_COMPILED = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
-for _name, _value in {
-    "jax_compilation_cache_dir": _COMPILED.name,
-    "jax_persistent_cache_min_compile_time_secs": 0.0,
-    "jax_persistent_cache_min_entry_size_bytes": -1,
-}.items():
-    jax.config.update(_name, _value)
-    os.environ[_name.upper()] = str(_value)  # the same for the processes that a test starts
+# One folder of compiled programs for all workers: they compile the same few programs for log after log. The first
+# process makes it, so that it outlives every other and goes with it; `HDEV_TEST_PROGRAMS` names one that is kept for
+# the next run. What a test starts has a folder of its own, for JAX does not write an entry in one step.
+if "HDEV_TEST_PROGRAMS" not in os.environ:
+    _programs = tempfile.TemporaryDirectory(prefix="hdev-compiled-", ignore_cleanup_errors=True)
+    os.environ["HDEV_TEST_PROGRAMS"] = _programs.name
+_COMPILED = Path(os.environ["HDEV_TEST_PROGRAMS"])
+for _name, _here, _started in (
+    ("jax_compilation_cache_dir", str(_COMPILED), str(_COMPILED / str(os.getpid()))),
+    ("jax_persistent_cache_min_compile_time_secs", 0.0, "0.0"),
+    ("jax_persistent_cache_min_entry_size_bytes", -1, "-1"),
+):
+    jax.config.update(_name, _here)
+    os.environ[_name.upper()] = _started
+
+
+def _put(self: LRUCache, key: str, value: bytes) -> None:
+    """In the place of JAX's own, which writes an entry while another worker may be reading it."""
+    with tempfile.NamedTemporaryFile(dir=self.path, prefix=".", delete=False) as file:
+        file.write(value)
+    os.replace(file.name, self.path / f"{key}-cache")
+
+
+LRUCache.put = _put
 
 
 def _with_shapes() -> list[str]:
@@ -53,11 +75,40 @@ compile_quickly()  # each program runs once or twice; studies and benchmarks run
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 mpl.use("Agg")
+# What is imported stays: it need not be looked through again, nor the many short-lived objects of a trace so often.
+gc.freeze()
+gc.set_threshold(50_000, 10, 10)
 hypothesis.settings.register_profile("hdev", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("hdev")
 
 DATA = Path(os.environ.get("HDEV_DATA") or Path(__file__).parents[2] / "shared" / "data")
 NO_DATA = f"no measured data in {DATA} (HDEV_DATA)"
+
+
+_savefig = matplotlib.figure.Figure.savefig
+
+
+@cache
+def _picture() -> bytes:
+    """A PNG of noise: as many bytes as a plot, in none of its time."""
+    file = io.BytesIO()
+    PIL.Image.fromarray(np.random.default_rng(0).integers(0, 256, (60, 100, 3), np.uint8)).save(file, "png")
+    return file.getvalue()
+
+
+@pytest.fixture(autouse=True)
+def _plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plots are made, and only tests marked `drawn` lay them out and draw their pixels: half of the time of a page.
+    What a module or a session shares is drawn."""
+    if request.node.get_closest_marker("drawn") is None:
+        monkeypatch.setattr(matplotlib.figure.Figure, "savefig", _save_noise)
+
+
+def _save_noise(self: matplotlib.figure.Figure, to: Any, **options: Any) -> None:
+    if options.get("format") == "png":
+        to.write(_picture())
+    else:
+        _savefig(self, to, **options)
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 
+from experiments.runner.workers import crowded
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State
@@ -69,7 +70,7 @@ def diagnosed(problem: Problem, split: Split, library: Mapping[str, type[Effect]
     """The whole loop, with what a process that compiles for every log has to forget now and then."""
     global _runs
     _runs += 1
-    if _runs % 12 == 0:
+    if crowded(_runs):
         jax.clear_caches()  # or it runs out of memory maps
     return diagnose(problem, split, library, **{"seed": 0} | options)
 

@@ -22,7 +22,7 @@ from typing import Any
 from experiments.runner.store import sources
 from hdev_jax import progress
 
-__all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
+__all__ = ["ClusterError", "Job", "Outcome", "call", "crowded", "in_turn", "on_cluster", "on_cores"]
 
 MOST_MAPS = 15_000  # memory maps of a process: Linux gives it 65,530; so many are some 2 GB of compiled programs
 FORGET_EVERY = 40  # tasks, where nobody says how many maps there are
@@ -47,7 +47,7 @@ def call(job: Job) -> tuple[list[Any], float]:
 
     # only where JAX is in use: an experiment may do without
     def run(task: dict[str, Any]) -> Any:
-        if _crowded(next(_calls)) and (jax := sys.modules.get("jax")) is not None:
+        if crowded(next(_calls)) and (jax := sys.modules.get("jax")) is not None:
             jax.clear_caches()  # a process that compiles for ever runs out of memory maps
         return module.run(task)
 
@@ -59,8 +59,8 @@ def call(job: Job) -> tuple[list[Any], float]:
     return results, time.perf_counter() - started
 
 
-def _crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:
-    """Whether it is time to forget what was compiled."""
+def crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:
+    """Whether it is time to forget what was compiled, after so many calls; `maps`: where Linux lists memory maps."""
     try:
         with maps.open("rb") as lines:
             return sum(1 for _ in lines) > MOST_MAPS

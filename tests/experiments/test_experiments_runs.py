@@ -61,10 +61,10 @@ def test_a_process_forgets_what_it_compiled_before_its_memory_maps_run_out(tmp_p
     few.write_text("map\n" * 10)
     many.write_text("map\n" * 11)
     monkeypatch.setattr(workers, "MOST_MAPS", 10)
-    assert [workers._crowded(calls, few) for calls in (1, workers.FORGET_EVERY)] == [False, False]
-    assert workers._crowded(1, many)
+    assert [workers.crowded(calls, few) for calls in (1, workers.FORGET_EVERY)] == [False, False]
+    assert workers.crowded(1, many)
     nowhere = tmp_path / "no" / "maps"
-    assert [workers._crowded(calls, nowhere) for calls in (1, workers.FORGET_EVERY)] == [False, True]
+    assert [workers.crowded(calls, nowhere) for calls in (1, workers.FORGET_EVERY)] == [False, True]
 
 
 def test_what_was_killed_resumes(tmp_path, config, monkeypatch):

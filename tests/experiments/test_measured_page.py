@@ -77,6 +77,7 @@ def results() -> dict:
     return {**niro, "niro_road": result([COPPER], 150.0), **folds, **held}
 
 
+@pytest.mark.drawn
 def test_the_page_tells_all_runs_and_draws_them(results, tmp_path):
     rest = {"temperature": {"rows": 2000, "trips": 2, "gone": ["ambient_temp_c"], "same": ["time_s"], "ledger": 3}}
     text, drawn = page.page(results, warm={"A": 3.0, "B": 20.0}, rest=rest)

@@ -398,6 +398,7 @@ def test_the_sheet_predicts_what_the_truth_says_it_does(folder):
         assert {c.name for c in built.table.free} == {"road.c_rr", "road.cda_m2"}
 
 
+@pytest.mark.drawn
 def test_a_killed_run_goes_on_to_the_same_bytes_and_done_is_done(folder, capsys, monkeypatch):
     config, write, written = folder / "fleet.toml", files._write_vehicle, []
 

@@ -156,11 +156,11 @@ def test_nuts_agrees_with_the_closed_form_of_one_vehicle(tmp_path):
 
     The closed form's table is as wide as the noise turns out; its draws are weighed to the model's, which is not.
     """
-    fit, _, _ = fleet(1, 400)
+    fit, _, _ = fleet(1, 100)
     line = linear_fit(truck(), tabular(), lambda: [Rows(fit, np.zeros(fit.rows, dtype=int))], "battery_power_kw")
     noise = float(line.prior.noise)
     model = Model.of(truck(), tabular(), fit, "battery_power_kw", noise=noise, student=False, grows=False)
-    long = sampled(model, line.values, key=jax.random.key(0), chains=4, draws=1000, noise=noise)
+    long = sampled(model, line.values, key=jax.random.key(0), chains=4, draws=600, noise=noise)
     assert long.faults() == []
     theta, sigma = line.draws(jax.random.key(1), 100_000)
     away = np.sum(((theta - PRIOR) / PRIOR_SD) ** 2, axis=1)
@@ -173,7 +173,7 @@ def test_nuts_agrees_with_the_closed_form_of_one_vehicle(tmp_path):
         assert abs(np.mean(ours) - mean) < 4.0 * sd / np.sqrt(long.quality()["ess"])
         assert np.std(ours) == pytest.approx(sd, rel=0.1)
     long.write(tmp_path / "posterior.nc")
-    assert long.idata().sample_stats["diverging"].shape == (4, 1000)
+    assert long.idata().sample_stats["diverging"].shape == (4, 600)
 
 
 DRIFT = {

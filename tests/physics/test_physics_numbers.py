@@ -59,19 +59,22 @@ def test_it_reads_as_the_road_chain_with_one_efficiency() -> None:
     np.testing.assert_allclose(lossless.power(LOG), lossless.force(LOG) * LOG.speed_mps, rtol=1e-12)
 
 
+@jax.jit
+def energy(x: Any) -> Any:
+    return truck(*x).energy(LOG.without("mass_kg"))
+
+
+slopes = jax.jit(jax.jacfwd(energy))
+
+
 @given(st.floats(0.003, 0.02), st.floats(1.0, 9.0), st.floats(0.7, 1.0), st.floats(5e3, 4e4), st.sampled_from(range(4)))
 def test_gradients_against_differences(c_rr: float, cda: float, efficiency: float, mass: float, which: int) -> None:
     """By each number, wherever the vehicle is: the sign of no row's force changes over so small a step."""
     at = np.array([c_rr, cda, efficiency, mass])
-    log = LOG.without("mass_kg")
-
-    def energy(x: Any) -> Any:
-        return truck(*x).energy(log)
-
     step = np.zeros(4)
     step[which] = 1e-6 * at[which]
     slope = (energy(at + step) - energy(at - step)) / (2e-6 * at[which])
-    found = jax.jacfwd(energy)(jnp.asarray(at))[:, which]
+    found = slopes(jnp.asarray(at))[:, which]
     off = np.abs(found - slope) > 1e-6 * np.max(np.abs(slope))
     assert np.sum(off) == 0 or np.any(np.abs(truck(*at).force(log)[off]) < 1.0)
 

@@ -48,6 +48,7 @@ def report(tmp_path_factory):
     return folder
 
 
+@pytest.mark.drawn
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 @pytest.mark.parametrize(("width", "dark"), [(1280, False), (390, False), (390, True)])
