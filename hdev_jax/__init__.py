@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.check import check
     from hdev_jax.verbs.diagnose import diagnose
     from hdev_jax.verbs.effects import effects
+    from hdev_jax.verbs.follow import follow
     from hdev_jax.verbs.init import init
     from hdev_jax.verbs.predict import predict
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
@@ -32,6 +33,7 @@ __all__ = [
     "check",
     "diagnose",
     "effects",
+    "follow",
     "init",
     "predict",
     "read_log",
@@ -53,6 +55,7 @@ _HOME = {
     "check": "hdev_jax.verbs.check",
     "diagnose": "hdev_jax.verbs.diagnose",
     "effects": "hdev_jax.verbs.effects",
+    "follow": "hdev_jax.verbs.follow",
     "init": "hdev_jax.verbs.init",
     "predict": "hdev_jax.verbs.predict",
     "simulate": "hdev_jax.verbs.simulate",

@@ -22,6 +22,7 @@ from hdev_jax import __version__
 from hdev_jax.compiling import compile_quickly, compiles_long, keep_compiled
 from hdev_jax.errors import InputError
 from hdev_jax.targets import TARGETS
+from hdev_jax.verbs.arguments import count, names, share
 
 __all__ = ["main", "parser"]
 
@@ -111,11 +112,11 @@ def parser() -> argparse.ArgumentParser:
     _logs(diagnose)
     _split(diagnose)
     _effects(diagnose)
-    diagnose.add_argument("--only", type=_names, metavar="ID,ID", help="search only these effects")
-    diagnose.add_argument("--exclude", type=_names, metavar="ID,ID", help="leave these effects out of the search")
+    diagnose.add_argument("--only", type=names, metavar="ID,ID", help="search only these effects")
+    diagnose.add_argument("--exclude", type=names, metavar="ID,ID", help="leave these effects out of the search")
     diagnose.add_argument(
         "--fdr",
-        type=_share,
+        type=share,
         default=0.05,
         metavar="Q",
         help="highest FDR-adjusted p-value of an added effect (default: 0.05)",
@@ -168,8 +169,28 @@ def parser() -> argparse.ArgumentParser:
         help="the file to write (.csv, .csv.gz or .parquet): trip_id, time_s, predicted, lower, upper, level",
     )
     level = "probability inside the interval (default: 0.9)"
-    predict.add_argument("--level", type=_share, default=0.9, metavar="P", help=level)
+    predict.add_argument("--level", type=share, default=0.9, metavar="P", help=level)
     predict.add_argument("--online", action="store_true", help="loads that switch follow the power of the rows before")
+
+    follow = verbs.add_parser(
+        "follow",
+        help="rows of a vehicle as they arrive: its energy, its coefficients, what its sheet lacks",
+        description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
+        "is predicted from those before it, and tells more of the sheet's coefficients.",
+        epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
+        "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
+        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
+    )
+    _file(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
+    _file(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
+    _file(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
+    _file(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
+    _target(follow)
+    _effects(follow)
+    follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
+    follow.add_argument(
+        "--no-watch", dest="watch", action="store_false", help="do not look for effects that the sheet lacks"
+    )
 
     simulate = verbs.add_parser(
         "simulate",
@@ -191,7 +212,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--out", type=Path, default=Path("hdev_demo"), metavar="DIR", help="the folder (default: hdev_demo)"
     )
-    demo.add_argument("--seed", type=_count, default=3, metavar="N", help="random seed of the log (default: 3)")
+    demo.add_argument("--seed", type=count, default=3, metavar="N", help="random seed of the log (default: 3)")
 
     verbs.add_parser(
         "effects",
@@ -226,13 +247,13 @@ def _split(verb: argparse.ArgumentParser) -> None:
     _target(verb)
     verb.add_argument(
         "--train-trips",
-        type=_names,
+        type=names,
         metavar="A,B",
         help="training trips; without --test-trips all others are test trips",
     )
     verb.add_argument(
         "--test-trips",
-        type=_names,
+        type=names,
         metavar="C,D",
         help="held-out test trips; without --train-trips all others are for training; with neither, "
         "every third trip is held out",
@@ -245,30 +266,7 @@ def _effects(verb: argparse.ArgumentParser) -> None:
 
 def _out(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the results")
-    verb.add_argument("--seed", type=_count, default=0, metavar="N", help="random seed (default: 0)")
-
-
-def _names(text: str) -> tuple[str, ...]:
-    names = tuple(part.strip() for part in text.split(","))
-    if not all(names):
-        raise argparse.ArgumentTypeError(f"expected names with commas between them, found {text!r}")
-    return names
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < 1.0:
-        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, found {text!r}")
-    return value
-
-
-def _count(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) < 2**32):
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 2^32 - 1, found {text!r}")
-    return int(text)
+    verb.add_argument("--seed", type=count, default=0, metavar="N", help="random seed (default: 0)")
 
 
 class _Parser(argparse.ArgumentParser):

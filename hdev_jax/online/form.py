@@ -67,7 +67,8 @@ class Form:
             raise ValueError(f"level: a probability between 0 and 1 is expected, found {level}")
         names = tuple(c.name for c in table.free)
         return Form(
-            (*NEEDED, *sorted(channels)), target, table.structure, names, tuple(c.unit for c in table.free),
+            (*NEEDED, *sorted(set(channels) - {*NEEDED})), target, table.structure, names,
+            tuple(c.unit for c in table.free),
             tuple(k for k, c in enumerate(table.free) if c.path in by_trip), LEVELS[target] if levels else (),
             tuple((m, s) for m in memories for s in (lasting_s if levels else (math.inf,))), robust, drifts,
             known_noise, level, candidates, alpha,

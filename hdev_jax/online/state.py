@@ -72,8 +72,9 @@ class State(eqx.Module):
     target's unit). `drift`: sd [scale] by which each wanders in an hour. `noise`: of a row where it is declared.
     For each member, a model of the noise: `sums` over rows; `mean` and `covariance` of the posterior, `variance` of a
     whitened row, `wide`, that of a row as it counts in a total, `score`, mean square of a weighed error over its scale;
-    `evidence`, the logarithm of its likelihood. `before` and `candidate`, the last row used, [x | r] and c, and
-    `since`, how many rows ago it was; `last`, the last good value of each column. `counts` as in `Form.counts`;
+    `evidence`, the logarithm of its likelihood. `growth`, moments of squared errors and the target's size, and `worth`,
+    of all rows in those of the usual noise. `before` and `candidate`, the last row used, [x | r] and c, and `since`,
+    how many rows ago it was; `last`, the last good value of each column. `counts` as in `Form.counts`;
     `totals`: of rows, the target's squares, squares of the levels' columns; `level_squares` of finished trips;
     `driven_s`, how long all rows were. Of effects that are watched: `cost_wh`, what one unit of each candidate came to;
     `lowest`, the least log e-value that it had, and `lowest_at` which row; `alarm_at`, the row at which each effect was
@@ -92,6 +93,8 @@ class State(eqx.Module):
     variance: Float[Array, "*car member"]
     wide: Float[Array, "*car member"]
     score: Float[Array, "*car member"]
+    growth: Float[Array, "*car moment"]
+    worth: Float[Array, "*car"]
     evidence: Float[Array, "*car member"]
     before: Float[Array, "*car z"]
     candidate: Float[Array, "*car candidate"]
@@ -155,7 +158,8 @@ class Now(eqx.Module):
     **Fields:** `predicted` in the target's unit with its interval, from the rows before; `model`, the same without
     what the error of the row before tells; `energy_wh` of the row where the target is the battery's, else its work;
     `values` and `sd` of the coefficients after the row; `sigma`, `memory`, as of the state; `weight` of the row (1: in
-    full, 0: not used). A row that cannot be used has NaN.
+    full, 0: not used); `alarm`, not 0 once an effect is certain that the sheet lacks. Of a row that cannot be used NaN,
+    and of the first one no interval.
     """
 
     predicted: Float[Array, "*row"]
@@ -168,6 +172,7 @@ class Now(eqx.Module):
     sigma: Float[Array, "*row"]
     memory: Float[Array, "*row"]
     weight: Float[Array, "*row"]
+    alarm: Float[Array, "*row"]
 
 
 def acts_across_rows(effect: type[Effect] | Effect) -> bool:
@@ -246,6 +251,7 @@ def start(
         sums=Sums(jnp.zeros((m, size + 1, size + 1)), jnp.zeros((m, size + 1, c)), jnp.zeros((m, c))),
         mean=jnp.zeros((m, size)), covariance=real(np.tile(np.diag(np.r_[np.ones(k), np.zeros(size - k)]), (m, 1, 1))),
         variance=real(np.full(m, 0.0 if noise is None else noise**2)), wide=jnp.zeros(m), score=jnp.zeros(m),
+        growth=jnp.zeros(5), worth=zero,
         evidence=jnp.zeros(m), before=jnp.zeros(size + 1), candidate=jnp.zeros(c), since=real(np.inf), last=real(last),
         counts=jnp.zeros(len(form.counts)), totals=jnp.zeros(2 + size - k), level_squares=jnp.zeros(size - k),
         driven_s=zero, cost_wh=jnp.zeros(c), lowest=jnp.zeros(c), lowest_at=jnp.zeros(c),

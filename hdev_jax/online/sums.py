@@ -26,7 +26,8 @@ TINY = 1e-300
 def levels_prior(state: State) -> Float[Array, " level"]:
     """Variance of each level over trips: what finished trips had, and a share of the target for the first."""
     n, square, columns = state.totals[0], state.totals[1], state.totals[2:]
-    usual = LEVEL_SHARE**2 * square / jnp.maximum(columns, 1e-12 * jnp.maximum(square, 1e-12))
+    moved = columns > 1e-6 * jnp.max(columns, initial=0.0)  # a force does nothing before the vehicle first moves
+    usual = jnp.where(moved, LEVEL_SHARE**2 * square / jnp.where(moved, columns, 1.0), 0.0)
     return jnp.where(n > 0, (TRIPS * usual + state.level_squares) / (TRIPS + finished_trips(state)), 1.0)
 
 
@@ -61,7 +62,7 @@ def whole_posterior(state: State) -> State:
 
     before = jnp.maximum(jnp.where(state.variance > 0, state.variance, usual), TINY)
     mean, covariance, left = jax.vmap(one)(state.sums.gram, of_mean(form, before))
-    variance = before if form.known_noise else jnp.maximum((BELIEVED * usual + left) / (BELIEVED + n), TINY)
+    variance = before if form.known_noise else jnp.maximum((BELIEVED * usual + left) / (BELIEVED + state.worth), TINY)
     return eqx.tree_at(lambda s: (s.mean, s.covariance, s.variance), state, (mean, covariance, variance))
 
 

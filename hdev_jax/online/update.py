@@ -38,6 +38,9 @@ __all__ = ["expected", "one_row", "scan", "update", "wh_per_unit"]
 
 ENOUGH = 20.0  # rows that show the noise, from which on models of it are weighed by what they predict
 FAULT = 6.0  # scales: beyond, a row is an instrument's fault; it is no neighbour of the next (`inference.predictive`)
+ALIKE = 20.0  # rows that are believed to be equally noisy, before any are seen
+QUIET = 0.05  # least variance of a row over that of all: rows at rest are not exact
+LARGE = 100.0  # mean squares of the target: above, a prediction says nothing more of its noise
 EDGE = 1e-6  # of a bounded support, that estimates are kept off its ends
 NORMAL_SCORE = 0.774  # mean square of a weighed normal error over the scale that a Student t of 4 degrees gives it
 
@@ -101,14 +104,12 @@ def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
     channels, before = row[len(NEEDED) :], state.last[len(NEEDED) :]
     gone = ~jnp.isfinite(channels)
     channels = jnp.where(gone, before, channels)
-    good &= jnp.all(jnp.isfinite(channels))
-    channels = jnp.where(jnp.isfinite(channels), channels, 0.0)
     whole = row.at[len(NEEDED) :].set(channels)
     for name, value in (("duration_s", duration), ("distance_m", distance), ("speed_start_mps", v0),
                         ("speed_end_mps", v1)):  # fmt: skip
         whole = whole.at[at[name]].set(value)
     whole = whole.at[at["time_s"]].set(jnp.where(jnp.isfinite(row[at["time_s"]]), row[at["time_s"]], _next(state, at)))
-    return whole, good, jnp.concatenate([lost[None], gone])
+    return whole, good, jnp.concatenate([lost[None], gone & jnp.isfinite(before)])
 
 
 def _next(state: State, at: dict[str, int]) -> Array:
@@ -142,6 +143,9 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
 
     mean = begun.weights @ begun.mean
     base, x = expected(begun, mean, whole)
+    good &= jnp.isfinite(base) & jnp.all(
+        jnp.isfinite(x)
+    )  # NaN where the vehicle reads a channel that never had a value
     heard = jnp.isfinite(row[at["measured"]]) & good
     y = jnp.where(heard, row[at["measured"]], 0.0)
     z = jnp.append(x, y - base)
@@ -153,37 +157,43 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     xs, rs = white[:, :-1], white[:, -1]
     # what the rows before say of this one
     own = jnp.where(begun.variance > 0, begun.variance, jnp.maximum((SHARE * base) ** 2, TINY) * (1.0 - rho**2))
-    width = own + jnp.einsum("mi,mij,mj->m", xs, begun.covariance, xs)
+    loud, size = _loudness(begun, base + mean @ x) if form.robust else (jnp.ones(()), jnp.zeros(()))
+    width = loud * own + jnp.einsum("mi,mij,mj->m", xs, begun.covariance, xs)
     told = base + begun.mean @ x + fades * (begun.before[-1] - begun.mean @ begun.before[:-1])
     weights = begun.weights
     predicted = weights @ told
     spread = weights @ (q * width + (told - predicted) ** 2)
-    half = _reach(form) * jnp.sqrt(spread)
+    half = jnp.where(n > 0, _reach(form) * jnp.sqrt(spread), jnp.nan)  # of the first row the noise is not known
     # what it says of them
     far = (y - predicted) ** 2 / spread
     sure = form.robust & (n > 0)  # of the first row nothing is known that it could be far from
-    weight = jnp.where(sure, (STUDENT_DF + 1.0) / (STUDENT_DF + far), 1.0) * heard
+    tail = jnp.where(sure, (STUDENT_DF + 1.0) / (STUDENT_DF + far), 1.0)
+    weight = tail / loud * heard
     fault = heard & sure & (far > FAULT**2)
     near = heard & ~fault
     error, scale = rs - jnp.sum(xs * begun.mean, axis=1), jnp.sqrt(width)
     density = jax.scipy.stats.t.logpdf(error / scale, STUDENT_DF) if form.robust else -0.5 * (error / scale) ** 2
     density = jnp.where(heard & (n >= ENOUGH), density - jnp.log(scale) - 0.5 * jnp.log(q), 0.0)
     evidence = begun.evidence + density
-    clipped = jnp.where(sure, jnp.minimum(error**2, FAULT**2 * width), error**2) * own / width
-    score = jnp.where(sure, (weight * error / scale) ** 2, NORMAL_SCORE)
+    clipped = jnp.where(sure, jnp.minimum(error**2, FAULT**2 * width), error**2) * loud * own / width
+    score = jnp.where(sure, (tail * error / scale) ** 2, NORMAL_SCORE)
 
     def running(mean: Array, new: Array) -> Array:
         return jnp.where(heard, (n * mean + new) / (n + 1.0), mean)
 
     sums = faded(begun, xs, duration / 3600.0) if form.drifts else begun.sums
+    # squares of errors over the noise of a row, by how large the target is; large ones do not outweigh the rest
+    grown = jnp.stack([1.0, size, size**2, loud * tail * far, loud * tail * far * size]) / (1.0 + size) ** 2
     squares = jnp.concatenate([jnp.ones(1), y[None] ** 2, x[len(form.names) :] ** 2])
     wh = wh_per_unit(form, whole)
     used = eqx.tree_at(
-        lambda s: (s.sums, s.evidence, s.before, s.candidate, s.since, s.wide, s.score, s.totals, s.cost_wh),
-        begun,
+        lambda s: (
+            s.sums, s.evidence, s.before, s.candidate, s.since, s.wide, s.score, s.totals, s.growth, s.worth, s.cost_wh,
+        ), begun,
         (sums.plus(white, white_c, weight), evidence - jnp.max(evidence), jnp.where(near, z, begun.before),
          jnp.where(near, c, begun.candidate), jnp.where(near, 0.0, since), running(begun.wide, clipped),
-         running(begun.score, score), begun.totals + heard * squares, begun.cost_wh + c * wh),
+         running(begun.score, score), begun.totals + heard * squares,
+         begun.growth + (heard & (n >= ENOUGH)) * grown, begun.worth + heard / loud, begun.cost_wh + c * wh),
     )  # fmt: skip
     counts = state.counts + _counted(held, good, heard, fault, gap, jumps, opens)
     after = eqx.tree_at(lambda s: s.driven_s, whole_posterior(used), used.driven_s + duration)
@@ -197,8 +207,23 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     }  # fmt: skip
     return new, Now(
         **{k: jnp.where(good, v, jnp.nan) for k, v in seen.items()}, values=new.values, sd=new.sd, sigma=new.sigma,
-        memory=new.memory, weight=weight,
+        memory=new.memory, weight=weight, alarm=jnp.max(new.alarm_at, initial=0.0),
     )  # fmt: skip
+
+
+def _loudness(state: State, predicted: Array) -> tuple[Array, Array]:
+    """Variance of this row's noise over that of a row of no energy, a + b·u; and u, the square of what is predicted
+    over the mean square of the target.
+
+    Instruments err in proportion to what they show (`inference.predictive`, growth). By least squares of the squared
+    errors so far, of which the first are believed to be alike.
+    """
+    size = predicted**2 / jnp.maximum(state.totals[1] / jnp.maximum(state.totals[0], 1.0), TINY)
+    n, u, uu, e, eu = state.growth + ALIKE * jnp.array([1.0, 1.0, 2.0, 1.0, 1.0])
+    slope = jnp.clip((n * eu - u * e) / (n * uu - u**2), 0.0, jnp.maximum(eu / uu, 0.0))
+    level = (e - slope * u) / n
+    loud = jnp.maximum(level, QUIET) + slope * jnp.minimum(size, LARGE)
+    return jnp.where(state.totals[0] > 0, loud, 1.0), jnp.minimum(size, LARGE)
 
 
 def _reach(form: Form) -> float:

@@ -37,7 +37,7 @@ from hdev_jax.segments import Segments
 
 __all__ = ["WATCH_ROWS", "Alarm", "Watch", "evidence", "of_effects", "watched"]
 
-WATCH_ROWS = 200.0  # that show the noise and its correlation, which E takes as known; also these count in it
+WATCH_ROWS = 400.0  # that show the noise and its correlation, which E takes as known; also these count in it
 
 SHIFT_S = 9 * 3600.0  # what a vehicle drives in a day: daily driving time of Regulation (EC) 561/2006
 

@@ -1,12 +1,13 @@
 """Arguments as people write them: names as text or one by one, a seed of any kind of whole number."""
 
+import argparse
 from collections.abc import Iterable
 from numbers import Integral
 from typing import Any
 
 from hdev_jax.errors import InputError
 
-__all__ = ["names_of", "seed_of"]
+__all__ = ["count", "names", "names_of", "seed_of", "share"]
 
 
 def seed_of(given: Any) -> int:
@@ -28,3 +29,29 @@ def names_of(given: Any) -> tuple[str, ...] | None:
     if not all(names):
         raise InputError(f"expected names with commas between them, found {given!r}")
     return names
+
+
+def names(text: str) -> tuple[str, ...]:
+    """An option's names with commas between. Raises argparse's error for an empty one."""
+    found = tuple(part.strip() for part in text.split(","))
+    if not all(found):
+        raise argparse.ArgumentTypeError(f"expected names with commas between them, found {text!r}")
+    return found
+
+
+def share(text: str) -> float:
+    """An option's number between 0 and 1. Raises argparse's error for another."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < 1.0:
+        raise argparse.ArgumentTypeError(f"expected a number between 0 and 1, found {text!r}")
+    return value
+
+
+def count(text: str) -> int:
+    """An option's whole number from 0 to 2³² − 1. Raises argparse's error for another."""
+    if not (text.isascii() and text.isdigit() and int(text) < 2**32):
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 2^32 - 1, found {text!r}")
+    return int(text)

@@ -48,7 +48,7 @@ def test_a_planted_effect_of_half_the_noise_is_named(watching, effect):
     assert alarm is not None
     assert alarm.effect == effect
     assert effect not in alarm.instead
-    assert 200 < alarm.certain_row <= 600
+    assert 400 < alarm.certain_row <= 600
     assert alarm.since_row < alarm.certain_row
     assert alarm.sd > 0
     assert f"{effect}: {alarm.name} = " in alarm.line()

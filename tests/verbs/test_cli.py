@@ -16,7 +16,7 @@ import hdev_jax
 from hdev_jax import cli, progress
 from hdev_jax.errors import InputError
 
-VERBS = ("check", "init", "diagnose", "calibrate", "predict", "simulate", "demo", "effects")
+VERBS = ("check", "init", "diagnose", "calibrate", "predict", "follow", "simulate", "demo", "effects")
 SHEET = ["--vehicle", "v.toml"]
 
 

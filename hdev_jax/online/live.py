@@ -1,0 +1,104 @@
+"""One vehicle fed from Python row by row: one compiled call a row, and a file that keeps what is known."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
+
+from hdev_jax.errors import InputError
+from hdev_jax.online.state import Now, State
+from hdev_jax.online.update import update
+from hdev_jax.rundir import atomic_file
+
+__all__ = ["Live", "keep", "kept"]
+
+SCHEMA = "hdev-follow/1"
+
+
+class Live:
+    """A state that each call takes one row further: all that changes is one vector, which the call gives away and gets
+    back, so that a row costs little beyond its arithmetic.
+
+    `state` is what is known now; setting it begins anew from there.
+    """
+
+    def __init__(self, state: State):
+        changing, constant = eqx.partition(state, _changes(state))
+        self._flat, self._whole = ravel_pytree(changing)
+        self._constant, structure = jax.tree.flatten(constant)
+        now = jax.eval_shape(update, state, jnp.zeros(len(state.form.columns)), jnp.zeros(len(state.form.candidates)))[
+            1
+        ]
+        empty = jax.tree.map(lambda leaf: np.zeros(leaf.shape), now)
+        _, self._now = ravel_pytree(empty)
+        self._sizes = [(leaf.shape, int(leaf.size)) for leaf in jax.tree.leaves(empty)]
+        self._shape = jax.tree.structure(empty)
+        self._restored = lambda flat, leaves: eqx.combine(self._whole(flat), jax.tree.unflatten(structure, leaves))
+
+        def step(flat: Any, leaves: Any, row: Any, candidates: Any) -> tuple[Any, Any]:
+            new, now = update(self._restored(flat, leaves), row, candidates)
+            return ravel_pytree(eqx.filter(new, _changes(new)))[0], ravel_pytree(now)[0]
+
+        self._step = jax.jit(step, donate_argnums=0)
+        self._none = np.zeros(len(state.form.candidates))
+
+    def __call__(self, row: Float[np.ndarray, " column"], candidates: Any = None) -> Now:
+        """One row more, as `update`; what is known now, as NumPy arrays."""
+        each = self._none if candidates is None else candidates
+        self._flat, told = self._step(self._flat, self._constant, row, each)
+        told, at, leaves = np.asarray(told), 0, []
+        for shape, size in self._sizes:
+            leaves.append(told[at : at + size].reshape(shape))
+            at += size
+        return jax.tree.unflatten(self._shape, leaves)
+
+    @property
+    def state(self) -> State:
+        """What is known after the rows so far."""
+        return self._restored(self._flat, self._constant)
+
+    @property
+    def numbers(self) -> Float[np.ndarray, " number"]:
+        """All that changes, as one vector."""
+        return np.asarray(self._flat)
+
+    @numbers.setter
+    def numbers(self, flat: Float[np.ndarray, " number"]) -> None:
+        """Raises `ValueError` for another number of them."""
+        if np.shape(flat) != self._flat.shape:
+            raise ValueError(f"{self._flat.size} numbers are expected, found {np.size(flat)}")
+        self._flat = jnp.asarray(flat)
+
+
+def _changes(state: State) -> Any:
+    """Which leaves a row changes."""
+    constant = jax.tree.map(lambda _: True, state)
+    where = lambda s: (s.vehicle, s.centre, s.scale, s.drift, s.noise)  # noqa: E731
+    return eqx.tree_at(where, constant, replace_fn=lambda leaf: jax.tree.map(lambda _: False, leaf))
+
+
+def keep(path: str | Path, live: Live, about: dict[str, Any]) -> None:
+    """Write what is known to a file, whole or not at all; `about`, plain values that go with it."""
+    with atomic_file(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, numbers=live.numbers, about=np.array(json.dumps({"schema": SCHEMA} | about)))
+
+
+def kept(path: str | Path) -> tuple[Float[np.ndarray, " number"], dict[str, Any]]:
+    """What `keep` wrote. Raises `InputError` for a file that it did not write, `FileNotFoundError` for none."""
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            numbers, about = found["numbers"], json.loads(str(found["about"]))
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as e:
+        raise InputError(f"--state {path}: no file of hdev follow; name another, or delete it") from e
+    if about.get("schema") != SCHEMA:
+        raise InputError(f"--state {path}: {about.get('schema')!r} is not {SCHEMA!r}; name another file, or delete it")
+    return numbers, about
