@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import minimize
 
-__all__ = ["DRIVE", "HEIGHT", "SLOPE", "Course", "Kind", "Lanes", "course_of", "lanes_of", "smoothed"]
+__all__ = ["DRIVE", "HEIGHT", "SLOPE", "Course", "Kind", "Lanes", "course_of", "lanes_of", "smoothed", "usual_sd"]
 
 LANE = 256  # cells that are filtered together; a lane more costs less than a longer one
 MARGIN = 64  # cells at a lane's ends that are another's: several spans of smoothing
-BATCH = 32  # lanes at a time
+BATCH = 64  # lanes at a time
 SOME = 8  # lanes whose likelihood is maximised: 2,000 cells of 20 m tell five numbers to a tenth
 UNKNOWN_M = 1e3  # standard deviation of a trip's first height about its first reading
 FACTOR = 2.0  # that the typical values of a kind may be off by: the sd of a log-normal prior
@@ -148,6 +148,13 @@ def smoothed(
     out[lanes.at[lanes.mine]] = (mean + (lanes.origin if level else 0.0))[lanes.mine]
     sd[lanes.at[lanes.mine]] = np.sqrt(np.maximum(var[lanes.mine], 0.0))
     return out, sd
+
+
+def usual_sd(lanes: Lanes, course: Course, kind: Kind) -> float:
+    """The slope's posterior standard deviation where readings come at an even rate: the median over the first lanes."""
+    first = Lanes(*(x[:BATCH] for x in lanes))
+    (var,) = (_called(_states, batch, course, kind)[1] for batch in _batches(first, BATCH))
+    return float(np.sqrt(max(np.median(var[: len(first.at)][first.mine]), 0.0)))
 
 
 def _batches(lanes: Lanes, size: int) -> list[tuple[np.ndarray, ...]]:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hdev_jax.logs.instruments.slope import MATTERS
-from hdev_jax.logs.instruments.smoother import DRIVE, course_of, lanes_of, smoothed
+from hdev_jax.logs.instruments.smoother import DRIVE, course_of, lanes_of, smoothed, usual_sd
 from hdev_jax.logs.instruments.steps import step_of
 
 __all__ = ["speed_of"]
@@ -30,4 +30,5 @@ def speed_of(
     lanes = lanes_of(trip, time_s, time_s, reading, np.ones(len(trip)), kind=DRIVE)
     course = course_of(lanes, DRIVE, least=step / np.sqrt(12.0))
     speed = np.clip(smoothed(lanes, course, DRIVE, level=True)[0], reading - 0.5 * step, reading + 0.5 * step)
-    return np.where(reading > 0, np.maximum(speed, 0.0), 0.0), smoothed(lanes, course, DRIVE)[1], step
+    sd = np.full(len(trip), usual_sd(lanes, course, DRIVE))
+    return np.where(reading > 0, np.maximum(speed, 0.0), 0.0), sd, step
