@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import sparse
 
 from hdev_jax.energy.fitted import Fitted
 from hdev_jax.inference import Shapes, chunks_of_fit, insert, padded
@@ -69,8 +68,8 @@ class ByCause:
             arrays.append(np.concatenate(kept, axis=-1))
         return ByCause((*self.causes[:at], *names, rest, *self.causes[at + 1 :]), *arrays)
 
-    def grouped(self, member: sparse.csr_array) -> "ByCause":
-        """Sums over groups of trips; `member` [group, trip] has 1 where the trip is in the group (or its weight)."""
+    def grouped(self, member: Any) -> "ByCause":
+        """Sums over groups of trips; `member` [group, trip], a sparse array of SciPy, has each trip's weight there."""
         draws, trips, causes = self.drawn.shape
         drawn = member @ np.moveaxis(self.drawn, 1, 0).reshape(trips, draws * causes)
         return ByCause(self.causes, member @ self.value, np.moveaxis(drawn.reshape(-1, draws, causes), 0, 1))

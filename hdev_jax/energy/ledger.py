@@ -41,11 +41,11 @@ COLUMNS = ("level", "name", "cause", "kwh", "lower", "upper", "kwh_per_100km", "
 
 @dataclass(frozen=True)
 class Groups:
-    """Sets of trips that a table has a block for: their `names` and `member` [group, trip]."""
+    """Sets of trips that a table has a block for: their `names`, and `member` [group, trip], SciPy's sparse."""
 
     level: str
     names: tuple[str, ...]
-    member: sparse.csr_array
+    member: Any
 
 
 @dataclass(frozen=True)
