@@ -16,32 +16,17 @@ import matplotlib.figure
 import numpy as np
 import PIL.Image
 import pytest
-from jax._src.lru_cache import LRUCache
 
-# One folder of compiled programs for all workers: they compile the same few programs for log after log. The first
-# process makes it, so that it outlives every other and goes with it; `HDEV_TEST_PROGRAMS` names one that is kept for
-# the next run. What a test starts has a folder of its own, for JAX does not write an entry in one step.
-if "HDEV_TEST_PROGRAMS" not in os.environ:
-    _programs = tempfile.TemporaryDirectory(prefix="hdev-compiled-", ignore_cleanup_errors=True)
-    os.environ["HDEV_TEST_PROGRAMS"] = _programs.name
-_COMPILED = Path(os.environ["HDEV_TEST_PROGRAMS"])
-for _name, _here, _started in (
-    ("jax_compilation_cache_dir", str(_COMPILED), str(_COMPILED / str(os.getpid()))),
-    ("jax_persistent_cache_min_compile_time_secs", 0.0, "0.0"),
-    ("jax_persistent_cache_min_entry_size_bytes", -1, "-1"),
-):
-    jax.config.update(_name, _here)
-    os.environ[_name.upper()] = _started
-
-
-def _put(self: LRUCache, key: str, value: bytes) -> None:
-    """In the place of JAX's own, which writes an entry while another worker may be reading it."""
-    with tempfile.NamedTemporaryFile(dir=self.path, prefix=".", delete=False) as file:
-        file.write(value)
-    os.replace(file.name, self.path / f"{key}-cache")
-
-
-LRUCache.put = _put
+# One cache of compiled programs for a test process and the processes that it starts: the tests compile the same few
+# programs for log after log. A folder of its own for each worker, for JAX does not write an entry in one step.
+_COMPILED = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
+for _name, _value in {
+    "jax_compilation_cache_dir": _COMPILED.name,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}.items():
+    jax.config.update(_name, _value)
+    os.environ[_name.upper()] = str(_value)  # the same for the processes that a test starts
 
 
 def _with_shapes() -> list[str]:
