@@ -58,6 +58,9 @@ def add_unnamed(round_: Round) -> tuple[Training, State] | None:
     new = forward(Round(there, state, scores, round_.rng, round_.tell))
     if new is None:
         return None
+    before, after = (float(np.mean(there.residual(s.fit) ** 2)) for s in (state, new))
+    if before - after < settings.least_share * before:
+        return None  # significant, but it explains too little to be described
     new = replace(new, found=new.found[:-1], terms=(*new.terms, term))
     return replace(there, settings=settings), new
 

@@ -5,7 +5,9 @@ ahead* knows the rows before: the filtered state, carried on by one row. *Given 
 power, this row's included: it explains and does not predict.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -42,8 +44,7 @@ LEAST_S = 600.0  # of time there
 @dataclass(frozen=True)
 class Given:
     """The log's rows with the decoded states (`segments`), predictions given them and one step ahead, the model that
-    decoded them, the power of each load as fitted with all else in the vehicle [W], and the energy of each in each trip
-    [kWh]: mean, 5 % and 95 %."""
+    decoded them, the power of each load as fitted with all else in the vehicle [W], and what draws their energies."""
 
     segments: Segments
     predicted: np.ndarray
@@ -51,7 +52,12 @@ class Given:
     ids: tuple[str, ...]
     model: Switching
     power_w: dict[str, float]
-    kwh: list[dict[str, list[float]]]
+    drawn: Callable[[], list[dict[str, list[float]]]]
+
+    @cached_property
+    def kwh(self) -> list[dict[str, list[float]]]:
+        """The energy of each load in each trip [kWh]: mean, 5 % and 95 %."""
+        return self.drawn()
 
     @property
     def left_open(self) -> dict[str, dict[str, Open]]:
@@ -82,7 +88,7 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
     both = [(power[i], errors.get(f"effects.{i}.power_w", 0.0)) for i in ids]
     return Given(
         where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, known(decoded.ahead)) + error, ids,
-        model, power, _kwh(problem, split, rows, model, decoded, both, seed),
+        model, power, lambda: _kwh(problem, split, rows, model, decoded, both, seed),
     )  # fmt: skip
 
 

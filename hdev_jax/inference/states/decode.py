@@ -15,6 +15,7 @@ from hdev_jax.segments import trip_slices
 
 __all__ = ["Decoded", "decode", "energy_draws"]
 
+MOST_PLACES = 2**18  # rows in lanes at a time: of two loads half a gigabyte
 FURTHEST = 1e9  # 1 + x²/freedom of an error beyond which any further is as unlikely
 
 
@@ -164,6 +165,25 @@ def _laid(model: Switching, rows: StateRows) -> tuple[Lanes, _Levels, _Laid]:
 
 def decode(model: Switching, rows: StateRows) -> Decoded:
     """The states of rows by filter and smoother."""
+    parts = [_decode(model, rows.take(s)) for s in _parts(rows.trip)]
+    if len(parts) == 1:
+        return parts[0]
+    on, ahead, error_w, same, moves = (np.concatenate(c) for c in zip(*(p[:-1] for p in parts), strict=True))
+    return Decoded(on, ahead, error_w, same, moves, sum(p.log_likelihood for p in parts))
+
+
+def _parts(trip: np.ndarray) -> list[slice]:
+    """Rows of whole trips that take no more memory at a time than `MOST_PLACES` in lanes, where trips allow it."""
+    starts = [s.start for _, s in trip_slices(trip)]
+    rows, lanes = Lanes.of(trip).shape
+    if rows * lanes <= MOST_PLACES or len(starts) == 1:
+        return [slice(0, len(trip))]
+    half = starts[len(starts) // 2]
+    later = (slice(half + s.start, half + s.stop) for s in _parts(trip[half:]))
+    return [*_parts(trip[:half]), *later]
+
+
+def _decode(model: Switching, rows: StateRows) -> Decoded:
     lanes, levels, laid = _laid(model, rows)
     found = _decoded(levels, laid)
     on, ahead, filtered, same, moves = (np.asarray(x)[lanes.place, lanes.lane] for x in found[:-1])
@@ -176,6 +196,11 @@ def decode(model: Switching, rows: StateRows) -> Decoded:
 
 def energy_draws(model: Switching, rows: StateRows, *, seed: int, draws: int) -> Float[np.ndarray, "draw load trip"]:
     """Energy of each load in each trip [Wh] over draws of the state sequence from its posterior."""
+    parts = [_drawn(model, rows.take(s), seed + k, draws) for k, s in enumerate(_parts(rows.trip))]
+    return np.concatenate(parts, axis=2)
+
+
+def _drawn(model: Switching, rows: StateRows, seed: int, draws: int) -> Float[np.ndarray, "draw load trip"]:
     lanes, levels, laid = _laid(model, rows)
     posed = _posed(levels, laid)
     filtered, at, rng = smooth(posed.moves, posed.fits).filtered, np.arange(len(rows.trip)), np.random.default_rng(seed)
