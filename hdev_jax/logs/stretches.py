@@ -10,7 +10,7 @@ from hdev_jax.logs.intervals import starts
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import Log
 from hdev_jax.logs.repair import CIRCULAR
-from hdev_jax.segments import GRADE_SD, Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 from hdev_jax.units import unit_of
 
 __all__ = ["HALT_S", "by_distance"]
@@ -69,6 +69,9 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
             channels[name], how = _direction(x, duration, first), "mean direction over time"
         elif _is_state(name, x):
             channels[name], how = _held_longest(x, duration, row), "the value held longest"
+        elif name == ACCEL_SD:  # of the difference of a stretch's end speeds, whatever lies between
+            usual = _mean(x, duration, first)
+            channels[name], how = usual * np.minimum(2.0 / (last - first + 1), 1.0), "the error of the end speeds"
         elif name in _OF_THE_ROAD:
             weight = np.where(way[row] > 0, distance, duration)
             channels[name], how = _mean(x, weight, first, slope=name == "grade_rad"), "mean over distance"
