@@ -24,7 +24,7 @@ from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.physics.tyres import RollingLinear
 from hdev_jax.segments import Segments, trip_slices
 
-__all__ = ["ByCause", "by_cause", "same"]
+__all__ = ["ByCause", "Change", "by_cause", "same"]
 
 NOTHING_KWH = 1e-9  # rounding of a loss that is none
 Change = Callable[[Vehicle, Segments], tuple[Vehicle, Segments]]

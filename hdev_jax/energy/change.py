@@ -8,20 +8,29 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.energy.causes import ByCause, by_cause
+from hdev_jax.energy.causes import ByCause, Change, by_cause
 from hdev_jax.energy.fitted import Fitted
 from hdev_jax.errors import InputError
 from hdev_jax.inference.parameters import leaf_of
-from hdev_jax.inference.sheet.schema import KEYS, effect_key
+from hdev_jax.inference.sheet.schema import KEYS, Key, effect_key
 from hdev_jax.logs.adapter import near
+from hdev_jax.logs.limits import MAX_GRADE_RAD, MAX_SPEED_MPS
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
 from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.problem import Problem
 from hdev_jax.segments import Segments
 
-__all__ = ["Changed", "Step", "changed", "parse_changes"]
+__all__ = ["Changed", "Step", "changed", "idle", "parse_changes"]
+
+NOTHING = 1e-9  # of the energy: rounding
 
 _FORM = re.compile(r"([^=\s]+)=([+-]?)(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+)(%?)")
+_CHANNELS = {  # ranges of channels, where a number beyond is in another unit or no weather
+    "grade_rad": Key("number", "rad", -MAX_GRADE_RAD, MAX_GRADE_RAD),
+    "ambient_temp_c": Key("number", "degC", -90.0, 60.0),  # the extremes on record: -89.2 and 56.7 °C (WMO)
+    "wind_speed_mps": Key("number", "m/s", 0.0, MAX_SPEED_MPS),
+    "soc": Key("number", "1", 0.0, 1.0),
+}
 _KINEMATIC = ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "speed_mps")
 _MEASURED = ("motor_torque_nm", "motor_speed_radps", "traction_force_n", "accel_mps2", "current_a", "brake_pressure_pa")
 
@@ -79,7 +88,7 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
             raise InputError(f"--set {text}: {key} follows from the drive; a coefficient or the weather can change")
         if key not in coefficients and key not in channels:
             why = "is not in use here" if key in held else "is no coefficient in use and no channel of the log"
-            choices = (*coefficients, *channels)
+            choices = tuple(dict.fromkeys([*coefficients, *channels]))
             raise InputError(f"--set {text}: {key} {why}{near(key, choices)}; accepted are {', '.join(choices)}")
         number = float(f"{sign}{digits}")
         if key in [s.key for s in out]:
@@ -97,7 +106,7 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
 
 
 def _in_range(problem: Problem, step: Step) -> None:
-    key = KEYS.get(step.key)
+    key = _CHANNELS.get(step.key, KEYS.get(step.key))
     if step.key.startswith("effects."):
         _, effect_id, name = step.key.split(".")
         effect = problem.sheet.library[effect_id]
@@ -117,6 +126,24 @@ def changed(fitted: Fitted, steps: Sequence[Step], *, seed: int = 0) -> Changed:
     A change in percent, or by an amount, is one of the coefficient whatever it is; a new value is certain.
     """
 
+    change = _by(steps)
+    thetas = fitted.draws(seed)
+    before, after = by_cause(fitted, thetas), by_cause(fitted, thetas, change)
+    return Changed(before, after, after.minus(before))
+
+
+def idle(fitted: Fitted, steps: Sequence[Step]) -> list[Step]:
+    """The changes of channels that, each by itself, leave the energy of every trip as it was."""
+    estimate = fitted.draws(0)[:1]
+    whole = by_cause(fitted, estimate).value
+    small = NOTHING * max(float(np.max(np.abs(whole))), 1.0)
+    alone = ((s, by_cause(fitted, estimate, _by([s])).value) for s in steps if s.channel)
+    return [s for s, x in alone if float(np.max(np.abs(x - whole))) <= small]
+
+
+def _by(steps: Sequence[Step]) -> Change:
+    """The vehicle and the rows with these changes."""
+
     def change(car: Vehicle, rows: Segments) -> tuple[Vehicle, Segments]:
         for s in steps:
             if s.channel:
@@ -128,9 +155,7 @@ def changed(fitted: Fitted, steps: Sequence[Step], *, seed: int = 0) -> Changed:
                 )  # fmt: skip
         return car, rows
 
-    thetas = fitted.draws(seed)
-    before, after = by_cause(fitted, thetas), by_cause(fitted, thetas, change)
-    return Changed(before, after, after.minus(before))
+    return change
 
 
 def _moved(leaf: object, s: Step) -> object:

@@ -25,6 +25,7 @@ from hdev_jax.energy.ledger import STANDING_MPS
 from hdev_jax.errors import InputError
 from hdev_jax.inference import linearised, padded
 from hdev_jax.logs import Log
+from hdev_jax.logs.adapter import near
 from hdev_jax.problem import Problem
 
 __all__ = ["LEAST_TRIPS", "Saving", "circumstances", "conditions", "saving", "trips_of"]
@@ -71,12 +72,17 @@ def trips_of(log: Log, text: str, option: str) -> tuple[int, ...]:
     if ".." not in text:
         return tuple(dict.fromkeys(log.trip_id(name.strip()) for name in text.split(",") if name.strip()))
     first, _, last = (part.strip() for part in text.partition(".."))
-    dates = [_date(x) for x in (first, last)]
-    if any(d is None for d, x in zip(dates, (first, last), strict=True) if x and x not in log.trip_names):
-        for x, d in zip((first, last), dates, strict=True):
-            if x and d is None:
-                log.trip_id(x)
-    if any(x and d is not None and x not in log.trip_names for x, d in zip((first, last), dates, strict=True)):
+    named = [x for x in (first, last) if x in log.trip_names]
+    other = [x for x in (first, last) if x and x not in named]
+    dates = [None if x in named else _date(x) for x in (first, last)]
+    for x in other:
+        if _date(x) is None:
+            if x[0].isdigit() and not near(x, log.trip_names):
+                raise InputError(f"{option} {text}: {x} is no trip of the log and no day; 2024-03-31 is expected")
+            log.trip_id(x)
+    if other:
+        if named:
+            raise InputError(f"{option} {text}: {named[0]} is a trip and {other[0]} a day; two of a kind are expected")
         if not log.started_s:
             raise InputError(f"{option} {text}: the log's clock has no date; name trips, T01..T08 or T01,T02")
         low = dates[0] if dates[0] is not None else -math.inf
@@ -91,9 +97,10 @@ def trips_of(log: Log, text: str, option: str) -> tuple[int, ...]:
 
 
 def _date(text: str) -> float | None:
-    """Seconds since 1970 of a day's start; None for what is no date."""
+    """Seconds since 1970 of a day's start; None for what is no day."""
     try:
-        return datetime.datetime.fromisoformat(text).replace(tzinfo=datetime.UTC).timestamp()
+        day = datetime.date.fromisoformat(text)
+        return datetime.datetime.combine(day, datetime.time(), datetime.UTC).timestamp()
     except ValueError:
         return None
 

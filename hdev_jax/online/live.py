@@ -94,11 +94,12 @@ def kept(path: str | Path) -> tuple[Float[np.ndarray, " number"], dict[str, Any]
     """What `keep` wrote. Raises `InputError` for a file that it did not write, `FileNotFoundError` for none."""
     try:
         with np.load(path, allow_pickle=False) as found:
-            numbers, about = found["numbers"], json.loads(str(found["about"]))
+            numbers, about = found["numbers"].astype(float), json.loads(str(found["about"]))
+            schema = about.get("schema")
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as e:
+    except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile, EOFError) as e:
         raise InputError(f"--state {path}: no file of hdev follow; name another, or delete it") from e
-    if about.get("schema") != SCHEMA:
-        raise InputError(f"--state {path}: {about.get('schema')!r} is not {SCHEMA!r}; name another file, or delete it")
+    if schema != SCHEMA:
+        raise InputError(f"--state {path}: {schema!r} is not {SCHEMA!r}; name another file, or delete it")
     return numbers, about

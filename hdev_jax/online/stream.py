@@ -21,6 +21,7 @@ from hdev_jax.units import J_PER_WH
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
 KINEMATICS = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
+KEPT = ("trips", "origin_s", "held", "before", "last_s", "repeated", "unreadable")  # in the file of the state
 Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")
 READ = ("mass_kg", "grade_rad", "air_density_kgpm3", "gear", "motor_torque_nm", "motor_speed_radps", "traction_force_n",
@@ -54,6 +55,8 @@ class Stream:
             raise InputError(
                 f"{a.where}: hdev follow takes rows of a table; layout, long, clock and companion are for files"
             )
+        if a.stamp != "middle":
+            raise InputError(f'{a.where}: stamp = "{a.stamp}" is for files; hdev follow takes samples, or intervals')
         if counters := [k for k, r in a.columns.items() if r.counter]:
             raise InputError(f"{a.where}: columns.{counters[0]}: counter is for files; send what each row added")
         if a.columns:  # a row cannot be filled from rows that are still to come; the last value stands in
@@ -62,14 +65,12 @@ class Stream:
 
     def about(self) -> dict[str, Any]:
         """What goes into the file of the state, as plain values."""
-        return {
-            k: getattr(self, k) for k in ("trips", "origin_s", "held", "before", "last_s", "repeated", "unreadable")
-        }
+        return {k: getattr(self, k) for k in KEPT}
 
     @staticmethod
     def again(about: Mapping[str, Any], rules: Adapter) -> "Stream":
-        """The stream that goes on from there."""
-        return Stream(rules, **about, continued=True, understood=True)
+        """The stream that goes on from there. Raises `KeyError` or `TypeError` for what `about` did not give."""
+        return Stream(rules, **{k: about[k] for k in KEPT}, continued=True, understood=True)
 
     # --- rows in the contract's columns ------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hdev_jax.energy.causes import by_cause
-from hdev_jax.energy.change import changed, parse_changes
+from hdev_jax.energy.change import changed, idle, parse_changes
 from hdev_jax.energy.compare import compare_sheets, compare_trips
 from hdev_jax.energy.fitted import Fitted, calibrated_on, forgotten
 from hdev_jax.energy.ledger import TOTAL, TRACTION_REST, UNEXPLAINED, ledger_of
@@ -193,6 +193,11 @@ def test_mass_of_the_log_and_weather_can_change(fitted):
     assert spread == pytest.approx(0.0, abs=1e-9)  # a new value is certain
 
 
+def test_a_channel_that_no_effect_needs_changes_nothing_and_is_found(fitted):
+    steps = parse_changes(fitted.problem, ["ambient_temp_c=-10", "mass_kg=+500", "road.c_rr=-10%"])
+    assert [s.key for s in idle(fitted, steps)] == ["ambient_temp_c"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -203,6 +208,8 @@ def test_mass_of_the_log_and_weather_can_change(fitted):
         ("speed_start_mps=+1", "stay as driven"),
         ("machine.motoring_efficiency=0.9", "is not in use here"),
         ("mass_kg=-100%", "above 0"),
+        ("grade_rad=3", "-0.8 or more and up to 0.8"),
+        ("ambient_temp_c=-300", "-90 or more"),
     ],
 )
 def test_what_is_no_change_is_refused(fitted, text, said):
@@ -272,6 +279,13 @@ def test_trips_by_names_order_and_dates(fitted):
     for text, said in (("T2..T04", "T02"), ("2024-01-01..", "no date"), ("T04..T02", "no trip of the log")):
         with pytest.raises(InputError, match=said):
             trips_of(log, text, "--after")
+    for text, said in (
+        ("1970-01-02..T05", "T05 is a trip and 1970-01-02 a day; two of a kind are expected"),
+        ("..1970-01-03T12:00", "no trip of the log and no day; 2024-03-31 is expected"),
+        ("..03.01.1970", "no trip of the log and no day"),
+    ):
+        with pytest.raises(InputError, match=said):
+            trips_of(dated, text, "--after")
 
 
 # --- compare ---------------------------------------------------------------------------------------------------------

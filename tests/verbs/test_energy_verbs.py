@@ -19,6 +19,7 @@ from hdev_jax.inference.states import Switching
 from hdev_jax.logs import Log
 from hdev_jax.options.energy import ENERGY_VERBS
 from hdev_jax.problem import prepare
+from hdev_jax.verbs.energy.result import _write_book
 from hdev_jax.verbs.online import given_states, states_of
 
 
@@ -181,3 +182,12 @@ def test_bad_input_is_one_line(case, files, tmp_path):
     assert (status, text) == (2, "")
     assert said in line
     assert not out.exists()
+
+
+def test_a_name_that_looks_like_a_formula_stays_text_in_the_workbook(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    table = pd.DataFrame({"trip_id": ["=1+1", "T01"], "kwh": [1.5, 2.0]})
+    _write_book(tmp_path / "b.xlsx", {"trips": table})
+    cells = openpyxl.load_workbook(tmp_path / "b.xlsx")["trips"]
+    assert [(c.value, c.data_type) for c in cells["A"][1:]] == [("=1+1", "s"), ("T01", "s")]
+    assert [c.data_type for c in cells["B"][1:]] == ["n", "n"]

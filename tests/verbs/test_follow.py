@@ -1,6 +1,7 @@
 """`hdev follow`: rows as they arrive, from a pipe, in anybody's columns; a stop costs nothing."""
 
 import contextlib
+import gzip
 import io
 import json
 import subprocess
@@ -101,6 +102,13 @@ def test_a_stop_costs_nothing(frame, tmp_path, sampled):
     assert "repeated" in said
     with pytest.raises(InputError, match="of another sheet; name another file, or delete it"):
         follow(SHEET | {"mass_kg": 20e3}, [], state=tmp_path / "parts.state", watch=False)
+    with pytest.raises(InputError, match="of a run whose target is energy_wh; name another file, or delete it"):
+        told(text(frame), state=tmp_path / "parts.state", target="battery_power_kw")
+    for about, said in (("[1]", "no file of hdev follow"), ('{"schema": "hdev-follow/1"}', "of another version")):
+        with (tmp_path / "other.state").open("wb") as file:
+            np.savez(file, numbers=np.zeros(3), about=np.array(about))
+        with pytest.raises(InputError, match=said):
+            told(text(frame), state=tmp_path / "other.state")
     (tmp_path / "parts.state").write_text("no")
     with pytest.raises(InputError, match="no file of hdev follow; name another, or delete it"):
         told(text(frame), state=tmp_path / "parts.state")
@@ -122,6 +130,15 @@ def test_samples_are_the_intervals_of_a_log(frame):
         np.testing.assert_allclose([rows[i][name] for i in inner], np.asarray(getattr(log, name))[inner], atol=1e-9)
 
 
+def test_a_last_line_cut_short_is_no_reading_where_it_will_be_sent_again(frame, tmp_path):
+    whole = text(frame[:30])
+    cut = told(whole[:-4], state=tmp_path / "cut.state")
+    again = told(whole, state=tmp_path / "cut.state")
+    assert (len(cut), len(again)) == (29, 1)
+    assert cut + again == told(whole)
+    assert len(told(whole.rstrip())) == 30  # a file that ends without a line's end
+
+
 def test_what_does_not_read_is_counted_and_the_rest_used(frame):
     lines = text(frame).splitlines()
     lines[30] = lines[30].replace(lines[30].split(",")[6], "n/a")
@@ -130,6 +147,9 @@ def test_what_does_not_read_is_counted_and_the_rest_used(frame):
     lines.insert(60, lines[0])  # a logger that began again
     said = summed_up(io.BytesIO("\n".join(lines).encode()))
     assert "118 rows, 118 used, 2 trips, 1 held mass_kg, 2 unreadable" in said
+    hostile = ["x" * 200_000, '{"a":' + "[" * 20_000 + "]" * 20_000 + "}"]
+    said = summed_up(io.BytesIO("\r".join([*text(frame).splitlines(), *hostile]).encode()))
+    assert "120 rows, 120 used, 2 trips, 2 unreadable" in said
 
 
 @pytest.mark.parametrize(
@@ -141,9 +161,20 @@ def test_what_does_not_read_is_counted_and_the_rest_used(frame):
     ],
     ids=["nothing", "no target", "text"],
 )
-def test_rows_that_cannot_be_followed_are_one_line(rows, what):
-    with pytest.raises(InputError, match=what):
+def test_rows_that_cannot_be_followed_are_one_line(rows, what, tmp_path):
+    with pytest.raises(InputError, match=f"^standard input.*{what}"):
         summed_up(io.BytesIO(rows.encode()))
+    (tmp_path / "rows.csv").write_text(rows)
+    with pytest.raises(InputError, match=f"rows.csv.*{what}"):
+        summed_up(tmp_path / "rows.csv")
+
+
+def test_means_and_compressed_rows_are_refused(tmp_path):
+    (tmp_path / "a.toml").write_text('stamp = "end"\n')
+    with pytest.raises(InputError, match='a.toml: stamp = "end" is for files'):
+        summed_up([], adapter=tmp_path / "a.toml")
+    with pytest.raises(InputError, match="compressed by gzip; text is expected"):
+        summed_up(io.BytesIO(gzip.compress(b"time_s,speed_mps,energy_wh\n")))
 
 
 def test_an_effect_that_the_sheet_lacks_is_told_once(monkeypatch, capsys):

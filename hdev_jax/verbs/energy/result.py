@@ -57,9 +57,7 @@ class EnergyResult:
             frame.to_csv(run.path(f"{name}.csv"), index=False, float_format="%.8g", lineterminator="\n")
             frame.to_parquet(run.path(f"{name}.parquet"), index=False)
         try:
-            with pd.ExcelWriter(run.path(f"{self.verb}.xlsx"), engine="openpyxl") as book:
-                for name, frame in self.tables.items():
-                    frame.to_excel(book, sheet_name=name[:31], index=False, freeze_panes=(1, 0))
+            _write_book(run.path(f"{self.verb}.xlsx"), self.tables)
         except ImportError:
             self._answer += "\nnote: no workbook was written: pip install 'hdev_jax[formats]' for .xlsx"
         self.report(run.work)
@@ -95,6 +93,18 @@ class EnergyResult:
         from html import escape
 
         return f"<pre>{escape(self._answer)}</pre>"
+
+
+def _write_book(path: Path, tables: Mapping[str, "pd.DataFrame"]) -> None:
+    """A workbook with a sheet for each table. A name that begins with = stays text. Raises `ImportError`."""
+    import pandas as pd
+
+    with pd.ExcelWriter(path, engine="openpyxl") as book:
+        for name, frame in tables.items():
+            frame.to_excel(book, sheet_name=name[:31], index=False, freeze_panes=(1, 0))
+            for cell in (c for row in book.sheets[name[:31]].iter_rows() for c in row):
+                if cell.data_type == "f":
+                    cell.data_type = "s"
 
 
 def records(frame: "pd.DataFrame") -> list[dict[str, Any]]:

@@ -1,13 +1,14 @@
 """The verb `whatif`: what a change of the vehicle, its load or the weather would cost on the trips as driven."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from hdev_jax.energy.change import Changed, Step, changed, parse_changes
+from hdev_jax.energy.change import Changed, Step, changed, idle, parse_changes
 from hdev_jax.energy.fitted import Fitted, interval
 from hdev_jax.energy.ledger import SUM
 from hdev_jax.errors import InputError
@@ -60,6 +61,9 @@ def whatif(
 
 def _answer(fitted: Fitted, steps: list[Step], asked: Asked, command: str) -> EnergyResult:
     found = changed(fitted, steps, seed=asked.seed)
+    said = [f"{s.text} changes nothing on these trips: no effect of the sheet that needs {s.key} (hdev effects) shows it"
+            for s in idle(fitted, steps)]  # fmt: skip
+    fitted = replace(fitted, notes=(*fitted.notes, *said))
     log = fitted.problem.log
     there = [i for i in range(len(log.trip_names)) if np.any(log.trip == i)]
     km = np.bincount(log.trip, weights=np.asarray(log.segments.distance_m) / 1e3, minlength=len(log.trip_names))

@@ -1,7 +1,6 @@
 """The verb `follow`: rows of one vehicle as they arrive, what is known of it after each, and what its sheet lacks."""
 
 import contextlib
-import csv
 import json as json_
 import signal
 import sys
@@ -19,13 +18,14 @@ from hdev_jax.logs.read import adapter_of
 from hdev_jax.online import Now, Watch, start
 from hdev_jax.online.live import Live, keep, kept
 from hdev_jax.online.stream import Arrived, Stream, channels_of, target_in
+from hdev_jax.verbs.live.lines import Records, batches, opened
 from hdev_jax.verbs.opening import Effects, Vehicles, known_effects, sheet_of
 from hdev_jax.verbs.predict import sheet_digest
 
 __all__ = ["follow"]
 
+INPUT = "standard input"  # where rows come from, in messages
 SAVED_S = 5.0  # between two files of the state: what a power cut may cost
-Records = Iterable[Mapping[str, Any]]
 
 
 def follow(
@@ -53,15 +53,18 @@ def follow(
     `InputError`.
     """
     sheet, rules = sheet_of(vehicle, known_effects(effects)), adapter_of(adapter)
-    with _opened(rows) as source, _terminal(live=not json) as tell, _stopped_by_signal():
+    with opened(rows) as source, _terminal(live=not json) as tell, _stopped_by_signal():
         following = _Following(sheet, rules, target, state, tell, json, watch)
         try:
-            for batch in _batches(source):
-                following.take(batch)
-        except KeyboardInterrupt:
-            pass
-        following.end()
-    return None if json else following.summary()
+            with contextlib.suppress(KeyboardInterrupt):
+                for batch in batches(source, again=state is not None):
+                    following.take(batch)
+            following.end()
+            return None if json else following.summary()
+        except InputError as e:
+            if isinstance(rows, str | Path) and str(e).startswith(INPUT):
+                raise InputError(f"{rows}{str(e).removeprefix(INPUT)}") from None
+            raise
 
 
 class _Following:
@@ -77,16 +80,32 @@ class _Following:
         self.alarm: str | None = None
         self.saved = time.monotonic()
         self.digest = sheet_digest(augmented_sheet(sheet, {}, {}))
-        self.numbers, self.about = None, {}
+        self.numbers, self.stream = None, Stream(rules)
+        about: dict[str, Any] = {}
         with contextlib.suppress(FileNotFoundError):
             if file is not None:
-                self.numbers, self.about = kept(file)
-        if self.about and (self.about["sheet_sha256"] != self.digest or self.about["watch"] != watch):
-            what = "another sheet" if self.about["watch"] == watch else "a run that watched other effects"
-            raise InputError(f"--state {file}: of {what}; name another file, or delete it")
-        self.stream = Stream.again(self.about["stream"], rules) if self.about else Stream(rules)
-        if self.about:
-            self._begin(self.about["columns"])
+                self.numbers, about = kept(file)
+        if about:
+            self._again(about, rules)
+
+    def _again(self, about: Mapping[str, Any], rules: Adapter) -> None:
+        """Go on from the file of a state. Raises `InputError` where it is of another run."""
+        try:
+            digest, watched, target, columns = (about[k] for k in ("sheet_sha256", "watch", "target", "columns"))
+            self.stream = Stream.again(about["stream"], rules)
+        except (KeyError, TypeError):
+            raise self._other("another version") from None
+        if digest != self.digest:
+            raise self._other("another sheet")
+        if watched != self.watching:
+            raise self._other("a run that watched other effects")
+        if self.target not in (None, target):
+            raise self._other(f"a run whose target is {target}")
+        self.target = target
+        self._begin(columns)
+
+    def _other(self, what: str) -> InputError:
+        return InputError(f"--state {self.file}: of {what}; name another file, or delete it")
 
     def _begin(self, names: Iterable[str]) -> None:
         """The state, once it is known which columns rows have."""
@@ -104,7 +123,7 @@ class _Following:
             try:
                 self.live.numbers = self.numbers
             except ValueError:
-                raise InputError(f"--state {self.file}: of another version; name another file, or delete it") from None
+                raise self._other("another version") from None
         if not self.as_json:
             for note in self.notes:
                 self.tell(f"note: {note}")
@@ -164,8 +183,9 @@ class _Following:
 
     def _save(self) -> None:
         if self.live is not None and self.file is not None:
-            about = {"sheet_sha256": self.digest, "columns": self.columns, "watch": self.watching}
-            keep(self.file, self.live, {**about, "stream": self.stream.about()})
+            about = {"sheet_sha256": self.digest, "columns": self.columns, "watch": self.watching,
+                     "target": self.target, "stream": self.stream.about()}  # fmt: skip
+            keep(self.file, self.live, about)
             self.saved = time.monotonic()
 
     def end(self) -> None:
@@ -193,69 +213,9 @@ class _Following:
         return "\n".join(lines)
 
 
-@contextlib.contextmanager
-def _opened(rows: str | Path | Records | BinaryIO | None) -> Iterator[Records | BinaryIO]:
-    """Where rows come from. Raises `InputError` for a file that cannot be read."""
-    if rows is None:
-        yield sys.stdin.buffer
-    elif isinstance(rows, str | Path):
-        try:
-            file = open(rows, "rb")  # noqa: SIM115
-        except OSError as e:
-            raise InputError(f"{rows}: cannot be read ({e.strerror or e})") from e
-        with file:
-            yield file
-    else:
-        yield rows
-
-
 def _number(x: Any) -> float | None:
     value = float(x)
     return value if np.isfinite(value) else None
-
-
-def _batches(rows: Records | BinaryIO) -> Iterator[list[Mapping[str, Any] | None]]:
-    """Rows by header as they come, all that are there at a time."""
-    if not hasattr(rows, "read1"):
-        yield [*rows]  # type: ignore[misc]
-        return
-    header: list[str] | None = None
-    mark = ","
-    for lines in _lines(rows):  # type: ignore[arg-type]
-        found: list[Mapping[str, Any] | None] = []
-        for line in lines:
-            text = line.decode("utf-8", errors="replace").strip("\ufeff\r\n \0")
-            if not text:
-                continue
-            if text.startswith("{"):
-                found.append(_of_json(text))
-            elif header is None:
-                mark = ";" if text.count(";") > text.count(",") else ","
-                header = next(csv.reader([text], delimiter=mark))
-            else:
-                cells = next(csv.reader([text], delimiter=mark))
-                if cells != header:  # a source that began again sends its header again
-                    found.append(dict(zip(header, cells, strict=True)) if len(cells) == len(header) else None)
-        if found:
-            yield found
-
-
-def _of_json(text: str) -> Mapping[str, Any] | None:
-    try:
-        found = json_.loads(text)
-    except ValueError:
-        return None
-    return found if isinstance(found, dict) else None
-
-
-def _lines(stream: BinaryIO) -> Iterator[list[bytes]]:
-    """Whole lines, all that have come since the last ones."""
-    rest = b""
-    while piece := stream.read1(1 << 16):  # type: ignore[attr-defined]
-        *lines, rest = (rest + piece).split(b"\n")
-        yield lines
-    if rest:
-        yield [rest]
 
 
 @contextlib.contextmanager
