@@ -140,7 +140,8 @@ class Watch:
         why = {k: "acts across rows" for k, c in library.items() if acts_across_rows(c)}
         why |= {k: "is looked for by a search of its own" for k, c in library.items() if c.searched}
         why |= {k: "has a number for each group" for k, c in library.items() if any(p.by for p in c.parameters)}
-        why |= {k: "compares trips with those before them" for k in library if k == "step_change"}
+        by_trip = [k for k, c in library.items() if any(p.name == "at_trip" for p in c.parameters)]
+        why |= dict.fromkeys(by_trip, "compares trips with those before them")
         own = [c for k, c in library.items() if k not in why and not vehicle.has(k)]
         sample = sample_row(form.channels)
         plan = plan_of(vehicle, own, facts_of(sample), form.target)

@@ -101,7 +101,7 @@ def test_a_parameter_that_could_never_be_fitted_or_tried(make: Any, words: str) 
 @pytest.mark.parametrize(
     ("kind", "field"),
     [(Size, "grid"), (Size, "of"), (Size, "smooth"), (Switch, "by"), (Switch, "of"), (Shape, "least"), (Shape, "by"),
-     (Choice, "least"), (Choice, "of"), (Choice, "in_rows")],
+     (Choice, "least"), (Choice, "by"), (Choice, "in_rows")],
 )  # fmt: skip
 def test_a_parameter_has_only_the_fields_of_its_kind(kind: type[Parameter], field: str) -> None:
     assert field not in {f.name for f in dataclasses.fields(kind)}
