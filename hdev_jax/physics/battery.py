@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Point, Real, Row, Stage
-from hdev_jax.physics.parameter import Choice, Shape, Size, Switch
+from hdev_jax.physics.parameter import Choice, Size, Switch
 from hdev_jax.segments import READING_ERRORS
 from hdev_jax.units import GRAVITY_MPS2
 
@@ -69,8 +69,8 @@ class VoltageDependence(Effect):
     parameters: ClassVar[Parameters] = (
         # an inverter's efficiency moves by a few percent over 100 V
         Size("per_v", "1/V", 0.0, 5e-4, -5e-3, 5e-3, least=1e-6, label="per volt"),
-        # where the sheet's efficiencies hold; far off it is a gain of the power, which they may not be able to absorb
-        Shape("at_v", "V", 650.0, 50.0, 200.0, 1000.0, grid=(350.0, 550.0, 600.0, 650.0, 700.0, 800.0)),
+        # about the log's own mean: about another voltage it is a gain of the power besides
+        Choice("at_v", "V", 650.0, 50.0, 10.0, 2000.0, mean_of="voltage_v", label="mean voltage"),
     )
     mistaken_for: ClassVar[Names] = ("battery_resistance",)
     separated_by: ClassVar[str] = "long trips from full to empty"

@@ -42,6 +42,7 @@ class Parameter:
     smooth: ClassVar[bool] = False
     in_rows: ClassVar[bool] = False
     of: ClassVar[str] = ""
+    mean_of: ClassVar[str] = ""
 
     has_column: ClassVar[bool] = False  # whether it has a column of its own in the design matrix
 
@@ -144,11 +145,13 @@ class Shape(Parameter):
 class Choice(Parameter):
     """A shape that is only ever one of its `grid`; without a grid the log or a search of its own says which.
 
-    Its null may be NaN: not known until it is chosen. `of` as a shape's.
+    Its null may be NaN: not known until it is chosen. `of` as a shape's. `mean_of`: a channel whose mean over the log
+    is the only value.
     """
 
     grid: Sequence[float] | np.ndarray = field(default=(), kw_only=True)
     of: str = field(default="", kw_only=True)
+    mean_of: str = field(default="", kw_only=True)
     _may_be_unknown: ClassVar[bool] = True
 
 

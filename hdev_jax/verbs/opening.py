@@ -139,7 +139,7 @@ def _malformed_parameters(effect: type[Effect], parameters: Sequence[Parameter])
     if twice := {n for n in names if names.count(n) > 1}:
         return f"two parameters are called {min(twice)}"
     for p in parameters:
-        if not p.has_column and not len(p.grid):  # some of the library's have a search of their own
+        if not (p.has_column or len(p.grid) or p.mean_of):  # some of the library's have a search of their own
             return f"parameter {p.name!r}: a {type(p).__name__} without a grid is never tried; give it values to try"
         if p.of and p.of not in names:
             return f"parameter {p.name!r}: of is {p.of!r}; one of {', '.join(names)} is expected"

@@ -125,6 +125,8 @@ def _grid(p: Parameter, facts: Facts, grids: Grids) -> tuple[float, ...]:
         return grids[p.name]
     if p.name == "at_trip":
         return facts.steps
+    if p.mean_of:
+        return (facts.means[p.mean_of],)
     return tuple(g * facts.row_s if p.in_rows else g for g in p.grid)
 
 

@@ -22,7 +22,7 @@ class Facts:
 
     `sample` is one row (which channels there are), `trips` the ids in order, `vehicles` whose each is, `row_s` the
     median duration of a row [s], `groups` how many rows each id of a grouping channel has, `gears` the highest such id
-    (at least 1).
+    (at least 1), `means` of the channels.
     """
 
     sample: Segments
@@ -32,6 +32,7 @@ class Facts:
     row_s: float
     groups: Mapping[str, Mapping[int, int]]
     gears: int
+    means: Mapping[str, float]
 
     @property
     def steps(self) -> tuple[float, ...]:
@@ -83,7 +84,8 @@ def facts_of(segments: Segments, rows: int | None = None) -> Facts:
     row_s = float(np.median(np.asarray(part.duration_s)))
     trips, first = np.unique(np.asarray(part.trip), return_index=True)
     vehicles = np.asarray(part.vehicle)[first]
-    return Facts(segments.take(np.arange(1)), trips, vehicles, n, row_s, groups, most_group(part))
+    means = {k: float(np.mean(v)) for k, v in part.channels.items()}
+    return Facts(segments.take(np.arange(1)), trips, vehicles, n, row_s, groups, most_group(part), means)
 
 
 def merged(parts: Iterable[Facts], duration_s: Float[np.ndarray, " row"]) -> Facts:
@@ -103,4 +105,5 @@ def merged(parts: Iterable[Facts], duration_s: Float[np.ndarray, " row"]) -> Fac
     trips, at = np.unique(np.concatenate([f.trips for f in every]), return_index=True)
     vehicles = np.concatenate([f.vehicles for f in every])[at]
     rows, gears = sum(f.rows for f in every), max(f.gears for f in every)
-    return Facts(first.sample, trips, vehicles, rows, float(np.median(duration_s)), groups, gears)
+    means = {k: sum(f.means[k] * f.rows for f in every) / rows for k in first.means}
+    return Facts(first.sample, trips, vehicles, rows, float(np.median(duration_s)), groups, gears, means)
