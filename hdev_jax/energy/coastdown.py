@@ -94,8 +94,8 @@ def coast_down(log: Log, mass_kg: float, rotating: float, *, level: float = LEVE
     inside = np.interp(kmh, driven_range(fast), (1.0, 1.0), left=0.0, right=0.0) > 0
     if np.all(low[3:][inside] <= 0):
         raise InputError(
-            "this is no coast-down: no force that holds the vehicle back shows at any speed driven; coast in neutral, or "
-            "give a log that measures energy_wh, battery_power_w (_kw), motor_torque_nm or traction_force_n"
+            "this is no coast-down: no force that holds the vehicle back shows at any speed driven; coast in neutral, "
+            "or give a log that measures energy_wh, battery_power_w (_kw), motor_torque_nm or traction_force_n"
         )
     mass = float(np.mean(np.asarray(s.get("mass_kg", mass_kg))))
     notes = [how] if both else ["all runs go one way: a slope is in A, a wind in A and B"]

@@ -120,6 +120,9 @@ class Stream:
             self.last_s = time if np.isfinite(time) else self.last_s
             row = row | {"time_s": time - self.origin_s} if "time_s" in row else row
             if "speed_mps" not in row and np.isfinite(row.get("duration_s", np.nan)):
+                if self.held is not None and "speed_mps" not in self.held:
+                    yield len(self.trips), _interval(self.before, self.held, row)
+                self.before = self.held = None
                 yield len(self.trips), row  # whole by itself
             elif self.held is None:
                 self.held = row

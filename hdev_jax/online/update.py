@@ -25,7 +25,7 @@ from scipy import stats
 
 from hdev_jax.inference.calibrate import STUDENT_DF, UNBOUNDED
 from hdev_jax.inference.parameters import insert
-from hdev_jax.logs.limits import GAP_SAMPLES, MAX_SPEED_MPS, REVERSE_MPS
+from hdev_jax.logs.limits import GAP_SAMPLES, MAX_GRADE_RAD, MAX_POWER_W, MAX_SPEED_MPS, REVERSE_MPS
 from hdev_jax.online.form import COUNTS, NEEDED, Form
 from hdev_jax.online.state import Now, State
 from hdev_jax.online.sums import SHARE, TINY, aged, faded, on_a_new_trip, whole_posterior
@@ -42,6 +42,8 @@ ALIKE = 20.0  # rows that are believed to be equally noisy, before any are seen
 QUIET = 0.05  # least variance of a row over that of all: rows at rest are not exact
 LARGE = 100.0  # mean squares of the target: above, a prediction says nothing more of its noise
 EDGE = 1e-6  # of a bounded support, that estimates are kept off its ends
+MOST = 1e9  # no channel has more in SI units; the squares of such numbers still add up
+RANGES = {"mass_kg": (1.0, 1e6), "grade_rad": (-MAX_GRADE_RAD, MAX_GRADE_RAD)}  # the heaviest trucks have 8e5 kg
 NORMAL_SCORE = 0.774  # mean square of a weighed normal error over the scale that a Student t of 4 degrees gives it
 
 
@@ -102,7 +104,8 @@ def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
     lost = ~(jnp.isfinite(distance) & (distance >= 0) & (distance <= 2.0 * MAX_SPEED_MPS * duration))
     distance = jnp.where(lost, 0.5 * (v0 + v1) * duration, distance)
     channels, before = row[len(NEEDED) :], state.last[len(NEEDED) :]
-    gone = ~jnp.isfinite(channels)
+    low, high = (jnp.asarray([RANGES.get(c, (-MOST, MOST))[k] for c in form.channels], dtype=float) for k in (0, 1))
+    gone = ~((channels >= low) & (channels <= high))  # also NaN
     channels = jnp.where(gone, before, channels)
     whole = row.at[len(NEEDED) :].set(channels)
     for name, value in (("duration_s", duration), ("distance_m", distance), ("speed_start_mps", v0),
@@ -110,6 +113,14 @@ def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
         whole = whole.at[at[name]].set(value)
     whole = whole.at[at["time_s"]].set(jnp.where(jnp.isfinite(row[at["time_s"]]), row[at["time_s"]], _next(state, at)))
     return whole, good, jnp.concatenate([lost[None], gone & jnp.isfinite(before)])
+
+
+def _most(form: Form, duration_s: Array) -> Array:
+    """What the target of no vehicle exceeds, in its unit."""
+    weight, of_battery = TARGETS[form.target].weight, TARGETS[form.target].of_battery
+    if not of_battery:
+        return jnp.full_like(duration_s, MOST)
+    return MAX_POWER_W * (duration_s / J_PER_WH if weight == "row" else jnp.full_like(duration_s, 1e-3))
 
 
 def _next(state: State, at: dict[str, int]) -> Array:
@@ -146,7 +157,7 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     good &= jnp.isfinite(base) & jnp.all(
         jnp.isfinite(x)
     )  # NaN where the vehicle reads a channel that never had a value
-    heard = jnp.isfinite(row[at["measured"]]) & good
+    heard = (jnp.abs(row[at["measured"]]) <= _most(form, whole[at["duration_s"]])) & good  # false for NaN
     y = jnp.where(heard, row[at["measured"]], 0.0)
     z = jnp.append(x, y - base)
     rho, n = jnp.asarray(form.memories), begun.totals[0]

@@ -93,7 +93,7 @@ def test_too_few_runs_are_refused_and_a_drive_is_no_coast_down():
     with pytest.raises(InputError, match="usable coast-down runs"):
         coast_down(log.take(log.trip < 1), MASS_KG, ROTATING)
     assert is_coast_down(log)
-    driven = synthetic_log(seed=1, trips=8, rows_per_trip=60).frame
+    driven = synthetic_log(seed=2, trips=8, rows_per_trip=60).frame
     assert not is_coast_down(Log.from_frame(driven))
     with pytest.raises(InputError, match="no coast-down: no force that holds the vehicle back shows"):
         coast_down(Log.from_frame(driven.drop(columns=["energy_wh"])), 29e3, 1.0)

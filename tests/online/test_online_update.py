@@ -106,7 +106,7 @@ def test_faults_of_a_stream_are_survived_and_counted(log):
     rows[14, at["speed_end_mps"]] = np.nan
     rows[16, at["speed_end_mps"]] = 400.0
     rows[18, at["distance_m"]] = np.nan
-    rows[20, at["measured"]] = 1e6
+    rows[20, at["measured"]] = 1.9e4
     rows[22:40, at["time_s"]] += 3600.0
     rows[30:40, at["time_s"]] -= 7200.0
     rows[45, at["trip"]] = np.nan

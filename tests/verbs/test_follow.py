@@ -139,6 +139,32 @@ def test_a_last_line_cut_short_is_no_reading_where_it_will_be_sent_again(frame, 
     assert len(told(whole.rstrip())) == 30  # a file that ends without a line's end
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "counted"),
+    [
+        ("energy_wh", 1e308, "1 unmeasured"),
+        ("mass_kg", 1e300, "1 held mass_kg"),
+        ("mass_kg", -5.0, "1 held mass_kg"),
+        ("grade_rad", 5.0, "1 held grade_rad"),
+    ],
+)
+def test_a_number_of_no_vehicle_is_no_reading(frame, column, value, counted):
+    """As where it is missing, and never NaN in what is known."""
+    few = frame[:60]
+    at = np.arange(60) == 30
+    rows, missing = (few.assign(**{column: np.where(at, x, few[column])}) for x in (value, np.nan))
+    said = summed_up(rows.to_dict("records"))
+    assert counted in said
+    assert "nan" not in said
+    assert said == summed_up(missing.to_dict("records"))
+
+
+def test_an_interval_without_its_length_ends_where_the_next_begins(frame):
+    few = frame[:30]
+    rows = few.assign(duration_s=np.where(np.arange(30) == 10, np.nan, few["duration_s"]))
+    assert "30 rows, 30 used" in summed_up(rows.to_dict("records"))
+
+
 def test_what_does_not_read_is_counted_and_the_rest_used(frame):
     lines = text(frame).splitlines()
     lines[30] = lines[30].replace(lines[30].split(",")[6], "n/a")
@@ -171,7 +197,7 @@ def test_rows_that_cannot_be_followed_are_one_line(rows, what, tmp_path):
 
 def test_means_and_compressed_rows_are_refused(tmp_path):
     (tmp_path / "a.toml").write_text('stamp = "end"\n')
-    with pytest.raises(InputError, match='a.toml: stamp = "end" is for files'):
+    with pytest.raises(InputError, match=r'a\.toml: stamp = "end" is for files'):
         summed_up([], adapter=tmp_path / "a.toml")
     with pytest.raises(InputError, match="compressed by gzip; text is expected"):
         summed_up(io.BytesIO(gzip.compress(b"time_s,speed_mps,energy_wh\n")))

@@ -50,8 +50,6 @@ class EnergyResult:
 
     def write(self, run: Run, out: str | Path) -> None:
         """Everything into a run's folder, which the user calls `out`."""
-        import pandas as pd
-
         run.path(f"{self.verb}.json").write_text(json.dumps(self.summary, indent=1, allow_nan=False) + "\n")
         for name, frame in self.tables.items():
             frame.to_csv(run.path(f"{name}.csv"), index=False, float_format="%.8g", lineterminator="\n")
