@@ -57,7 +57,7 @@ SCENARIOS = {
         {"power_gain": {}},
         ("power_gain",),
         {"ratio": 1.0},
-        ("power_gain", "mass_scale", "voltage_dependence", "speed_scale"),
+        ("power_gain", "mass_scale", "speed_scale"),
     ),
     "outside the library": Scenario(7102, OUTSIDE, (), {"ratio": 1.0, "trips": 15}, depends_on="humidity_pct"),
     "levels of trips": Scenario(7101, {}, (), {"noise": "trip_levels", "ar_coefficient": 0.9}, depends_on="trip_id"),

@@ -23,8 +23,7 @@ ROAD = [effect for (effect,) in typed(Config, resolve(STUDY), STUDY).sets["road"
 # what else may stand in a twin's class: little is left of the column beside it
 THIRD = {
     # power_gain's offset, which is never had by itself; a loss by power squared, where the voltage hardly changes
-    "auxiliary_power": ("inverter_loss", "power_gain"), "mass_scale": ("voltage_dependence",),
-    "power_gain": ("voltage_dependence",), "battery_resistance": ("part_load",),
+    "auxiliary_power": ("inverter_loss", "power_gain"), "battery_resistance": ("part_load",),
 }  # fmt: skip
 
 

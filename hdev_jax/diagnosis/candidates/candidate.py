@@ -125,9 +125,7 @@ def _grid(p: Parameter, facts: Facts, grids: Grids) -> tuple[float, ...]:
         return grids[p.name]
     if p.name == "at_trip":
         return facts.steps
-    if p.mean_of:
-        return (facts.means[p.mean_of],)
-    return tuple(g * facts.row_s if p.in_rows else g for g in p.grid)
+    return (facts.means[p.mean_of],) if p.mean_of else tuple(g * facts.row_s if p.in_rows else g for g in p.grid)
 
 
 def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tuple[Any, ...]]:
