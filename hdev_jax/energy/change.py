@@ -15,6 +15,7 @@ from hdev_jax.inference.parameters import leaf_of
 from hdev_jax.inference.sheet.schema import KEYS, Key, effect_key
 from hdev_jax.logs.adapter import near
 from hdev_jax.logs.limits import MAX_GRADE_RAD, MAX_SPEED_MPS
+from hdev_jax.logs.log import KINEMATICS
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
 from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.problem import Problem
@@ -31,7 +32,6 @@ _CHANNELS = {  # ranges of channels, where a number beyond is in another unit or
     "wind_speed_mps": Key("number", "m/s", 0.0, MAX_SPEED_MPS),
     "soc": Key("number", "1", 0.0, 1.0),
 }
-_KINEMATIC = ("time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "speed_mps")
 _MEASURED = ("motor_torque_nm", "motor_speed_radps", "traction_force_n", "accel_mps2", "current_a", "brake_pressure_pa")
 
 
@@ -82,7 +82,7 @@ def parse_changes(problem: Problem, changes: Sequence[str]) -> list[Step]:
                 f"--set {text}: KEY=VALUE is expected, as in road.c_rr=-10%, mass_kg=+500 or battery.auxiliary_w=2000"
             )
         key, sign, digits, percent = found.groups()
-        if key in _KINEMATIC:
+        if key in KINEMATICS:
             raise InputError(f"--set {text}: the trips stay as driven; a coefficient or the weather can change")
         if key in _MEASURED:
             raise InputError(f"--set {text}: {key} follows from the drive; a coefficient or the weather can change")

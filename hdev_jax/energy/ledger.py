@@ -14,13 +14,13 @@ from hdev_jax.energy.fitted import Fitted, interval
 from hdev_jax.errors import InputError
 from hdev_jax.logs import Log
 from hdev_jax.physics import DECLARED, LIBRARY
+from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TARGETS
 
 __all__ = [
     "COLUMNS",
     "PARKED_S",
-    "STANDING_MPS",
     "SUM",
     "TOTAL",
     "TRACTION_REST",
@@ -34,7 +34,6 @@ __all__ = [
 TRACTION_REST = "traction_unexplained"
 UNEXPLAINED, TOTAL, SUM = "unexplained", "measured", "all causes"
 PARKED_S = 300.0  # a stop of at least so long is parking; traffic lights and bus stops are shorter
-STANDING_MPS = 0.1
 LEAST_SHARE = 0.05  # of Σ|measured| under which a total has no shares (contract, section 4: pe_percent)
 COLUMNS = ("level", "name", "cause", "kwh", "lower", "upper", "kwh_per_100km", "share_percent", "cost")
 
@@ -142,7 +141,7 @@ def _flows(log: Log, measured_wh: np.ndarray) -> dict[str, np.ndarray]:
     """Sums of each trip: km, hours, energy out of and back into the battery, while standing, while parked [kWh]."""
     s = log.segments
     seconds, kwh = np.asarray(s.duration_s), measured_wh / 1e3
-    stands = np.asarray(s.speed_mps) < STANDING_MPS
+    stands = np.asarray(s.speed_mps) < STANDSTILL_MPS
     parked = _long(stands, np.asarray(s.trip), seconds)
 
     def by_trip(x: np.ndarray) -> np.ndarray:

@@ -151,9 +151,7 @@ def in_service(fitted: Fitted, mass_kg: float, *, seed: int = 0) -> RoadLoad:
     driven = driven_range(problem.segments)
     kmh = speeds_kmh(driven)
     passing = [
-        e.id
-        for e in fitted.vehicle.effects
-        if e.id == AirDensity.id or any(e.overrides(h) for h in ("derive", "across", "sense", "observe"))
+        e.id for e in fitted.vehicle.effects if e.id == AirDensity.id or e.acts_across_rows() or e.overrides("sense")
     ]
     car = replace_mass(fitted.vehicle, mass_kg)
     thetas = fitted.draws(seed, DRAWS)

@@ -21,11 +21,11 @@ from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.energy.fitted import LEVEL, Fitted
-from hdev_jax.energy.ledger import STANDING_MPS
 from hdev_jax.errors import InputError
 from hdev_jax.inference import linearised, padded
 from hdev_jax.logs import Log
 from hdev_jax.logs.adapter import near
+from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.problem import Problem
 
 __all__ = ["LEAST_TRIPS", "Saving", "circumstances", "conditions", "saving", "trips_of"]
@@ -191,7 +191,7 @@ def conditions(problem: Problem) -> dict[str, tuple[str, np.ndarray]]:
     def total(x: np.ndarray) -> np.ndarray:
         return np.bincount(trip, weights=x, minlength=n)
 
-    moves = v >= STANDING_MPS
+    moves = v >= STANDSTILL_MPS
     with np.errstate(invalid="ignore", divide="ignore"):
         km = total(meters) / 1e3
         begins = np.r_[False, moves[1:] & ~moves[:-1] & (trip[1:] == trip[:-1])]

@@ -16,9 +16,11 @@ from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS
 from hdev_jax.units import J_PER_WH
 
-__all__ = ["MEASURED", "Log"]
+__all__ = ["KINEMATICS", "MEASURED", "Log"]
 
 MEASURED = ("battery_power_w", "energy_wh")
+# what a row is, before any channel: fields of `Segments`, or what they are made of
+KINEMATICS = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
 from hdev_jax.logs.instruments import Slope, instruments_of, slope_of, speed_of
 from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
-from hdev_jax.logs.log import MEASURED, Log
+from hdev_jax.logs.log import KINEMATICS, MEASURED, Log
 from hdev_jax.logs.presets import PRESETS, preset
 from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
@@ -27,8 +27,6 @@ from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 from hdev_jax.units import accepted
 
 __all__ = ["log_from_frame", "read_log"]
-
-_ROW = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
 
 
 def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Adapter | None = None) -> Log:
@@ -118,7 +116,7 @@ def _require(pieces: list[Piece]) -> bool:
     ends = all("speed_start_mps" in p.data and "speed_end_mps" in p.data for p in pieces)
     for p in pieces:
         free = [h for h in p.headers if h not in {c.source for c in p.columns} or h in p.data]
-        free = [h for h in free if h not in _ROW]
+        free = [h for h in free if h not in KINEMATICS]
         if not ends and "speed_mps" not in p.data:
             lacking = [c for c in ("speed_start_mps", "speed_end_mps") if c not in p.data]
             wanted = lacking[0] if len(lacking) == 1 else "speed_mps"
@@ -171,7 +169,7 @@ def _log(
         ledger = ledger.add(
             "noted", f"the sum is {ratio:.3g} times speed × duration: check its unit", column="distance_m"
         )
-    channels: dict[str, Any] = {k: v for k, v in data.items() if k not in _ROW and k not in measured}
+    channels: dict[str, Any] = {k: v for k, v in data.items() if k not in KINEMATICS and k not in measured}
     channels, ledger = repair(channels, trip, time, ledger)
     soc = channels.get("soc")
     if soc is not None and soc.max() > 1.5:  # a share cannot be: this is per cent

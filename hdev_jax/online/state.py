@@ -18,11 +18,11 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference.calibrate import tabular
 from hdev_jax.inference.sheet import Sheet, build, choose_entry
 from hdev_jax.online.form import LASTING_S, MEMORIES, Form
-from hdev_jax.physics import Effect, Vehicle
+from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS, TargetName
 
-__all__ = ["Now", "State", "Sums", "acts_across_rows", "sample_row", "stacked", "start"]
+__all__ = ["Now", "State", "Sums", "sample_row", "stacked", "start"]
 
 SAMPLE = {"mass_kg": 20e3, "voltage_v": 600.0, "soc": 0.5, "gear": 1.0, "air_density_kgpm3": 1.225}
 
@@ -175,11 +175,6 @@ class Now(eqx.Module):
     alarm: Float[Array, "*row"]
 
 
-def acts_across_rows(effect: type[Effect] | Effect) -> bool:
-    """Whether an effect needs more of a trip than one row."""
-    return any(effect.overrides(hook) for hook in ("derive", "across", "observe"))
-
-
 def sample_row(channels: Iterable[str]) -> Segments:
     """One plausible row with these channels, which says what a log of them can be asked."""
     return Segments.from_arrays(
@@ -218,7 +213,7 @@ def start(
     """
     sample = sample_row(channels).without(*TARGETS[target].follows)
     built = build(sheet, sample, choose_entry(sample, target, sheet), target)
-    across = [e.id for e in built.vehicle.effects if acts_across_rows(e)]
+    across = [e.id for e in built.vehicle.effects if e.acts_across_rows()]
     table, vehicle = built.table, built.vehicle
     notes = [n for n in built.notes if "efficiency map" not in n or "gear" in n]
     for effect_id in across:

@@ -11,7 +11,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter
 from hdev_jax.logs.columns import translate
 from hdev_jax.logs.limits import GAP_SAMPLES, REVERSE_MPS
-from hdev_jax.logs.log import MEASURED
+from hdev_jax.logs.log import KINEMATICS, MEASURED
 from hdev_jax.logs.readers.raw import Raw
 from hdev_jax.online.form import NEEDED, Form
 from hdev_jax.physics import LIBRARY
@@ -20,7 +20,6 @@ from hdev_jax.units import J_PER_WH
 
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
-KINEMATICS = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mps", "speed_end_mps")
 KEPT = ("trips", "origin_s", "held", "before", "last_s", "repeated", "unreadable")  # in the file of the state
 Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")
@@ -55,6 +54,8 @@ class Stream:
             raise InputError(
                 f"{a.where}: hdev follow takes rows of a table; layout, long, clock and companion are for files"
             )
+        if a.rows is not None or a.repeated_stamps != "drop":
+            raise InputError(f"{a.where}: rows and repeated_stamps are for files; send the rows that are to be used")
         if a.stamp != "middle":
             raise InputError(f'{a.where}: stamp = "{a.stamp}" is for files; hdev follow takes samples, or intervals')
         if counters := [k for k, r in a.columns.items() if r.counter]:

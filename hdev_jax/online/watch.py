@@ -30,7 +30,7 @@ from hdev_jax.diagnosis.candidates.facts import facts_of
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.inference import padded
 from hdev_jax.online.form import Form
-from hdev_jax.online.state import State, acts_across_rows, sample_row
+from hdev_jax.online.state import State, sample_row
 from hdev_jax.online.sums import of_mean
 from hdev_jax.physics import LIBRARY, Effect, Vehicle
 from hdev_jax.segments import Segments
@@ -137,7 +137,7 @@ class Watch:
     @staticmethod
     def beside(vehicle: Vehicle, form: Form, library: Mapping[str, type[Effect]] = LIBRARY) -> "Watch":
         """The same from a vehicle and a form."""
-        why = {k: "acts across rows" for k, c in library.items() if acts_across_rows(c)}
+        why = {k: "acts across rows" for k, c in library.items() if c.acts_across_rows()}
         why |= {k: "is looked for by a search of its own" for k, c in library.items() if c.searched}
         why |= {k: "has a number for each group" for k, c in library.items() if any(p.by for p in c.parameters)}
         by_trip = [k for k, c in library.items() if any(p.name == "at_trip" for p in c.parameters)]
@@ -184,7 +184,7 @@ class Watch:
         """What the declared model lacks, once it has been certain that it lacks something; None until then.
 
         Of the effects that have been certain it is the one with the most evidence now. What another effect seems to
-        explain besides is not told apart before this one is in the sheet: `hdev diagnose` does that.
+        explain besides is not distinguished before this one is in the sheet: `hdev diagnose` does that.
         """
         found = np.asarray(state.alarm_at)
         if not found.any():

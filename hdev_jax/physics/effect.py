@@ -234,6 +234,11 @@ class Effect(eqx.Module):
         return column
 
     @classmethod
+    def acts_across_rows(cls) -> bool:
+        """Whether it needs more of a trip than one row."""
+        return any(cls.overrides(hook) for hook in ("derive", "across", "observe"))
+
+    @classmethod
     def overrides(cls, hook: str) -> bool:
         """Whether this class has a hook of its own, so that the kernel calls only what does something."""
         return getattr(cls, hook) is not getattr(Effect, hook)

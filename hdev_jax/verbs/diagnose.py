@@ -19,7 +19,6 @@ from hdev_jax.problem import implausible
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.rundir import Run, open_run
 from hdev_jax.verbs.arguments import names_of
-from hdev_jax.verbs.online import states_of
 from hdev_jax.verbs.opening import (
     Effects,
     Logs,
@@ -32,6 +31,7 @@ from hdev_jax.verbs.opening import (
 )  # fmt: skip
 from hdev_jax.verbs.predict import predictive_of, sheet_digest
 from hdev_jax.verbs.result import Diagnosis
+from hdev_jax.verbs.states import states_of
 
 __all__ = ["diagnose"]
 

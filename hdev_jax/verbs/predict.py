@@ -15,9 +15,9 @@ from hdev_jax.problem import Problem, Split, derivable, prepare
 from hdev_jax.rundir import atomic_file
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.beside import beside_sheet, covariance_of
-from hdev_jax.verbs.online import one_step_ahead
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of, tried
 from hdev_jax.verbs.result import PREDICTIVE, Prediction, Result
+from hdev_jax.verbs.states import one_step_ahead
 
 __all__ = ["predict", "predictive_of", "sheet_digest", "strongly_correlated"]
 

@@ -20,7 +20,7 @@ from hdev_jax.logs import Log
 from hdev_jax.options.energy import ENERGY_VERBS
 from hdev_jax.problem import prepare
 from hdev_jax.verbs.energy.result import _write_book
-from hdev_jax.verbs.online import given_states, states_of
+from hdev_jax.verbs.states import given_states, states_of
 
 
 @pytest.fixture(scope="module")

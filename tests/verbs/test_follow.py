@@ -199,6 +199,9 @@ def test_means_and_compressed_rows_are_refused(tmp_path):
     (tmp_path / "a.toml").write_text('stamp = "end"\n')
     with pytest.raises(InputError, match=r'a\.toml: stamp = "end" is for files'):
         summed_up([], adapter=tmp_path / "a.toml")
+    (tmp_path / "b.toml").write_text('rows = "battery_power_w"\n')
+    with pytest.raises(InputError, match=r"b\.toml: rows and repeated_stamps are for files"):
+        summed_up([], adapter=tmp_path / "b.toml")
     with pytest.raises(InputError, match="compressed by gzip; text is expected"):
         summed_up(io.BytesIO(gzip.compress(b"time_s,speed_mps,energy_wh\n")))
 

@@ -185,10 +185,6 @@ def beyond(from_: float, at: float) -> float:
     return at * at / from_ if min(from_, at) > 0 else 2.0 * at - from_
 
 
-def _row_level(effect: Effect | type[Effect]) -> bool:
-    return not any(effect.overrides(h) for h in ("across", "observe", "derive"))
-
-
 @runtime_checkable
 class Source(Protocol):
     """What makes candidates' columns of any rows: the library's `Plan`, or the terms of a formula.
@@ -253,11 +249,11 @@ def plan_of(
         else:
             nulls.append(as_seen(at_null(c, gears=facts.gears), facts))
     # in the same company whatever the log lacks, so that logs share programs
-    company = {id_: k // TOGETHER for k, id_ in enumerate(c.id for c in effects if _row_level(c))}
+    company = {id_: k // TOGETHER for k, id_ in enumerate(c.id for c in effects if not c.acts_across_rows())}
     groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
     for k in sorted({company[e.id] for e in nulls if e.id in company}):
         groups.append(([e for e in nulls if company.get(e.id) == k], None))
-    for e in (e for e in nulls if not _row_level(e)):
+    for e in (e for e in nulls if e.acts_across_rows()):
         for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.has_column),):
             groups.append(([_only(e, sizes)], sizes))
 

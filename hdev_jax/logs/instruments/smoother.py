@@ -102,7 +102,7 @@ def lanes_of(
 def course_of(lanes: Lanes, kind: Kind, *, least: float) -> Course:
     """The numbers of greatest likelihood; `least` is the white noise that readings in steps have at least.
 
-    A drift is there where it pays, and only of heights: of slopes it could not be told from the road.
+    A drift is there where it pays, and only of heights: of slopes it could not be distinguished from the road.
     """
     some = np.unique(np.linspace(0, len(lanes.at) - 1, min(SOME, len(lanes.at))).astype(int))
     few = Lanes(*(x[some] for x in lanes))
@@ -273,7 +273,7 @@ def _likelihood(cells: Any, course: Array, sees: Array, _: Array) -> tuple[Array
 
 @jax.jit
 def _states(cells: Any, course: Array, sees: Array, wants: Array) -> tuple[Array, Array]:
-    """Posterior means and variances `[lane, cell]` of what is wanted of the state."""
+    """Posterior means and variances `[lane, cell]` of the states asked for."""
 
     def step(carry: Any, cell: _Cell) -> Any:
         r, n = carry  # what later cells say, as it acts on this one

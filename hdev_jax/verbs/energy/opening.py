@@ -20,7 +20,6 @@ from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.arguments import seed_of
 from hdev_jax.verbs.beside import beside_sheet, covariance_of
 from hdev_jax.verbs.energy.result import EnergyResult
-from hdev_jax.verbs.online import given_states
 from hdev_jax.verbs.opening import (
     Effects,
     Logs,
@@ -35,6 +34,7 @@ from hdev_jax.verbs.opening import (
     tried,
 )
 from hdev_jax.verbs.result import PREDICTIVE, Result
+from hdev_jax.verbs.states import given_states
 
 __all__ = ["Asked", "answered", "battery_target", "fitted_for", "problem_for", "synthetic"]
 

@@ -40,7 +40,7 @@ def follow(
 ) -> str | None:
     """Follow one vehicle row by row: energy of each row before it is measured, coefficients after it, alarms.
 
-    Rows come as CSV (header first) or as JSON lines, in the columns of a log: intervals, or samples, which are told one
+    Rows come as CSV (header first) or as JSON lines, in the columns of a log: intervals, or samples, which are used one
     row later, when it is known how long they lasted. What a row lacks keeps its last value; rows that cannot be used
     are counted, and told at the end.
 
@@ -49,8 +49,8 @@ def follow(
     on from it as if it had never stopped, and rows that it has had are left out. `json`: a line of JSON for each row.
     `watch`: name effects of the library that the sheet lacks.
 
-    **Returns:** the estimates and what became of the rows, as text; None where each row was told as JSON. **Raises:**
-    `InputError`.
+    **Returns:** the estimates and what became of the rows, as text; None where each row was written as JSON.
+    **Raises:** `InputError`.
     """
     sheet, rules = sheet_of(vehicle, known_effects(effects)), adapter_of(adapter)
     with opened(rows) as source, _terminal(live=not json) as tell, _stopped_by_signal():

@@ -1,4 +1,4 @@
-"""Predictions one step ahead: loads that switch are filtered along the log, from the rows before alone."""
+"""Loads that switch along a log: one step ahead, from the rows before alone, or given all rows of a trip."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
