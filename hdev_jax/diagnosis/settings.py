@@ -138,6 +138,10 @@ class Settings:
         0.5, "largest sd of a load's power over trips, and difference between standstill and motion, over it", "1",
         "measured loads of buses have stages: 0.15 to 0.35",
     )  # fmt: skip
+    load_steady: float = _number(
+        0.15, "share of a load's power by which it may rise or fall while it is on", "1",
+        "two loads of a bus 0.01 and 0.08, planted ones at most 0.05, a saw-tooth 0.26 to 0.7",
+    )  # fmt: skip
     load_s: float = _number(
         60.0, "least time on, and off, in a trip, at standstill or in motion, for a power there", "s", "a minute"
     )

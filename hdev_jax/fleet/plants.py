@@ -87,7 +87,7 @@ PLANTABLE: dict[str, Plant] = {
         ("power_w",),
         in_library=False,
         match="noise",
-        partly=("auxiliary_power",),
+        partly=("auxiliary_power", "switching_load"),
     ),
     # what the library holds in another form
     "squared_hvac_power": Plant({"w_per_k2": 20.0, "at_c": 17.0}, ("w_per_k2",), in_library=False, like="hvac_power"),

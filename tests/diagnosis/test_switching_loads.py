@@ -177,6 +177,21 @@ def test_what_is_on_once_at_the_start_of_each_trip_is_no_load_that_switches():
     assert said[1] is None
 
 
+def test_a_saw_tooth_is_no_load_that_switches():
+    rng, trips, n = np.random.default_rng(0), 10, 1200
+    tooth = np.tile(np.arange(n) % 300 / 300.0, trips)
+    said = []
+    for power in (10e3 * tooth, 2.5e3 + 5e3 * (tooth > 0.5)):  # of the same medians
+        rows = StateRows(
+            power + rng.normal(0, 1e3, trips * n), np.repeat(np.arange(trips), n), np.ones(trips * n),
+            np.full(trips * n, 15.0), np.zeros(trips * n, int), 0.1,
+        )  # fmt: skip
+        model = Switching(np.array([5e3]), 2.5e3, np.full(2, 1e3), np.full((1, 4), 0.5), np.full(1, 75.0))
+        said.append(_unlike(rows, model, decode(model, rows), 0, SETTINGS))
+    assert "rises by 9" in str(said[0])  # 5 kW of 5 kW, less what the states at its ends make of the noise
+    assert said[1] is None
+
+
 def _clipped(power):
     return np.minimum(power, np.quantile(power, 0.7))
 

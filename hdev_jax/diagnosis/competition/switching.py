@@ -3,7 +3,8 @@
 Coloured noise wanders, and a model of two levels follows it too. What noise does not have is levels: the same in every
 trip, at standstill and in motion. So the model has to gain more likelihood over errors alone than it does on noise of
 the same colour and size (a parametric bootstrap whose innovations are the residual's own with random signs; Wu, Annals
-of Statistics 14, 1986), and the power between its levels has to be the same in all trips, standing and moving.
+of Statistics 14, 1986), and the power between its levels has to be the same in all trips, standing and moving, and
+from the first row to the last that it is on.
 """
 
 from dataclasses import replace
@@ -27,6 +28,7 @@ from hdev_jax.inference.states import (
     Switching,
     decode,
     fit_switching,
+    rise,
     rows_of,
     what_it_depends_on,
 )
@@ -253,6 +255,9 @@ def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, setting
             return f"it does not switch {'at standstill' if standing is None else 'in motion'}"
         if abs(standing[0] - moving[0]) > settings.load_alike * power:
             return f"it has {standing[0] / 1e3:.2g} kW at standstill and {moving[0] / 1e3:.2g} kW in motion"
+    rises, sd = rise(model, alone, on)
+    if abs(rises) - 2.0 * sd > settings.load_steady:
+        return f"its power {'rises' if rises > 0 else 'falls'} by {abs(rises):.0%} while it is on"
     return None
 
 

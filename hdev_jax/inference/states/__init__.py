@@ -13,7 +13,7 @@ chain from trip to trip (`probability_of_modes`).
 from hdev_jax.inference.states.chances import contrasts, what_it_depends_on
 from hdev_jax.inference.states.course import course
 from hdev_jax.inference.states.decode import Decoded, decode, energy_draws
-from hdev_jax.inference.states.fit import errors_alone, fit_switching, shares_of
+from hdev_jax.inference.states.fit import errors_alone, fit_switching, rise, shares_of
 from hdev_jax.inference.states.model import Switching
 from hdev_jax.inference.states.modes import probability_of_modes
 from hdev_jax.inference.states.rows import StateRows, rows_of
@@ -29,6 +29,7 @@ __all__ = [
     "errors_alone",
     "fit_switching",
     "probability_of_modes",
+    "rise",
     "rows_of",
     "shares_of",
     "what_it_depends_on",

@@ -12,7 +12,7 @@ from hdev_jax.inference.states.rows import StateRows
 from hdev_jax.physics.states import KNOTS_C
 from hdev_jax.segments import trip_slices
 
-__all__ = ["errors_alone", "fit_switching", "shares_of"]
+__all__ = ["errors_alone", "fit_switching", "rise", "shares_of"]
 
 FREEDOMS = (2.0, 3.0, 4.0, 6.0, 10.0, 20.0, 60.0)  # degrees of freedom of the errors
 LEAST_SHARE, MOST_SHARE = 0.005, 0.995  # of time on: a state that is never taken has no dwell time
@@ -123,6 +123,27 @@ def errors_alone(rows: StateRows) -> tuple[float, float]:
     innovation = error - np.r_[0.0, error[:-1]] * kept_errors(model, rows, starts)
     model = _with_errors(model, (innovation / rows.wide)[:, None], np.ones((len(error), 1)), rows.standing)
     return decode(model, rows).log_likelihood, memory
+
+
+def rise(model: Switching, rows: StateRows, on: Float[np.ndarray, " row"]) -> tuple[float, float]:
+    """How much the power rises from begin to end of a stay at the upper level, as a share of it, and its standard
+    error: generalised least squares with the errors' memory and Student's weights. A saw-tooth is decoded as two
+    levels too, but rises."""
+    starts = np.array([s.start for _, s in trip_slices(rows.trip)])
+    begins = np.r_[True, np.diff((on > 0.5).astype(int)) != 0]
+    begins[starts] = True
+    stay, until = np.cumsum(begins) - 1, np.cumsum(rows.duration_s)
+    seconds = np.bincount(stay, rows.duration_s)
+    through = (until - 0.5 * rows.duration_s - (until - rows.duration_s)[begins][stay]) / seconds[stay]
+    kept, scale = kept_errors(model, rows, starts)[:, None], scales(model, rows, starts)[:, None]
+    x = np.column_stack([np.ones(len(on)), on, np.where(on > 0.5, through - 0.5, 0.0), rows.residual_w])
+    x = (x - kept * np.r_[np.zeros((1, 4)), x[:-1]]) / scale
+    x, y, weight = x[:, :3], x[:, 3], np.ones(len(on))
+    for _ in range(SWEEPS):
+        inverse = np.linalg.pinv((x.T * weight) @ x)
+        size = inverse @ (x.T @ (weight * y))
+        weight = (model.freedom + 1.0) / (model.freedom + (y - x @ size) ** 2)
+    return float(size[2] / size[1]), float(np.sqrt(inverse[2, 2]) / abs(size[1]))
 
 
 def shares_of(rows: StateRows, on: Float[np.ndarray, " row"]) -> Float[np.ndarray, " knot"]:
