@@ -30,7 +30,7 @@ from experiments.measured.tables import (
 )
 from experiments.measured.withheld import WITHHELD
 from experiments.runner.page import folded
-from hdev_jax.diagnosis.settings import SETTINGS
+from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.report import names
 
 __all__ = ["page", "write"]
@@ -149,7 +149,7 @@ def _reading(runs: Runs) -> list[str]:
     kind = {"trip": "trips"}.get(next(iter(runs.values()))["clusters"]["kind"], "stretches of at least 5 minutes")
     clusters = f"{names.verbose_join(sorted(count, key=int), 'or')} {kind}"
     chance = names.verbose_join([f"{by_chance(k):.2f} for {k}" for k in range(2, max(2, len(runs)) + 1)])
-    return READING.format(draws=SETTINGS.resamples, clusters=clusters, chance=chance).splitlines()
+    return READING.format(draws=RESAMPLES, clusters=clusters, chance=chance).splitlines()
 
 
 def _details(runs: Runs, head: str, caution: str) -> list[str]:

@@ -71,7 +71,7 @@ LEGEND = {  # of each table that is there; the first of every page
     "planted_names": (
         "Named first: the first name of each entry is the planted one. No class: each entry is one name. Separable: "
         "logs in which, by the truth, no other effect explains as much under this noise. Redrawn: logs drawn again "
-        "because the effect acted in one training trip only",
+        "because the effect acted in one training trip only, or the noise was beyond what the reader takes",
     ),
     "planted_names_by_twin": (
         "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "

@@ -12,6 +12,7 @@ from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
 from hdev_jax.diagnosis.competition.compete import compete, named_alone, no_instrument_named, none_named, rows_with
 from hdev_jax.diagnosis.competition.refit import as_reported
 from hdev_jax.diagnosis.competition.state import State
+from hdev_jax.diagnosis.gates.gates import MOST_IN_CLASS
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.remainder.remainder import Formula, Remainder, remainder
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
@@ -118,7 +119,7 @@ def _diagnosed(
     leeway |= {} if given is None else given.left_open
     summary = summarise(problem, split, named, steps, predicted, left, leeway, settings, given)
     summary["excluded"] = excluded
-    twins = [(f.id, library[t]) for f in named.found for t in f.alike[: settings.most_in_class] if t in library]
+    twins = [(f.id, library[t]) for f in named.found for t in f.alike[:MOST_IN_CLASS] if t in library]
     if twins:
         tell("what to measure next: drives that separate the members of a class")
         drives = checkpoint("next", lambda: [asdict(a) for a in advise(problem, named, training.rows, twins)])

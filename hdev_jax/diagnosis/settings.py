@@ -2,7 +2,7 @@
 
 What half and double of each do to the study of planted effects is in docs/settings.md, which
 `python -m experiments configs/studies/settings.toml` measures. Numbers of computation (rows in a chunk, points of a
-grid, tolerances of a solver) are not among them.
+grid, rounds of a search, draws, tolerances of a solver) are not among them.
 """
 
 from dataclasses import dataclass, field, fields
@@ -22,7 +22,6 @@ class Settings:
     fdr: float = _number(
         0.05, "highest FDR-adjusted p-value of a named effect", "1", "Benjamini and Hochberg, JRSS B 57 (1995)"
     )
-    most_effects: int = _number(10, "effects that one search adds at most", "effects", "a bound on time")
 
     # what a candidate costs: its gain in log-likelihood has to pay for its numbers
     size_cost: float = _number(
@@ -38,29 +37,15 @@ class Settings:
         "log-likelihood",
         "odds of 20 to 1 (Kass and Raftery, JASA 90, 1995: strong)",
     )
-    leaders: int = _number(
-        3,
-        "candidates that are refitted, or have their shapes refined, in one step",
-        "candidates",
-        "time",
-    )
-    tries: int = _number(4, "rounds of leaders in one step", "rounds", "time")
 
     # gates
     absorbed: float = _number(
         3e-3, "share of a column outside the span of the fitted coefficients, below which it is absorbed", "1",
         "collinearity: standard error 18 times that of an orthogonal column",
     )  # fmt: skip
-    by_rows: float = _number(
-        1e-12, "p-value by rows alone below which a shape is refined before its clustered test counts", "1", "time"
-    )
     agreed: float = _number(
         0.25, "share of a size by ordinary least squares that generalised least squares must not exclude", "1",
         "chosen on seeds 1-99",
-    )  # fmt: skip
-    beyond_readings: float = _number(
-        0.02, "least share of the error's variance that an effect explains where slope or speed have known errors",
-        "1", "as `least_share`: 1 % of the error",
     )  # fmt: skip
     placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
     placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
@@ -71,11 +56,10 @@ class Settings:
         0.25, "share of resampled sets of clusters in which the effect, or its class, comes first again", "1",
         "Meinshausen and Bühlmann, JRSS B 72 (2010), far below their 0.6: sets of 8 trips differ much",
     )  # fmt: skip
-    resamples: int = _number(100, "resampled sets of clusters", "draws", "a share to ± 5 points")
     switch_low: float = _number(
-        0.4, "least estimate of a switch, over its full difference", "1", "half, less two standard errors"
-    )
-    switch_high: float = _number(2.5, "largest estimate of a switch, over its full difference", "1", "1 / switch_low")
+        0.4, "least estimate of a switch, over its full difference, and 1 over the largest", "1",
+        "half, less two standard errors",
+    )  # fmt: skip
 
     # a joint refit
     stands: float = _number(2.6, "least |t| of a size in the joint refit", "standard errors", "1 %, two-sided")
@@ -95,25 +79,17 @@ class Settings:
     )
 
     # is X still needed beside Y
-    keep: float = _number(0.05, "p-value up to which an effect stays beside those added later", "1", "Wald test, 5 %")
+    wald: float = _number(
+        0.05, "p-value up to which an effect is needed beside those added later, or another of its class", "1",
+        "Wald test, 5 %",
+    )  # fmt: skip
     class_share: float = _number(
         0.8, "least share of an effect's gain that another of its class reaches", "1", "chosen on seeds 1-99"
-    )
-    class_p: float = _number(
-        0.05, "p-value above which an effect is not needed beside another of its class", "1", "Wald test, 5 %"
     )
     inexact: float = _number(
         0.2, "share by which forms of effects are inexact: effects that differ by less are one class", "1",
         "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
     )  # fmt: skip
-    correlated: float = _number(
-        0.5, "least correlation of two estimates for which a class among found effects is looked for", "1",
-        "time: of those that share 80 % of their gain it is 0.9",
-    )  # fmt: skip
-    most_in_class: int = _number(2, "members of a class that are listed at most", "effects", "contract §4")
-    wider_p: float = _number(
-        1e-3, "p-value below which a size joins an effect that was found without it", "1", "as strict as `level`"
-    )
 
     # terms without a name
     unnamed_stricter: float = _number(
@@ -124,12 +100,12 @@ class Settings:
     )
 
     # loads that switch in a cycle, modes of some trips
-    alike_p: float = _number(
-        1e-3, "p-value below which a cycle differs between trips, or is no square wave", "1", "a test at 0.1 %"
-    )
     alike_spread: float = _number(0.3, "largest sd of its size over trips, over the size", "1", "chosen on seeds 1-99")
     other_waves: float = _number(0.1, "largest share of its gain that harmonics may add", "1", "chosen on seeds 1-99")
-    mode_trips: int = _number(8, "least number of trips for a mode of some trips", "trips", "as for trips as clusters")
+    least_count: int = _number(
+        8, "least number of trips for a mode of some of them, and of switches of a load beyond once a trip", "1",
+        "as for trips as clusters",
+    )  # fmt: skip
     mode_side: int = _number(2, "least trips of either mode", "trips", "one is an outlier")
     mode_enough: float = _number(0.01, "p-value above which two values are enough for all trips", "1", "a test at 1 %")
 
@@ -145,9 +121,6 @@ class Settings:
     load_s: float = _number(
         60.0, "least time on, and off, in a trip, at standstill or in motion, for a power there", "s", "a minute"
     )
-    load_switches: float = _number(
-        8.0, "least number of times that a load switches, beyond once a trip", "switches", "as for trips as clusters"
-    )
     load_spread: float = _number(
         2.0, "least sd of the gain of a load on noise", "log-likelihood", "sd of half a χ² of 8 free numbers"
     )
@@ -157,12 +130,12 @@ class Settings:
         0.2, "least correlation of the means of neighbouring minutes of a slow remainder", "1", "4 % of their variance"
     )
     level: float = _number(
-        1e-3, "p-value of unexplained structure; a tenth of it for change points and intercepts", "1",
-        "four kinds of structure are tested",
+        1e-3, "p-value of unexplained structure (a tenth of it for change points and intercepts), of a size that joins "
+        "a found effect, of a cycle that differs between trips", "1", "a test at 0.1 %",
     )  # fmt: skip
     least_share: float = _number(
-        0.02, "least share of the variance that a found structure explains", "1",
-        "1 % of the error",
+        0.02, "least share of the variance that a found structure explains, or an effect where readings of slope or "
+        "speed have known errors", "1", "1 % of the error",
     )  # fmt: skip
     least_levels: float = _number(
         0.1, "least share of the variance that random intercepts of trips explain", "1", "chosen on seeds 1-99"

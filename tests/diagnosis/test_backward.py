@@ -23,7 +23,7 @@ def shows_something(rows: Training, state: State, id_: str) -> None:
     p = needed(evidence_of(rows.baseline(state.fit)), state.fit, found).p
     car, row = state.fit.vehicle, rows.facts.sample
     tried = [c for c in rows.library.values() if not unavailable(c, row, car.entry, car.stands_in)]
-    assert rows.settings.fdr / len(tried) < p < rows.settings.keep, f"p = {p:.2g} shows nothing"
+    assert rows.settings.fdr / len(tried) < p < rows.settings.wald, f"p = {p:.2g} shows nothing"
 
 
 @pytest.mark.parametrize(

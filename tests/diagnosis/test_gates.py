@@ -68,10 +68,10 @@ def test_the_first_gate_that_a_score_does_not_pass_says_why(values, kind, number
 
 
 def test_where_readings_have_errors_a_small_gain_is_no_cause(log, scores):
-    least = scores.settings.beyond_readings
+    least = scores.settings.least_share
     scores.inexact = True
     assert first_rejection(asked(log, scores, "standstill_load"), EVERY) is None
-    scores.settings = replace(scores.settings, beyond_readings=0.99)
+    scores.settings = replace(scores.settings, least_share=0.99)
     why = first_rejection(asked(log, scores, "standstill_load"), EVERY)
     assert why is not None
     assert why.kind is Kind.READINGS

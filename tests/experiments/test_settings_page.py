@@ -36,7 +36,7 @@ def test_half_and_double(default, unit, expected):
 
 
 @pytest.mark.parametrize(
-    ("given", "words"), [("{closer=1.0}", "closer: one of fdr,"), ("{leaders=1.5}", "whole number")]
+    ("given", "words"), [("{closer=1.0}", "closer: one of fdr,"), ("{placebos=1.5}", "whole number")]
 )
 def test_a_setting_that_is_none_is_refused(given, words):
     sets = [f"settings={given}"]
@@ -68,11 +68,11 @@ def test_results_of_the_study_fill_half_and_double(tmp_path, capsys):
         twin = {"name": "one effect: no twin", "paper": None, "ours": {"n": 4, "right": 1.0}}
         return {"sweep": {"settings": settings}, "rows": [{"name": "x", "paper": None, "ours": ours}, pooled, twin]}
 
-    (tmp_path / "sweep.json").write_text(json.dumps([run({}, 4), run({"leaders": 2}, 3)]))
+    (tmp_path / "sweep.json").write_text(json.dumps([run({}, 4), run({"mode_side": 1}, 3)]))
     assert main(["--docs", str(tmp_path / "docs"), "--run", str(tmp_path)]) == 0
     text = (tmp_path / "docs" / "settings.md").read_text(encoding="utf-8")
     assert "With the defaults: 4/4, 1 false." in text
-    assert "| `leaders` | 3 | 2: 3/4, 1 false | 6 |" in text
+    assert "| `mode_side` | 2 | 1: 3/4, 1 false | 4 |" in text
     assert "No results" in page(command="x")
     assert main(["--docs", str(tmp_path), "--run", str(tmp_path / "none")]) == 2
     assert "no complete sweep.json" in capsys.readouterr().err

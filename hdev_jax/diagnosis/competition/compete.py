@@ -28,6 +28,9 @@ __all__ = ["compete", "named_alone", "no_instrument_named", "none_named", "rows_
 Tell = Callable[[str], None]
 
 
+MOST_EFFECTS = 10  # that one search adds
+
+
 def compete(
     training: Training,
     vehicle: Vehicle,
@@ -53,7 +56,7 @@ def compete(
     state = remember(0, calibrated)
     declared = state.fit
     # nothing is added in the second half: what is taken out there is one of those that were
-    for step in range(1, 2 * training.settings.most_effects + 3):
+    for step in range(1, 2 * MOST_EFFECTS + 3):
         rng = np.random.default_rng([seed, step])
         state = remember(step, lambda s=state, k=step, r=rng: _step(rows_with(training, s), s, declared, k, r, tell))
         if state.finished:
@@ -81,7 +84,7 @@ def _step(
     round_ = Round(training, state, scores, rng, tell)
     sought: list[Verdict] = []
     new = None
-    if len(state.found) < training.settings.most_effects and step <= training.settings.most_effects + 1:
+    if len(state.found) < MOST_EFFECTS and step <= MOST_EFFECTS + 1:
         new = two_exchanged(round_) or forward(round_, skip=state.refused)
         if new is None and state.refused:
             new = forward(round_, skip=tuple(round_.reasons))  # tried just now: no second time

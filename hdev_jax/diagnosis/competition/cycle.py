@@ -16,6 +16,7 @@ from scipy import stats
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.refit import joined
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
+from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.noise.noise import estimate_noise
 from hdev_jax.diagnosis.noise.spectrum import Clocked, strongest_period
@@ -111,7 +112,7 @@ def add_cycle(training: Training, state: State, rng: np.random.Generator) -> tup
     if gain < settings.size_cost * freedoms or share < settings.least_share:
         return no(Kind.OUTSCORED, f"{cycle} that explains too little for its number of coefficients", gain, q)
     left_out = _left_out_gain(rows, square, settings)
-    drawn = rng.integers(0, len(gains), (settings.resamples, len(gains)))
+    drawn = rng.integers(0, len(gains), (RESAMPLES, len(gains)))
     stability = float(np.mean(np.sum(gains[drawn], axis=1) > settings.size_cost * freedoms))
     if left_out <= settings.ahead:
         return no(Kind.NOT_CONFIRMED, f"{cycle}, not confirmed by cross-validation over trips", gain, q)
@@ -219,7 +220,7 @@ def _differ(sizes: np.ndarray, precision: np.ndarray, times: np.ndarray, setting
     weight = precision * times
     mean = float(np.sum(weight * sizes) / np.sum(weight))
     chi2, freedom = float(np.sum(weight * (sizes - mean) ** 2)), float(np.sum(times)) - 1
-    if freedom < 1 or stats.chi2.sf(chi2, freedom) >= settings.alike_p:
+    if freedom < 1 or stats.chi2.sf(chi2, freedom) >= settings.level:
         return False
     between = max(chi2 - freedom, 0.0) / (np.sum(weight) - np.sum(weight * precision) / np.sum(weight))
     return bool(np.sqrt(between) > settings.alike_spread * mean)
@@ -243,6 +244,6 @@ def _unlike(
     x = np.linalg.lstsq(both, rows.white, rcond=None)[0]
     alone = 0.5 * float(square @ rows.white) ** 2 / float(square @ square)
     more = 0.5 * float(rows.white @ both @ x) - alone
-    if stats.chi2.sf(2 * more, others.shape[1]) < settings.alike_p and more > settings.other_waves * alone:
+    if stats.chi2.sf(2 * more, others.shape[1]) < settings.level and more > settings.other_waves * alone:
         return "not a load that is either on or off"
     return None

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hdev_jax.diagnosis.competition.grid import LEADERS
 from hdev_jax.diagnosis.competition.refit import Refit, refit
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class, stability
@@ -44,12 +45,15 @@ class Round:
         self.tell(f"rejected {id_}: {why}")
 
 
+TRIES = 4  # rounds of leaders in one step
+
+
 def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] | None = None) -> State | None:
     """The state with the candidate that passes every gate, refitted; None where none does. Goes on past one that
     fails; `only` these, without those to `skip`."""
     scores, settings = round_.scores, round_.training.settings
     done = {*round_.state.barred, *skip}
-    for _ in range(settings.tries):
+    for _ in range(TRIES):
         # in each round again: an effect taken in fewer groups has another p, which changes every adjusted p-value
         wanted = scores.best if only is None else {k: s for k, s in scores.best.items() if k in only}
         able = [s for id_, s in wanted.items() if id_ not in done and round_.passes(s)]
@@ -60,7 +64,7 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
         first, members = _plainest(round_, able)
         bar = settings.close * scores.worth(first)
         rivals = [s for s in able if s.plain == first.plain and s.candidate.id not in members]
-        close = [first, *(s for s in rivals[: settings.leaders - 1] if scores.worth(s) >= bar)]
+        close = [first, *(s for s in rivals[: LEADERS - 1] if scores.worth(s) >= bar)]
         fits = [(s, fit) for s in close if (fit := _refitted(round_, s)) is not None]
         done |= {s.candidate.id for s in close}
         each = [(taken, fit, max(fit.gain, taken.gain) if taken.plain else fit.gain) for taken, fit in fits]

@@ -8,7 +8,11 @@ from hdev_jax.diagnosis.scores.passes import both_looks
 from hdev_jax.diagnosis.scores.scores import Scores, best_of, plausible
 from hdev_jax.diagnosis.training import Training
 
-__all__ = ["refined", "sharpened"]
+__all__ = ["LEADERS", "refined", "sharpened"]
+
+
+LEADERS = 3  # candidates that are refitted, or have their shapes refined, in one step
+BY_ROWS = 1e-12  # p-value by rows alone below which a shape is refined before its clustered test counts
 
 
 def sharpened(training: Training, scores: Scores) -> Scores:
@@ -19,10 +23,10 @@ def sharpened(training: Training, scores: Scores) -> Scores:
     settings = training.settings
     doubted = [
         s for id_, s in scores.best.items()
-        if scores.q[id_] > settings.fdr and s.p_model < settings.by_rows and not s.plain and s.candidate.shapes
+        if scores.q[id_] > settings.fdr and s.p_model < BY_ROWS and not s.plain and s.candidate.shapes
         and id_ not in scores.absorbed_by
     ]  # fmt: skip
-    for s in sorted(doubted, key=lambda s: -s.gain)[: settings.leaders]:
+    for s in sorted(doubted, key=lambda s: -s.gain)[:LEADERS]:
         better, ways = refined(training, s, scores)
         if better is not s and better.p * ways < s.p:
             # places stay those of the coarse grid; a refit looks for finer shapes again

@@ -17,6 +17,7 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate, plan_of
 from hdev_jax.diagnosis.competition.cycle import barred
 from hdev_jax.diagnosis.competition.refit import joined
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
+from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of
@@ -51,8 +52,8 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
     def no(kind: Kind, detail: str, gain: float | None = None, q: float = 1.0) -> tuple[None, Verdict]:
         return None, Verdict(ID, gain, q, Rejection(kind, {"detail": detail}))
 
-    if len(slices) < settings.mode_trips:
-        return no(Kind.TOO_FEW_CLUSTERS, f"at least {settings.mode_trips} trips are needed to split them in two groups")
+    if len(slices) < (least := settings.least_count):
+        return no(Kind.TOO_FEW_CLUSTERS, f"at least {least} trips are needed to split them in two groups")
     ids = np.concatenate([np.full(s.stop - s.start, k) for k, s in enumerate(slices)])
     noise = training.noise(state.fit)
     baseline = replace(
@@ -156,7 +157,7 @@ def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray, settings: Sett
     the column."""
     n, base = len(grams), len(pull)
     cross, square, moment = grams[:, :base, base], grams[:, base, base], grams[:, base, base + 1]
-    if np.count_nonzero(square > 1e-20) < settings.mode_trips:
+    if np.count_nonzero(square > 1e-20) < settings.least_count:
         return None
     total = grams.sum(axis=0)
     a, b = total[:base, :base] + precision, total[:base, base + 1] - pull
@@ -201,7 +202,7 @@ def _stability(
 ) -> float:  # fmt: skip
     """Share of resampled sets of trips that form two modes again, whichever trips those are."""
     n = every.shape[1]
-    draws, hits = int(np.clip(MOST_SPLITS // n, 10, settings.resamples)), 0
+    draws, hits = int(np.clip(MOST_SPLITS // n, 10, RESAMPLES)), 0
     for _ in range(draws):
         drawn = np.sort(rng.integers(0, n, n))
         best = _best(every[:, drawn], precision, pull, settings)

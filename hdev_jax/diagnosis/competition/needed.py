@@ -44,6 +44,9 @@ class Without:
         return [replace(c, columns=tuple(k + self.shift for k in c.columns)) for c in candidates]
 
 
+CORRELATED = 0.5  # two estimates that are less have no class: of those that share 80 % of their gain it is 0.9
+
+
 def model_without(evidence: Evidence, fit: Calibration, *out: Found) -> Without:
     """The model without found effects; their shapes are held where they are."""
     sizes: list[int] = []
@@ -96,7 +99,7 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
         for f in asked:
             p = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
             strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
-            allowed = settings.fdr / _tried(training, state) if strictly else settings.keep
+            allowed = settings.fdr / _tried(training, state) if strictly else settings.wald
             rank = (p / allowed, f.score.candidate.effect.stage == "sensors")
             if p > allowed and (worst is None or rank >= worst[0]):
                 worst = (rank, f)
@@ -173,7 +176,7 @@ def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Set
     in the vehicle, else the one that explains less by itself."""
     if not (can_be_asked(f) and can_be_asked(g)) or f.score.plain or g.score.plain:
         return False
-    if not _correlation(state.fit, f, g) > settings.correlated:
+    if not _correlation(state.fit, f, g) > CORRELATED:
         return False
     w = model_without(evidence, state.fit, f, g)
     totals, (own, other) = w.evidence.totals(), w.each

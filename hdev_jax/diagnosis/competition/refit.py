@@ -214,14 +214,11 @@ def widened(training: Training, state: State) -> State | None:
             evidence = evidence_of(training.baseline(there, training.noise(state.fit))).freed(at, there.values[at])
             assert isinstance(evidence, Evidence)
             added = evidence.score(replace(wider, sizes=tuple(new), columns=tuple(range(len(at)))))
-            if (
-                added.left < training.settings.absorbed
-                or max(added.p_model, added.p_cluster) > training.settings.wider_p
-            ):
+            if added.left < training.settings.absorbed or max(added.p_model, added.p_cluster) > training.settings.level:
                 continue
             fit = fitted(training, state.fit, vehicle, table)
             p = 2 * stats.t.sf(np.abs(fit.values[at] / fit.sd[at]), max(training.clusters.count - 1, 1))
-            if fit.converged and in_range(fit, wider) and np.all(p < training.settings.wider_p):
+            if fit.converged and in_range(fit, wider) and np.all(p < training.settings.level):
                 by_path = {r.path: float(v) for r, v in zip(fit.table.free, fit.values, strict=True)}
                 beta = np.array([by_path[f"effects.{f.id}.{n}"] for n in sizes])
                 score = replace(f.score, candidate=wider, beta=beta)

@@ -17,6 +17,7 @@ from hdev_jax.diagnosis.competition.cycle import barred
 from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, Tested, besides, level_test
 from hdev_jax.diagnosis.competition.refit import fitted, joined, without
 from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
+from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.settings import Settings
@@ -238,7 +239,7 @@ def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, setting
         return "its power is out of range"
     # once in a trip is what begins or fades in it: a change that stays, a cabin that is warm by then
     switches = [float(np.sum(np.abs(np.diff(on[s])))) for _, s in trip_slices(rows.trip)]
-    if np.sum(np.maximum(np.array(switches) - 1.0, 0.0)) < settings.load_switches:
+    if np.sum(np.maximum(np.array(switches) - 1.0, 0.0)) < settings.least_count:
         return "it switches too seldom to be distinguished from what changes once in a trip"
     each = [p for _, s in trip_slices(rows.trip) if (p := _power(alone.take(s), on[s], settings.load_s)) is not None]
     if len(each) < min(2, len(np.unique(rows.trip))):
@@ -269,5 +270,5 @@ def _stability(
     with_it = model.base_w + decoded.on[:, k] * model.power_w[k]
     each = (np.abs(alone - np.median(alone)) - np.abs(alone - with_it)) / (model.scale_w[rows.standing] * rows.wide)
     gains = np.array([np.sum(each[s]) for _, s in trip_slices(rows.trip)])
-    drawn = rng.integers(0, len(gains), (settings.resamples, len(gains)))
+    drawn = rng.integers(0, len(gains), (RESAMPLES, len(gains)))
     return float(np.mean(np.sum(gains[drawn], axis=1) > settings.size_cost))

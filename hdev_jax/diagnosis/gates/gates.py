@@ -18,7 +18,10 @@ from hdev_jax.diagnosis.scores.significance import least_clusters
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Chunk
 
-__all__ = ["DRAWN_GATES", "SCORE_GATES", "Asked", "alike", "first_rejection", "stability"]
+__all__ = ["DRAWN_GATES", "MOST_IN_CLASS", "RESAMPLES", "SCORE_GATES", "Asked", "alike", "first_rejection", "stability"]
+
+MOST_IN_CLASS = 2  # members of a class that are listed at most: contract, part 4
+RESAMPLES = 100  # sets of clusters: a share to ± 5 points
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ def _beyond_readings(a: Asked) -> Rejection | None:
         return None
     plain, columns = a.scores.plain, a.score.candidate.columns
     share = plain.gain(plain.totals(), columns)[0] / max(plain.misfit(), 1e-300)
-    least = a.scores.settings.beyond_readings
+    least = a.scores.settings.least_share
     return Rejection(Kind.READINGS, {"share": float(share), "least": least}) if share < least else None
 
 
@@ -174,7 +177,7 @@ def alike(
             more = evidence.gain(totals, both, before)[0] - rival
             beside = float(stats.chi2.sf(2 * max(more, 0.0), len(own.columns)))
         close = more < inexact**2 * gain and other.freedoms <= own.freedoms
-        if rival > settings.class_share * gain and (beside > settings.class_p or close):
+        if rival > settings.class_share * gain and (beside > settings.wald or close):
             found[other.id] = max(rival, found.get(other.id, -np.inf))
     return tuple(sorted(found, key=lambda id_: -found[id_]))
 
@@ -187,7 +190,7 @@ def stability(a: Asked) -> float:
     """
     scores, chosen = a.scores, a.score
     settings, g = scores.settings, scores.white.count
-    names = {chosen.candidate.id, *of_class(a)[: settings.most_in_class]}
+    names = {chosen.candidate.id, *of_class(a)[:MOST_IN_CLASS]}
     rivals = [
         s for s in scores.best.values()
         if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in {*scores.absorbed_by, *a.out}
@@ -196,7 +199,7 @@ def stability(a: Asked) -> float:
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
     small = [scores.evidence(s).only(s.candidate) for s in rivals]
     hits = 0
-    for _ in range(settings.resamples):
+    for _ in range(RESAMPLES):
         drawn = a.rng.integers(0, g, g)
         weight = np.bincount(drawn, minlength=g).astype(float)
         gains = []
@@ -207,7 +210,7 @@ def stability(a: Asked) -> float:
                 gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
             gains.append(scores.worth(replace(s, gain=gain)))
         hits += rivals[int(np.argmax(gains))].candidate.id in names and max(gains) > 0
-    return hits / settings.resamples
+    return hits / RESAMPLES
 
 
 def of_class(a: Asked, *, inexact: float | None = None) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
+from hdev_jax.diagnosis.gates.gates import MOST_IN_CLASS
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.remainder.remainder import Remainder
 from hdev_jax.diagnosis.result.hidden import Given, errors_by_knowledge, state_block
@@ -149,7 +150,7 @@ def summarise(
     clusters = cluster_rows(problem.segments.take(train))
     effects = [
         {
-            **_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count, settings.most_in_class),
+            **_effect_block(f, steps[-1], leeway[f.id], rmse[k], rmse[k + 1], clusters.count, MOST_IN_CLASS),
             "order": k + 1,
             **({"state": state_block(problem, split, given, f.id)} if given and f.id in given.ids else {}),
             **({"modes": mode_block(problem, steps[-1])} if f.id == ModeChange.id else {}),

@@ -44,7 +44,7 @@ def plausible(s: Score, settings: Settings) -> bool:
         first = c.parameter(c.sizes[0])
         size = abs(shapes[first.name] * s.beta[0])
         least = 0.05 * settings.switch_low if first.smooth else settings.switch_low
-        return bool(least <= s.beta[0] <= settings.switch_high and size >= first.least)
+        return bool(least <= s.beta[0] <= 1.0 / settings.switch_low and size >= first.least)
     each = [(c.parameter(n), b) for n, b in zip(c.sizes, s.beta, strict=True)]
     enough = any if None not in c.groups else all  # a gear may have nothing; a gain of 0 beside an offset is a load
     return all(p.lower <= p.null + b <= p.upper for p, b in each) and enough(abs(b) >= p.least for p, b in each)
