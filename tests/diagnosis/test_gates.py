@@ -97,7 +97,7 @@ def test_a_gain_that_placebos_reach_is_none(plain, log, scores):
     [
         ("absorbed", 1.1, Kind.ABSORBED), ("ahead", 1e9, Kind.NOT_CONFIRMED), ("fdr", 0.0, Kind.NOT_SIGNIFICANT),
         ("size_cost", 1e9, Kind.OUTSCORED), ("stands", 1e9, Kind.REFIT), ("stable", 1.1, Kind.UNSTABLE),
-        ("most_effects", 0, Kind.OUTSCORED), ("most_effects", 1, None),
+        ("fdr", 0.05, None),
     ],
 )  # fmt: skip
 def test_the_settings_decide(setting, value, kind, log):
