@@ -1,6 +1,7 @@
 """The HTML page: what the tables hold, put into the templates with the figures inside the file."""
 
 import base64
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.report import names, words
-from hdev_jax.report.canvas import png, style
+from hdev_jax.report.canvas import png, style, svg
 from hdev_jax.report.data import ReportData, metrics, same_model, test_rows, total_name, trip_lines
 from hdev_jax.report.figures import (
     before_after,
@@ -29,6 +30,7 @@ __all__ = ["write_calibration_report", "write_page", "write_report"]
 
 _TEMPLATES = Path(__file__).parent / "templates"
 CANDIDATES_SHOWN = 8
+_SERIES = ("before_after", "switching_loads", "drift_course")  # what one looks at closely
 _NO_UNEXPLAINED = {
     "significant": False,
     "share_of_test_variance": None,
@@ -55,7 +57,9 @@ def write_report(data: ReportData, directory: Path) -> None:
             "energy_by_effect": energy_by_effect(data),
             "trips": trip_errors(data),
         }
-        images = {name: png(fig) for name, fig in figures.items() if fig is not None}
+        drawn = {name: fig for name, fig in figures.items() if fig is not None}
+        images = {name: png(fig) for name, fig in drawn.items()}
+        lines = {name: svg(drawn[name]) for name in _SERIES if name in drawn}
     rows = test_rows(data)
     summary = data.summary
     context = {
@@ -80,7 +84,7 @@ def write_report(data: ReportData, directory: Path) -> None:
         "stages": _blocks(summary.get("stages", {})),
         "subsets": _blocks(summary.get("subsets", {})),
     }
-    write_page("diagnosis.html.j2", context, images, directory)
+    write_page("diagnosis.html.j2", context, images, directory, lines)
 
 
 def write_calibration_report(data: ReportData, directory: Path) -> None:
@@ -145,8 +149,15 @@ def _common(data: ReportData) -> dict[str, Any]:
     }
 
 
-def write_page(template: str, context: dict[str, Any], images: dict[str, bytes], directory: Path) -> None:
-    """`report.html` from a template with the images inside it, and `figures/*.png` beside it."""
+def write_page(
+    template: str,
+    context: dict[str, Any],
+    images: dict[str, bytes],
+    directory: Path,
+    lines: Mapping[str, bytes] | None = None,
+) -> None:
+    """`report.html` from a template with the images inside it, and `figures/*.png` beside it; in the page, those of
+    `lines` as SVG."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     env = Environment(
@@ -166,7 +177,10 @@ def write_page(template: str, context: dict[str, Any], images: dict[str, bytes],
         count=words.count,
         join=names.verbose_join,
     )
-    sources = {k: f"data:image/png;base64,{base64.b64encode(v).decode('ascii')}" for k, v in images.items()}
+    kinds = [("png", images), ("svg+xml", lines or {})]
+    sources = {
+        k: f"data:image/{x};base64,{base64.b64encode(v).decode('ascii')}" for x, all_ in kinds for k, v in all_.items()
+    }
     page = env.get_template(template).render(**context, figures=sources)
     folder = directory / "figures"
     folder.mkdir(parents=True, exist_ok=True)

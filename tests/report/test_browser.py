@@ -26,12 +26,17 @@ document.getElementById("f").onload = () => {{
   const first = d.querySelector("figure img"), zoom = d.getElementById("zoom");
   const figures = [...d.querySelectorAll("figure img")];
   first.click();
-  const opened = zoom.open && zoom.firstElementChild.alt === first.alt;
+  const opened = zoom.open && zoom.firstElementChild.alt === first.alt, image = zoom.firstElementChild;
+  const at = image.getBoundingClientRect(), wheel = {{deltaY: -400, clientX: 100, clientY: 100, cancelable: true}};
+  zoom.dispatchEvent(new WheelEvent("wheel", wheel));
+  const now = image.getBoundingClientRect(), by = now.width / at.width;
+  const stays = Math.abs(now.left - (100 - by * (100 - at.left)));
   zoom.click();
   document.getElementById("found").textContent = JSON.stringify({{
     width: wide.clientWidth, scroll: wide.scrollWidth,
     out: boxes.filter(e => e.getBoundingClientRect().right > wide.clientWidth + 1).map(e => e.outerHTML.slice(0, 80)),
-    zooms: opened && !zoom.open,
+    zooms: opened && !zoom.open, closer: by, stays: stays,
+    series: figures.filter(i => i.src.startsWith("data:image/svg")).length,
     unnamed: figures.filter(i => !i.alt || !i.complete || !i.naturalWidth).map(i => i.outerHTML.slice(0, 80)),
     figures: figures.length, heading: d.querySelector(".answer").textContent.trim(),
     background: getComputedStyle(d.body).backgroundColor, ink: getComputedStyle(d.body).color,
@@ -66,6 +71,9 @@ def test_nothing_overflows_and_no_error_is_logged(width, dark, report, tmp_path)
     assert found["unnamed"] == [], "a figure without a description, or one that does not load"
     assert found["figures"] >= 3
     assert found["zooms"], "a click enlarges a figure, another closes it"
+    assert found["closer"] == pytest.approx(2.718, rel=0.02), "the wheel zooms in"
+    assert found["stays"] < 2, "what is at the pointer stays there"
+    assert found["series"] >= 1, "time series are lines, sharp at any size"
     assert found["heading"].startswith("The declared model misses")
     assert "CONSOLE" not in done.stderr, done.stderr[-2000:]
     page_is, ink = (sum(map(int, re.findall(r"\d+", found[k])[:3])) for k in ("background", "ink"))

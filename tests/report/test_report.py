@@ -189,7 +189,7 @@ def written(data, directory, write=write_report) -> str:
     write(data, directory)
     text = (directory / "report.html").read_text(encoding="utf-8")
     page = Page(text)
-    assert all(link.startswith(("data:image/png;base64,", "#")) for link in page.fetched)
+    assert all(link.startswith(("data:image/png;base64,", "data:image/svg+xml;base64,", "#")) for link in page.fetched)
     assert page.tags.count("script") == 1, "the page's own, and none that a name brings"
     assert "link" not in page.tags
     bare = re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
