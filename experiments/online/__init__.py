@@ -1,0 +1,1 @@
+"""Estimates, forecasts and alarms while a vehicle drives, against synthetic truth."""
