@@ -9,15 +9,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.logs.adapter import Adapter
 from hdev_jax.logs.read import adapter_of
-from hdev_jax.online import Now, Watch, start
-from hdev_jax.online.live import Live, keep, kept
-from hdev_jax.online.stream import Arrived, Stream, channels_of, target_in
+from hdev_jax.online import Now
+from hdev_jax.online.followed import Followed, plain, plain_alarm
+from hdev_jax.online.live import keep, kept
+from hdev_jax.online.stream import Arrived
 from hdev_jax.verbs.live.lines import Records, batches, opened
 from hdev_jax.verbs.opening import Effects, Vehicles, known_effects, sheet_of
 from hdev_jax.verbs.predict import sheet_digest
@@ -74,105 +73,60 @@ class _Following:
         self, sheet: Sheet, rules: Adapter, target: str | None, file: str | Path | None, tell: Callable[[str], None],
         as_json: bool, watch: bool,
     ):  # fmt: skip
-        self.sheet, self.target, self.file, self.tell, self.as_json = sheet, target, file, tell, as_json
-        self.watching, self.live, self.watch = watch, None, None
-        self.notes: list[str] = []
-        self.alarm: str | None = None
+        self.file, self.tell, self.as_json, self.asked = file, tell, as_json, target
+        self.alarmed = False
         self.saved = time.monotonic()
         self.digest = sheet_digest(augmented_sheet(sheet, {}, {}))
-        self.numbers, self.stream = None, Stream(rules)
-        about: dict[str, Any] = {}
+        self.vehicle = Followed(sheet, rules, target, watch=watch)
+        self.vehicle.began = self._noted
         with contextlib.suppress(FileNotFoundError):
             if file is not None:
-                self.numbers, about = kept(file)
-        if about:
-            self._again(about, rules)
+                self._again(*kept(file), rules)
 
-    def _again(self, about: Mapping[str, Any], rules: Adapter) -> None:
+    def _again(self, numbers: Any, about: Mapping[str, Any], rules: Adapter) -> None:
         """Go on from the file of a state. Raises `InputError` where it is of another run."""
         try:
-            digest, watched, target, columns = (about[k] for k in ("sheet_sha256", "watch", "target", "columns"))
-            self.stream = Stream.again(about["stream"], rules)
-        except (KeyError, TypeError):
-            raise self._other("another version") from None
-        if digest != self.digest:
-            raise self._other("another sheet")
-        if watched != self.watching:
-            raise self._other("a run that watched other effects")
-        if self.target not in (None, target):
-            raise self._other(f"a run whose target is {target}")
-        self.target = target
-        self._begin(columns)
+            digest, watched, target = (about[k] for k in ("sheet_sha256", "watch", "target"))
+            if digest != self.digest:
+                raise self._other("another sheet")
+            if watched != self.vehicle.watching:
+                raise self._other("a run that watched other effects")
+            if self.asked not in (None, target):
+                raise self._other(f"a run whose target is {target}")
+            self.vehicle.again(about, numbers, rules)
+        except (KeyError, TypeError, ValueError) as e:
+            raise self._other("another version") from e
 
     def _other(self, what: str) -> InputError:
         return InputError(f"--state {self.file}: of {what}; name another file, or delete it")
 
-    def _begin(self, names: Iterable[str]) -> None:
-        """The state, once it is known which columns rows have."""
-        self.columns = sorted(names)
-        self.target = target_in(self.columns, self.target)
-        channels = channels_of(self.columns)
-        state, self.notes = start(self.sheet, channels, self.target)  # type: ignore[arg-type]
-        if self.watching:
-            self.watch = Watch.of(state, self.sheet.library)
-            state, _ = start(self.sheet, channels, self.target, candidates=self.watch.candidates)  # type: ignore[arg-type]
-        if "grade_rad" not in channels and state.vehicle.entry == "road":
-            self.notes.append("the rows have no slope (grade_rad): the road is taken as level")
-        self.live = Live(state)
-        if self.numbers is not None:
-            try:
-                self.live.numbers = self.numbers
-            except ValueError:
-                raise self._other("another version") from None
+    def _noted(self) -> None:
         if not self.as_json:
-            for note in self.notes:
+            for note in self.vehicle.notes:
                 self.tell(f"note: {note}")
 
     def take(self, records: list[Mapping[str, Any] | None]) -> None:
         """Some rows by header, in order; None for one that does not read."""
-        self.stream.unreadable += sum(r is None for r in records)
-        self._use(self.stream.intervals(self._seen(self.stream.read([r for r in records if r is not None]))))
+        self._use(self.vehicle.take(records))
         if self.file is not None and time.monotonic() - self.saved > SAVED_S:
             self._save()
 
-    def _seen(self, rows: list[tuple[str, dict[str, float]]]) -> Iterator[tuple[str, dict[str, float]]]:
-        for trip, row in rows:
-            if self.live is None:
-                self._begin(row)
-            yield trip, row
-
-    def _use(self, rows: Iterable[tuple[int, dict[str, float]]]) -> None:
-        found = list(rows)
-        if self.live is None or not found:
-            return
-        form = self.live.state.form
-        arrived = [Arrived.of(form, self.stream.trips[n - 1], n, row) for n, row in found]
-        each = [None] * len(arrived)
-        if self.watch is not None:
-            each = list(self.watch.columns(np.stack([a.vector for a in arrived])))
-        for a, candidates in zip(arrived, each, strict=True):
-            now = self.live(a.vector, candidates)
-            self.tell(self._told(form, a, now))
-            if now.alarm and self.alarm is None and self.watch is not None:
-                self._alarmed()
-
-    def _alarmed(self) -> None:
-        assert self.live is not None
-        assert self.watch is not None
-        if (found := self.watch.alarm(self.live.state)) is not None:
-            self.alarm = found.line()
-            plain = {k: _number(v) if isinstance(v, float) else v for k, v in vars(found).items()}
-            self.tell(json_.dumps({"alarm": plain}) if self.as_json else f"ALARM {self.alarm}")
+    def _use(self, rows: Iterable[tuple[Arrived, Now]]) -> None:
+        for a, now in rows:
+            self.tell(self._told(self.vehicle.form, a, now))
+            if now.alarm and not self.alarmed and (found := self.vehicle.alarm()) is not None:
+                self.alarmed = True
+                self.tell(json_.dumps({"alarm": plain_alarm(found)}) if self.as_json else f"ALARM {found.line()}")
 
     def _told(self, form: Any, a: Arrived, now: Now) -> str:
         by = dict(zip(form.columns, a.vector, strict=True))
         if self.as_json:
             told = ("predicted", "lower", "upper", "model", "energy_wh", "weight")
-            plain = {k: _number(getattr(now, k)) for k in told}
-            values = {n: [_number(v), _number(s)] for n, v, s in zip(form.names, now.values, now.sd, strict=True)}
+            own = {k: plain(getattr(now, k)) for k in told}
+            values = {n: [plain(v), plain(s)] for n, v, s in zip(form.names, now.values, now.sd, strict=True)}
             return json_.dumps(
-                {"trip_id": a.trip, "time_s": _number(by["time_s"]), "measured": _number(by["measured"]), **plain,
-                 "sigma": _number(now.sigma), "values": values}
+                {"trip_id": a.trip, "time_s": plain(by["time_s"]), "measured": plain(by["measured"]), **own,
+                 "sigma": plain(now.sigma), "values": values}
             )  # fmt: skip
         each = zip(form.names, now.values, now.sd, strict=True)
         values = "  ".join(f"{n} {float(v):.4g} ± {float(s):.2g}" for n, v, s in each)
@@ -182,40 +136,32 @@ class _Following:
         )
 
     def _save(self) -> None:
-        if self.live is not None and self.file is not None:
-            about = {"sheet_sha256": self.digest, "columns": self.columns, "watch": self.watching,
-                     "target": self.target, "stream": self.stream.about()}  # fmt: skip
-            keep(self.file, self.live, about)
+        if self.vehicle.live is not None and self.file is not None:
+            keep(self.file, self.vehicle.live, {"sheet_sha256": self.digest, **self.vehicle.about()})
             self.saved = time.monotonic()
 
     def end(self) -> None:
         """The last row, where nothing goes on from here; else the file."""
         if self.file is None:
-            self._use(self.stream.flush())
+            self._use(self.vehicle.end())
         self._save()
 
     def summary(self) -> str:
         """What is known at the end."""
-        if self.live is None:
+        if self.vehicle.live is None:
             raise InputError("standard input: no rows; a header and rows of CSV, or JSON lines, are expected")
-        state = self.live.state
+        state = self.vehicle.live.state
         lines = [
             f"{name:32s} {float(v):12.6g} ± {float(s):.3g}"
             for name, v, s in zip(state.form.names, state.values, state.sd, strict=True)
         ]
-        counted = state.counted() | {"repeated": self.stream.repeated, "unreadable": self.stream.unreadable}
-        lines.append(", ".join(f"{n} {name}" for name, n in counted.items() if n))
+        lines.append(", ".join(f"{n} {name}" for name, n in self.vehicle.counted().items()))
         lines.append(
             f"noise of a row {float(state.sigma):.4g} {state.form.unit}, correlation {float(state.memory):.2f}"
         )
-        if self.watch is not None and (found := self.watch.alarm(state)) is not None:
+        if (found := self.vehicle.alarm()) is not None:
             lines.append(f"ALARM {found.line()}")
         return "\n".join(lines)
-
-
-def _number(x: Any) -> float | None:
-    value = float(x)
-    return value if np.isfinite(value) else None
 
 
 @contextlib.contextmanager
