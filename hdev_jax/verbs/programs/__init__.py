@@ -1,0 +1,1 @@
+"""Verbs that write a vehicle for other programs."""
