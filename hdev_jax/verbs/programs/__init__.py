@@ -1,1 +1,3 @@
-"""Verbs that write a vehicle for other programs."""
+"""The verbs that write a vehicle for other programs: export."""
+
+__all__ = []
