@@ -69,7 +69,8 @@ class Sums(eqx.Module):
 class State(eqx.Module):
     """What is known after the rows so far. A leading axis where it is of several vehicles (`stacked`).
 
-    **Fields:** `vehicle` at its tabular values; `gears`, the trees that tell its gear where rows have none. `centre` those values of the free coefficients and `scale` their sds:
+    **Fields:** `vehicle` at its tabular values; `gears`, the trees that tell its gear where rows have none. `centre`
+    those values of the free coefficients and `scale` their sds:
     estimates are steps from the centre in units of the scale, followed by the levels of the trip (kW and 100 N, or the
     target's unit). `drift`: sd [scale] by which each wanders in an hour. `noise`: of a row where it is declared.
     For each member, a model of the noise: `sums` over rows; `mean` and `covariance` of the posterior, `variance` of a

@@ -36,8 +36,8 @@ class Sheet:
     beside which an efficiency map is looked for.
 
     **Fields:** `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`); `gear_ratios` count
-    from the first gear; `map_path` is where `efficiency_map` came from, `gear_model` a file of trees that tell the gear. **Raises:** `InputError`, one line with key,
-    what was found and what is accepted.
+    from the first gear; `map_path` is where `efficiency_map` came from, `gear_model` a file of gear trees.
+    **Raises:** `InputError`, one line with key, what was found and what is accepted.
     """
 
     def __init__(
