@@ -97,7 +97,7 @@ def page(m: dict[str, Any]) -> str:
     lines = [
         "# The gear's trees: time", "",
         f"Made by `{command}`: the models of two rows of the [gear table](fig5.md), each in several predictors, one "
-        f"thread, load of the machine before it {m['load']:.1f}. Accuracies are of routes that were not trained on.", "",
+        f"thread, load of the machine before it {m['load']:.1f}. Accuracies are of routes not trained on.", "",
     ]  # fmt: skip
     for name, part in m["models"].items():
         sizes = [str(n) for n in (*BATCHES, m["rows"])]
@@ -114,11 +114,11 @@ def page(m: dict[str, Any]) -> str:
             )
         lines += ["", verdict(part["predictors"], sizes), ""]
     lines += [
-        f"A call from Python of a compiled JAX function that does nothing takes {m['empty_call_us']:.1f} µs here, which a "
-        "C function does not. Beyond that lleaves has two things that arrays within jit do not: thresholds and leaves "
-        "are constants of its machine code, and a row walks down one path of a tree of any shape, where ours asks every "
-        "node. Oblivious trees have no path to save, so there ours leads, and the table's best model is of these; no "
-        "compiler reads CatBoost's file. On board the trees are a part of the one program that updates the "
+        f"A call from Python of a compiled JAX function that does nothing takes {m['empty_call_us']:.1f} µs here. "
+        "Beyond that lleaves has two things that arrays within jit do not: thresholds and leaves are constants of its "
+        "machine code, and a row walks down one path of a tree of any shape, where ours asks every node. Oblivious trees "
+        "have no path to save: there ours leads, and the table's best model is of these; no compiler here reads "
+        "CatBoost's file. On board the trees are a part of the one program that updates the "
         "[estimates](online.md), in which no call is paid again and the gear's probabilities stay in JAX.", "",
     ]  # fmt: skip
     return "\n".join(lines)
@@ -131,8 +131,8 @@ def verdict(predictors: dict[str, Any], sizes: list[str]) -> str:
     best = {n: min(others, key=lambda k, n=n: others[k][n]) for n in (sizes[0], sizes[-1])}
     one, many = (others[best[n]][n] / mine[n] for n in (sizes[0], sizes[-1]))
     return (
-        f"For {int(sizes[-1]):,} rows ours takes {1 / many:.2f} times as long as the best other, {best[sizes[-1]]}; for "
-        f"one row {1 / one:.2f} times as long as {best[sizes[0]]} (target: below 1, and at most {WITHIN:g})."
+        f"For {int(sizes[-1]):,} rows ours takes {1 / many:.2f} times as long as the best other, {best[sizes[-1]]}; "
+        f"for one row {1 / one:.2f} times as long as {best[sizes[0]]} (target: below 1, and at most {WITHIN:g})."
     )
 
 
