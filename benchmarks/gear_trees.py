@@ -116,8 +116,8 @@ def page(m: dict[str, Any]) -> str:
     lines += [
         f"A call from Python of a compiled JAX function that does nothing takes {m['empty_call_us']:.1f} µs here. "
         "Beyond that lleaves has two things that arrays within jit do not: thresholds and leaves are constants of its "
-        "machine code, and a row walks down one path of a tree of any shape, where ours asks every node. Oblivious trees "
-        "have no path to save: there ours leads, and the table's best model is of these; no compiler here reads "
+        "machine code, and a row walks down one path of a tree of any shape, where ours asks every node. Oblivious "
+        "trees have no path to save: there ours leads, and the table's best model is of these; no compiler here reads "
         "CatBoost's file. On board the trees are a part of the one program that updates the "
         "[estimates](online.md), in which no call is paid again and the gear's probabilities stay in JAX.", "",
     ]  # fmt: skip

@@ -151,11 +151,11 @@ def test_driving_tells_the_force_within_its_interval():
     assert any("driveline.efficiency is held" in note for note in load.notes)
 
 
-def test_numbers_without_an_sd_are_opened_and_it_is_said():
+def test_what_a_table_says_of_the_load_is_opened_and_it_is_said():
     opened, notes = open_sheet(sheet_of_sections({**SHEET, "road": {"c_rr": 0.006, "cda_m2": (5.6, 0.5)}}), 20e3)
     assert opened.declared["road.c_rr"].sd == pytest.approx(0.003)
-    assert opened.declared["road.cda_m2"].sd == 0.5
-    assert any("road.c_rr of the sheet has no sd" in note for note in notes)
+    assert opened.declared["road.cda_m2"].sd == pytest.approx(2.8)
+    assert any("road.c_rr is estimated from this log, as 0.006 ± 0.003" in note for note in notes)
     assert opened.declared["battery.auxiliary_w"].sd > 0
     with pytest.raises(InputError, match=r"road.cda_m2 is missing"):
         open_sheet(sheet_of_sections({**SHEET, "road": {"c_rr": 0.006}}), 20e3)
