@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.init import init
     from hdev_jax.verbs.live.follow import follow
     from hdev_jax.verbs.predict import predict
+    from hdev_jax.verbs.programs.export import export
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
     from hdev_jax.verbs.simulate import simulate
 
@@ -41,6 +42,7 @@ __all__ = [
     "compare",
     "diagnose",
     "effects",
+    "export",
     "follow",
     "init",
     "ledger",
@@ -68,6 +70,7 @@ _HOME = {
     "check": "hdev_jax.verbs.check",
     "diagnose": "hdev_jax.verbs.diagnose",
     "effects": "hdev_jax.verbs.effects",
+    "export": "hdev_jax.verbs.programs.export",
     "follow": "hdev_jax.verbs.live.follow",
     "init": "hdev_jax.verbs.init",
     "compare": "hdev_jax.verbs.energy.compare",

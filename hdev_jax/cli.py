@@ -34,12 +34,14 @@ from hdev_jax.options.common import (
     target_option,
 )
 from hdev_jax.options.energy import ENERGY_VERBS, energy_parsers
+from hdev_jax.options.export import export_parser
 
 __all__ = ["FOLDERS", "main", "parser"]
 
 FOLDERS = {
     **dict.fromkeys(ENERGY_VERBS, "energy."),
     "follow": "live.",
+    "export": "programs.",
 }  # within `verbs`
 
 _ABOUT = """\
@@ -231,6 +233,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--seed", type=count, default=3, metavar="N", help="random seed of the log (default: 3)")
 
     energy_parsers(verbs)
+    export_parser(verbs)
 
     verbs.add_parser(
         "effects",

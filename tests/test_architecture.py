@@ -25,7 +25,7 @@ LAYERS = [
     {"logs", "physics"},
     {"inference", "learn", "fleet"},
     {"problem"},
-    {"diagnosis", "energy"},
+    {"diagnosis", "energy", "export"},
     {"online", "report"},
     {"options", "verbs"},
     {"cli", "experiments"},

@@ -21,7 +21,7 @@ import numpy as np
 from experiments.simulators.drives import Drive
 from experiments.simulators.vehicles import Simulated, Vehicle, headwind_force_n, slope_with_force
 
-__all__ = ["VEHICLES", "drives", "simulate"]
+__all__ = ["VEHICLES", "drives", "run_tool", "simulate"]
 
 VEHICLES = {
     "car": lambda: Vehicle("car", "sumo", 1830.0, 0.010, 0.69, 40.0, 250.0, 0.32, 0.88, 0.85, top_mps=33.0),
@@ -43,7 +43,7 @@ _STEPS = 10  # of the energy model in a second
 _APART_S = 60  # between departures of the observed trips
 
 
-def _run(tool: str, *arguments: str, folder: Path) -> None:
+def run_tool(tool: str, *arguments: str, folder: Path) -> None:
     """One of SUMO's programs. Raises `RuntimeError` with what it said."""
     home = Path(import_module("sumo").SUMO_HOME)  # by name: it is in an extra of its own
     environment = {**os.environ, "SUMO_HOME": str(home)}
@@ -59,14 +59,14 @@ def drives(vehicle: Vehicle, rng: np.random.Generator, trips: int, seconds: floa
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         seed = int(rng.integers(1, 2**31 - 1))
-        _run(
+        run_tool(
             "netgenerate", "--grid", f"--grid.number={_GRID}", f"--grid.length={_STREET_M}", "--seed", str(seed),
             f"--default.speed={_LIMIT_MPS}", f"--perturb-z=norm(0,{_HILL_M})", "--perturb-x=norm(0,150)",
             "--perturb-y=norm(0,150)", "--default-junction-type=traffic_light", "--default.lanenumber=2",
             "-o", "net.xml", folder=folder,
         )  # fmt: skip
         _write_routes(folder, vehicle, rng, trips, seconds)
-        _run(
+        run_tool(
             "sumo", "-n", "net.xml", "-r", "routes.xml", "--seed", str(seed), "--no-step-log", "--no-warnings",
             "--time-to-teleport", "300", "--step-method.ballistic",
             "--fcd-output", "fcd.xml", "--fcd-output.attributes", "speed,slope",
@@ -169,7 +169,7 @@ def _power_w(vehicle: Vehicle, start: np.ndarray, end: np.ndarray, slope_rad: np
         rows = zip(end, end - start, np.degrees(slope_rad), strict=True)
         text = "".join(f"{t};{v:.9f};{a:.9f};{s:.9f}\n" for t, (v, a, s) in enumerate(rows))
         (folder / "drive.csv").write_text(text, encoding="utf-8")
-        _run(
+        run_tool(
             "emissionsDrivingCycle", "-t", "drive.csv", "-e", "Energy/unknown", "--additional-files", "type.xml",
             "--vtype", "own", "--have-slope", "--precision", "9", "-o", "power.csv", folder=folder,
         )  # fmt: skip

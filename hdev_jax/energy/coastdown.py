@@ -34,6 +34,8 @@ __all__ = ["coast_down", "directions_of", "is_coast_down"]
 
 LEAST_MPS = 15.0 / 3.6  # below, the last brakes and gears count: where coast-downs end (SAE J1263)
 LEAST_ROWS = 8  # of a run
+# A run that gains more speed than this, slopes taken off, is driven: speeds read to 0.2 m/s at worst jump by less
+GAIN_MPS = 1.0
 K0_PER_K, REFERENCE_C = 8.6e-3, 20.0  # UN GTR 15, annex 4, 4.5.3: rolling resistance with temperature
 T, X, Q, Y, N = range(5)
 WIND = ("wind_speed_mps", "wind_from_rad", "heading_rad")
@@ -61,9 +63,18 @@ def coast_down(log: Log, mass_kg: float, rotating: float, *, level: float = LEVE
     """A, B, C of a coast-down log, each trip a run; intervals by Student's t, errors of a run being correlated.
 
     **Arguments:** `mass_kg` where the log has no mass; `rotating`, the factor for what turns (SAE J1263: 1.03 where it
-    is not known). **Raises:** `InputError` for fewer than two runs, or speeds that do not tell A, B and C apart.
+    is not known). **Raises:** `InputError` for fewer than two runs, for one that something drives, or speeds that do
+    not tell A, B and C apart.
     """
     s = log.segments
+    for k, r in trip_slices(np.asarray(s.trip)):
+        gain = _gained(s.take(np.arange(r.start, r.stop)), rotating)
+        if gain > GAIN_MPS:
+            raise InputError(
+                f"trip '{log.trip_names[k]}' is no coast-down: it gains {gain:.1f} m/s"
+                f"{' beyond what the slope gives' if s.has('grade_rad') else ''}; coast in neutral from speed, or give "
+                "a log that measures energy_wh, battery_power_w (_kw), motor_torque_nm or traction_force_n"
+            )
     signs, how = directions_of(s)
     blocks = [_run(s.take(np.arange(r.start, r.stop)), mass_kg, rotating)
               for _, r in trip_slices(np.asarray(s.trip))]  # fmt: skip
@@ -153,6 +164,20 @@ def _estimate(runs: _Runs, *, by_wind: bool) -> tuple[Float[np.ndarray, " 3"], f
     noise = np.maximum(leftover.sum(), 0.0) / max(float(g[:, N, N].sum()) - 2 * len(s) - 3, 1.0) / xx
     square = max(float(np.mean((slopes - b) ** 2 - noise)), 0.0) / (4.0 * c**2)  # of the wind
     return np.array([a - c * square, b, c]), float(np.sqrt(square))
+
+
+def _gained(s: Segments, rotating: float) -> float:
+    """The most speed that a run gains from any moment on, with what slopes give taken off [m/s].
+
+    λ·dv/dt + g·sin θ = −(what holds the vehicle back)/m, which is never above 0 while it coasts.
+    """
+    s = s.take(np.asarray(s.speed_mps) >= LEAST_MPS)
+    if len(s) < LEAST_ROWS:
+        return 0.0
+    climb = np.sin(np.asarray(s.get("grade_rad", np.zeros(len(s)))))
+    t, v = np.asarray(s.time_s) + 0.5 * np.asarray(s.duration_s), np.asarray(s.speed_mps)
+    level = v + GRAVITY_MPS2 / rotating * cumulative_trapezoid(climb, t, initial=0.0)
+    return float(np.max(level - np.minimum.accumulate(level)))
 
 
 def _run(s: Segments, mass_kg: float, rotating: float) -> Float[np.ndarray, "5 5"] | None:

@@ -9,7 +9,7 @@ from hdev_jax.energy.fitted import Fitted, interval
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
 from hdev_jax.errors import InputError
 
-__all__ = ["compare_sheets", "compare_trips"]
+__all__ = ["alike", "compare_sheets", "compare_trips"]
 
 COLUMNS = ["cause", "a", "b", "difference", "lower", "upper"]
 
@@ -39,14 +39,19 @@ def compare_trips(fitted: Fitted, a: tuple[int, ...], b: tuple[int, ...], *, see
 def compare_sheets(a: Fitted, b: Fitted, *, seed: int = 0) -> pd.DataFrame:
     """Energy of one log by cause, by two vehicles [kWh/100 km], b less a with its 90 % interval.
 
-    What was measured is the same, so that the differences of all causes and of what is unexplained add up to 0. The
-    coefficients of the two are drawn independently.
+    What was measured is the same, so that the differences of all causes and of what is unexplained add up to 0.
+    Coefficients that both know alike (`alike`) are one and the same: they have the same draws, so that a sheet beside
+    itself differs by exactly 0. The others are drawn independently.
     """
     log = a.problem.log
     km = float(np.sum(np.asarray(log.segments.distance_m))) / 1e3
     if not km > 0:
         raise InputError("the log never moves; a log of driving is expected")
-    one, two = by_cause(a, a.draws(seed)), by_cause(b, b.draws(seed + 1))
+    first, second = a.draws(seed), b.draws(seed + 1)
+    if len(first) == len(second):
+        for i, k in alike(a, b):
+            second[:, k] = first[:, i]
+    one, two = by_cause(a, first), by_cause(b, second)
     causes = tuple(dict.fromkeys((*one.causes, *two.causes)))
     many = max(len(one.drawn), len(two.drawn))  # a vehicle that is known has but one draw
     value, drawn = [], []
@@ -59,6 +64,20 @@ def compare_sheets(a: Fitted, b: Fitted, *, seed: int = 0) -> pd.DataFrame:
     both = ByCause(causes, np.stack(value), np.stack(drawn, axis=1))
     table = _table(both, measured, np.zeros((many, 2)))
     return table if log.measured else pd.DataFrame(table[:-2])
+
+
+def alike(a: Fitted, b: Fitted) -> list[tuple[int, int]]:
+    """Places in both of the coefficients that are known alike: same name, value and variance, and correlated with none
+    that differ."""
+    names = [c.name for c in b.problem.table.free]
+    both = [(i, names.index(c.name)) for i, c in enumerate(a.problem.table.free) if c.name in names]
+    same = [(i, k) for i, k in both if a.values[i] == b.values[k] and a.covariance[i, i] == b.covariance[k, k]]
+    if not same or a.freedom != b.freedom:
+        return []
+    i, k = (np.array(x) for x in zip(*same, strict=True))
+    equal = np.array_equal(a.covariance[np.ix_(i, i)], b.covariance[np.ix_(k, k)])
+    apart = all(not np.any(np.delete(f.covariance[at], at, axis=1)) for f, at in ((a, i), (b, k)))
+    return same if equal and apart else []
 
 
 def _table(parts: ByCause, measured: np.ndarray, wobble: np.ndarray) -> pd.DataFrame:

@@ -17,7 +17,7 @@ from hdev_jax.inference.sheet import Sheet
 from hdev_jax.inference.sheet.schema import Declared
 from hdev_jax.physics import Vehicle, unavailable
 from hdev_jax.physics.loads import HvacPower
-from hdev_jax.physics.road import AirDensity, Headwind
+from hdev_jax.physics.road import AirDensity, Crosswind, Headwind
 from hdev_jax.physics.tyres import REFERENCE_TEMP_C, RollingLinear, RollingTemperature
 from hdev_jax.problem import Problem
 from hdev_jax.segments import Segments
@@ -32,9 +32,10 @@ SHOWN_KMH = (50.0, 80.0)
 B_SHARE = 0.2  # of A that B·v is expected to be at most, at 20 m/s (f₁ of UN GTR 15's default loads is 0)
 TOGETHER, UNSAID = 0.95, 0.9  # correlation; sd over the table's: beyond these it is said
 # effect, its parameter, value and sd: the physics as it is, give or take what a weather station is off by; of rolling
-# resistance K₀ = 8.6·10⁻³/K of c_rr (UN GTR 15, annex 4)
+# resistance K₀ = 8.6·10⁻³/K of c_rr (UN GTR 15, annex 4); drag against yaw as the effect has it (SAE J1252)
 WEATHER = (
     (Headwind, "scale", 1.0, 0.5),
+    (Crosswind, "drag_per_rad2", 2.0, 1.5),
     (AirDensity, "scale", 1.0, 0.1),
     (RollingTemperature, "per_k", -8.6e-3, 4e-3),
 )
@@ -87,10 +88,10 @@ def driven_range(segments: Segments) -> tuple[float, float]:
 def open_sheet(
     sheet: Sheet, mass_kg: float, segments: Segments | None = None, *, battery: bool = True
 ) -> tuple[Sheet, list[str]]:
-    """The sheet with c_rr, C_d·A and B estimated: a number without an sd, or one that came from a log, gets a wide one.
+    """The sheet with c_rr, C_d·A and B estimated from the log: half of the value is its sd, unless the sheet's is wider.
 
     Weather that the log (`segments`) has, and the sheet no effect for, is corrected as a coast-down's would be: wind
-    along the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is what is
+    along and across the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is what is
     measured, loads that would pass for a force are estimated too: the auxiliary one, heating and cooling.
 
     **Raises:** `InputError` for a sheet without `road.c_rr` or `road.cda_m2`.
@@ -103,9 +104,11 @@ def open_sheet(
         d = declared[path]
         if d.groups or d.per_vehicle:
             raise InputError(f"sheet {sheet.path}: {path} is per vehicle; the sheet of one vehicle is expected")
-        if d.sd is None:
-            declared[path] = replace(d, sd=WIDE * max(abs(d.value), 1e-4))
-            notes.append(f"{path} of the sheet has no sd: it is estimated from this log alone, from {d.value:g} on")
+        # a table is for vehicles of the kind; what is asked for is this one's, and tables are off by more than they say
+        wide = WIDE * max(abs(d.value), 1e-4)
+        if d.sd is None or d.sd < wide:
+            declared[path] = replace(d, sd=wide)
+            notes.append(f"{path} is estimated from this log, as {d.value:g} ± {wide:.2g} before it")
     if not {"road.b_n_per_mps", f"effects.{RollingLinear.id}.n_per_mps"} & {*declared}:
         sd = B_SHARE * declared["road.c_rr"].value * mass_kg * GRAVITY_MPS2 / 20.0
         declared["road.b_n_per_mps"] = Declared(0.0, sd)

@@ -80,8 +80,9 @@ class Live:
 def _changes(state: State) -> Any:
     """Which leaves a row changes."""
     constant = jax.tree.map(lambda _: True, state)
-    where = lambda s: (s.vehicle, s.centre, s.scale, s.drift, s.noise)  # noqa: E731
-    return eqx.tree_at(where, constant, replace_fn=lambda leaf: jax.tree.map(lambda _: False, leaf))
+    where = lambda s: (s.vehicle, s.centre, s.scale, s.drift, s.noise, s.gears)  # noqa: E731
+    none = lambda x: x is None  # noqa: E731
+    return eqx.tree_at(where, constant, replace_fn=lambda leaf: jax.tree.map(lambda _: False, leaf), is_leaf=none)
 
 
 def keep(path: str | Path, live: Live, about: dict[str, Any]) -> None:

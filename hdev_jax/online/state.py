@@ -17,7 +17,9 @@ from jaxtyping import Array, Float
 from hdev_jax.errors import InputError
 from hdev_jax.inference.calibrate import tabular
 from hdev_jax.inference.sheet import Sheet, build, choose_entry
+from hdev_jax.learn.gears.gears import Surrogate
 from hdev_jax.online.form import LASTING_S, MEMORIES, Form
+from hdev_jax.online.gears import gears_of, untold
 from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TARGETS, TargetName
@@ -67,7 +69,8 @@ class Sums(eqx.Module):
 class State(eqx.Module):
     """What is known after the rows so far. A leading axis where it is of several vehicles (`stacked`).
 
-    **Fields:** `vehicle` at its tabular values. `centre` those values of the free coefficients and `scale` their sds:
+    **Fields:** `vehicle` at its tabular values; `gears`, the trees that tell its gear where rows have none. `centre`
+    those values of the free coefficients and `scale` their sds:
     estimates are steps from the centre in units of the scale, followed by the levels of the trip (kW and 100 N, or the
     target's unit). `drift`: sd [scale] by which each wanders in an hour. `noise`: of a row where it is declared.
     For each member, a model of the noise: `sums` over rows; `mean` and `covariance` of the posterior, `variance` of a
@@ -108,6 +111,7 @@ class State(eqx.Module):
     lowest: Float[Array, "*car candidate"]
     lowest_at: Float[Array, "*car candidate"]
     alarm_at: Float[Array, "*car effect"]
+    gears: Surrogate | None = None
 
     @property
     def weights(self) -> Float[Array, " member"]:
@@ -197,6 +201,7 @@ def start(
     level: float = 0.9,
     candidates: Iterable[str] = (),
     alpha: float = 0.01,
+    gears: Surrogate | None = None,
 ) -> tuple[State, list[str]]:
     """The state before the first row, from the sheet's tabular priors; and notes on what of the sheet is not used.
 
@@ -207,7 +212,8 @@ def start(
     error with the one before, and times for which levels last, that are weighed by their likelihood. `robust`: errors
     are Student t of 4 degrees of freedom. `noise` of a row, where it is known [target's unit]. `level`,
     probability inside intervals. `candidates`, the effect of each candidate that is watched (`Watch`), and `alpha`, the
-    probability that any of them is ever named where there is none.
+    probability that any of them is ever named where there is none. `gears`: what tells the gear where the sheet's
+    efficiency is a map over several and rows have none (default: the trees of the sheet's `driveline.gear_model`).
 
     **Raises:** `InputError` where the sheet lacks what is in use, or nothing in it is to be estimated.
     """
@@ -216,6 +222,15 @@ def start(
     across = [e.id for e in built.vehicle.effects if e.acts_across_rows()]
     table, vehicle = built.table, built.vehicle
     notes = [n for n in built.notes if "efficiency map" not in n or "gear" in n]
+    if not untold(sheet, sample, vehicle):
+        gears = None
+    elif gears is None:
+        gears = gears_of(sheet)
+    if gears is not None:
+        notes = [n for n in notes if "no column 'gear'" not in n]
+        notes.append(
+            "the rows have no column 'gear': each is predicted in the gears that the trees say, by probability"
+        )
     for effect_id in across:
         table, vehicle = table.minus(effect_id), vehicle.minus(effect_id)
         notes.append(f"effect {effect_id} of the sheet is skipped: it acts across rows, which come one by one here")
@@ -250,7 +265,7 @@ def start(
         evidence=jnp.zeros(m), before=jnp.zeros(size + 1), candidate=jnp.zeros(c), since=real(np.inf), last=real(last),
         counts=jnp.zeros(len(form.counts)), totals=jnp.zeros(2 + size - k), level_squares=jnp.zeros(size - k),
         driven_s=zero, cost_wh=jnp.zeros(c), lowest=jnp.zeros(c), lowest_at=jnp.zeros(c),
-        alarm_at=jnp.zeros(len(form.effects)),
+        alarm_at=jnp.zeros(len(form.effects)), gears=gears,
     ), notes  # fmt: skip
 
 

@@ -69,6 +69,8 @@ def expected(state: State, step: Float[Array, " size"], row: Float[Array, " colu
     edge = EDGE * jnp.where(bounded, jnp.where(bounded, upper - lower, 1.0), state.scale)
     theta = jnp.clip(state.centre + state.scale * step[:k], lower + edge, upper - edge)
     segments = one_row(form, row)
+    if state.gears is not None:  # their probabilities have no slope by the coefficients
+        segments = state.gears(insert(state.vehicle, form.structure, theta), segments)
 
     def predict(delta: Array) -> tuple[Array, Array]:
         y = insert(state.vehicle, form.structure, theta + state.scale * delta).predict(segments, form.target)[0]

@@ -16,6 +16,10 @@ __all__ = ["ENERGY_VERBS", "energy_parsers"]
 ENERGY_VERBS = ("ledger", "roadload", "whatif", "saved", "compare")
 
 
+def _trust(verb: Any) -> None:
+    verb.add_argument("--trust", action="store_true", help="answer even where a unit or a sign is suspected")
+
+
 def energy_parsers(verbs: Any) -> None:
     """Add a parser for each verb to the subparsers `verbs`."""
     ledger = verbs.add_parser(
@@ -31,6 +35,7 @@ def energy_parsers(verbs: Any) -> None:
     logs_and_sheet(ledger)
     target_option(ledger)
     effects_option(ledger)
+    _trust(ledger)
     ledger.add_argument("--price", type=float, metavar="P", help="price of a kWh, in any currency")
     out_options(ledger)
 
@@ -66,6 +71,7 @@ def energy_parsers(verbs: Any) -> None:
     whatif.add_argument("--set", dest="changes", action="append", required=True, metavar="KEY=VALUE", help="one change")
     target_option(whatif)
     effects_option(whatif)
+    _trust(whatif)
     out_options(whatif)
 
     saved = verbs.add_parser(
@@ -84,6 +90,7 @@ def energy_parsers(verbs: Any) -> None:
     saved.add_argument("--after", required=True, metavar="C..D", help=f"trips after the change: {words}")
     target_option(saved)
     effects_option(saved)
+    _trust(saved)
     out_options(saved)
 
     compare = verbs.add_parser(
@@ -101,4 +108,5 @@ def energy_parsers(verbs: Any) -> None:
     file_argument(compare, "--vehicle", "V.toml", "the vehicle sheet, where trips or vehicles are compared")
     target_option(compare)
     effects_option(compare)
+    _trust(compare)
     out_options(compare)

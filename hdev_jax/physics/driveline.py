@@ -72,7 +72,8 @@ class EfficiencyMap(eqx.Module):
 
 def _cell(axis: Any, x: Any) -> tuple[Any, Any, Any]:
     """The cell of `axis` that holds x, the place inside it, 0 to 1, and its length."""
-    i = jnp.clip(jnp.searchsorted(axis, x, side="right") - 1, 0, axis.shape[0] - 2)
+    # counted, not searched: a grid is short, and every format that a vehicle is exported to can count
+    i = jnp.clip(jnp.sum(axis <= x) - 1, 0, axis.shape[0] - 2)
     length = axis[i + 1] - axis[i]
     # clamped before it is divided: a clip of the place to 0..1 would halve the slope at every node
     return i, (jnp.clip(x, axis[0], axis[-1]) - axis[i]) / length, length

@@ -311,3 +311,7 @@ def test_two_sheets_differ_where_they_differ(fitted):
     assert set(moved) == {"aero", "driveline", UNEXPLAINED}
     np.testing.assert_allclose(table["difference"].drop(TOTAL).sum(), 0.0, atol=1e-9)
     assert table.loc["aero", "b"] / table.loc["aero", "a"] == pytest.approx(6.6 / 5.6)
+    assert table.loc["rolling", "lower"] == table.loc["rolling", "upper"] == 0.0, "what both know alike is the same"
+    assert table.loc["aero", "lower"] < table.loc["aero", "difference"] < table.loc["aero", "upper"]
+    itself = compare_sheets(sheets[0], sheets[0])[["difference", "lower", "upper"]]
+    assert np.all(itself == 0.0)

@@ -95,8 +95,21 @@ def test_too_few_runs_are_refused_and_a_drive_is_no_coast_down():
     assert is_coast_down(log)
     driven = synthetic_log(seed=2, trips=8, rows_per_trip=60).frame
     assert not is_coast_down(Log.from_frame(driven))
-    with pytest.raises(InputError, match="no coast-down: no force that holds the vehicle back shows"):
+    with pytest.raises(InputError, match=r"trip 'T01' is no coast-down: it gains .* m/s beyond what the slope gives"):
         coast_down(Log.from_frame(driven.drop(columns=["energy_wh"])), 29e3, 1.0)
+
+
+def test_a_drive_whose_mean_force_holds_it_back_is_no_coast_down():
+    (log,) = runs(4)
+    s = log.segments
+    t = np.asarray(s.time_s)
+    start, end = (np.asarray(v) + np.where((log.trip == 1) & (t + k > 20), 4.0, 0.0)  # somebody steps on it once
+                  for k, v in ((0, s.speed_start_mps), (1, s.speed_end_mps)))  # fmt: skip
+    pushed = Segments.from_arrays(
+        duration_s=np.ones(len(t)), speed_start_mps=start, speed_end_mps=end, trip=log.trip, **s.channels
+    )
+    with pytest.raises(InputError, match=f"trip '{log.trip_names[1]}' is no coast-down: it gains"):
+        coast_down(Log(pushed, {}, log.trip_names, log.vehicle_names), MASS_KG, ROTATING)
 
 
 def test_directions_without_a_heading_alternate():
@@ -138,11 +151,11 @@ def test_driving_tells_the_force_within_its_interval():
     assert any("driveline.efficiency is held" in note for note in load.notes)
 
 
-def test_numbers_without_an_sd_are_opened_and_it_is_said():
+def test_what_a_table_says_of_the_load_is_opened_and_it_is_said():
     opened, notes = open_sheet(sheet_of_sections({**SHEET, "road": {"c_rr": 0.006, "cda_m2": (5.6, 0.5)}}), 20e3)
     assert opened.declared["road.c_rr"].sd == pytest.approx(0.003)
-    assert opened.declared["road.cda_m2"].sd == 0.5
-    assert any("road.c_rr of the sheet has no sd" in note for note in notes)
+    assert opened.declared["road.cda_m2"].sd == pytest.approx(2.8)
+    assert any("road.c_rr is estimated from this log, as 0.006 ± 0.003" in note for note in notes)
     assert opened.declared["battery.auxiliary_w"].sd > 0
     with pytest.raises(InputError, match=r"road.cda_m2 is missing"):
         open_sheet(sheet_of_sections({**SHEET, "road": {"c_rr": 0.006}}), 20e3)

@@ -119,6 +119,19 @@ def test_two_sheets_and_two_logs_without_energy(synthetic, files, tmp_path):
     assert found.report(tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
 
 
+@pytest.mark.parametrize("verb", ["ledger", "whatif", "saved", "compare"])
+def test_a_suspect_log_is_refused_unless_it_is_trusted(verb, synthetic, files, tmp_path):
+    dead = synthetic.frame.assign(energy_wh=0.0)
+    dead.to_csv(tmp_path / "dead.csv", index=False)
+    argv = arguments(verb, {**files, "log": tmp_path / "dead.csv"})
+    status, _, said = hdev(*argv, "--out", tmp_path / "out")
+    assert status == 2
+    assert "suspect" in said
+    assert "--trust" in said
+    if verb == "ledger":
+        assert hdev(*argv, "--trust", "--out", tmp_path / "out")[0] == 0
+
+
 def test_a_coast_down_is_known_by_what_it_lacks(tmp_path):
     rng = np.random.default_rng(0)
     rows = []

@@ -185,7 +185,10 @@ class _Builder:
                 what = "a ratio of 1" if key == "gear_ratios" else f"a wheel radius of {WHEEL_RADIUS_M:.3f} m"
                 self.notes.append(f"driveline.{key} is not in the sheet: the efficiency map is read with {what}")
         if sheet.gear_ratios is not None and len(sheet.gear_ratios) > 1 and not self.segments.has("gear"):
-            self.notes.append("the log has no column 'gear': the efficiency map is read in the last gear's ratio")
+            told = "; driveline.gear_model is used row by row alone (hdev follow)" if sheet.gear_model else ""
+            self.notes.append(
+                f"the log has no column 'gear': the efficiency map is read in the last gear's ratio{told}"
+            )
         return sheet.efficiency_map
 
     # --- effects -------------------------------------------------------------------------------------------------

@@ -85,6 +85,9 @@ SECTIONS: dict[str, dict[str, Key]] = {
         "gear_ratios": Key("numbers", "1", 0.0, above=True),
         "final_drive": Key("number", "1", 0.0, above=True),
         "wheel_radius_m": _LENGTH,
+        "gear_model": Key("file"),
+        "rated_power_w": Key("number", "W", 0.0, above=True),
+        "rated_speed_radps": Key("number", "rad/s", 0.0, above=True),
     },
     "machine": {"motoring_efficiency": _EFFICIENCY, "regenerating_efficiency": _EFFICIENCY},
     "battery": {

@@ -36,8 +36,8 @@ class Sheet:
     beside which an efficiency map is looked for.
 
     **Fields:** `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`); `gear_ratios` count
-    from the first gear; `map_path` is where `efficiency_map` came from. **Raises:** `InputError`, one line with key,
-    what was found and what is accepted.
+    from the first gear; `map_path` is where `efficiency_map` came from, `gear_model` a file of gear trees.
+    **Raises:** `InputError`, one line with key, what was found and what is accepted.
     """
 
     def __init__(
@@ -52,6 +52,10 @@ class Sheet:
         self.gear_ratios: tuple[float, ...] | None = others.get("driveline.gear_ratios")
         self.final_drive: float | None = others.get("driveline.final_drive")
         self.wheel_radius_m: float | None = others.get("driveline.wheel_radius_m")
+        self.rated_power_w: float | None = others.get("driveline.rated_power_w")
+        self.rated_speed_radps: float | None = others.get("driveline.rated_speed_radps")
+        model = others.get("driveline.gear_model")
+        self.gear_model: Path | None = None if model is None else self.path.parent / model
         self.nominal_voltage_v: float | None = others.get("battery.nominal_voltage_v")
         self.capacity_wh: float | None = others.get("battery.capacity_wh")
         self.map_path: Path | None = self.path.parent / others["driveline.map"] if "driveline.map" in others else None

@@ -86,6 +86,9 @@ def _write(sheet: Sheet, declared: Mapping[str, Declared], units: Mapping[str, s
         "driveline.gear_ratios": sheet.gear_ratios,
         "driveline.final_drive": sheet.final_drive,
         "driveline.wheel_radius_m": sheet.wheel_radius_m,
+        "driveline.gear_model": str(sheet.gear_model.resolve()) if sheet.gear_model else None,
+        "driveline.rated_power_w": sheet.rated_power_w,
+        "driveline.rated_speed_radps": sheet.rated_speed_radps,
         "battery.nominal_voltage_v": sheet.nominal_voltage_v,
         "battery.capacity_wh": sheet.capacity_wh,
     }

@@ -15,7 +15,7 @@ from hdev_jax.logs.adapter import near
 from hdev_jax.report.energy.figures import differences, label
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.report.words import number
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
 
@@ -30,6 +30,7 @@ def compare(
     adapter: str | Path | None = None,
     target: str | None = None,
     effects: Effects = None,
+    trust: bool = False,
     *,
     out: str | Path | None = None,
     seed: int = 0,
@@ -46,7 +47,7 @@ def compare(
             "compare: one is a sheet (.toml) and the other is not; two sheets, trips or vehicles are expected"
         )
     named = tuple(str(x) if isinstance(x, str | Path) else f"sheet {k}" for k, x in (("A", a), ("B", b)))
-    asked = Asked.of("compare", logs, adapter, effects, seed, {"target": target}, named)
+    asked = Asked.of("compare", logs, adapter, effects, seed, {"target": target, "trust": trust}, named)
     if all(sheets):
         measured = bool(asked.log.measured)
         name = battery_target(asked.log, target) if measured else target or "energy_wh"
@@ -60,7 +61,9 @@ def compare(
     if vehicle is None:
         raise InputError("compare: --vehicle is missing; two trips are compared by the sheet of their vehicle")
     trips = [_trips(asked.log, str(x)) for x in (a, b)]
-    fitted = fitted_for(problem_for(asked, vehicle, battery_target(asked.log, target)), vehicle)
+    problem = problem_for(asked, vehicle, battery_target(asked.log, target))
+    trusted(problem, trust)
+    fitted = fitted_for(problem, vehicle)
 
     def work(command: str) -> EnergyResult:
         table = compare_trips(fitted, *trips, seed=asked.seed)

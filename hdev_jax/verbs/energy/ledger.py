@@ -17,7 +17,7 @@ from hdev_jax.report import words
 from hdev_jax.report.energy.figures import by_week, consumption, label, waterfall
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.targets import TARGETS
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
 
@@ -31,6 +31,7 @@ def ledger(
     target: str | None = None,
     effects: Effects = None,
     price: float | None = None,
+    trust: bool = False,
     *,
     out: str | Path | None = None,
     seed: int = 0,
@@ -48,9 +49,11 @@ def ledger(
     """
     if price is not None and not (np.isfinite(price) and price >= 0):
         raise InputError(f"--price {price}: the price of a kWh, a number of 0 or more, is expected")
-    asked = Asked.of("ledger", logs, adapter, effects, seed, {"target": target, "price": price})
+    asked = Asked.of("ledger", logs, adapter, effects, seed, {"target": target, "price": price, "trust": trust})
     name = battery_target(asked.log, target)
-    fitted = fitted_for(problem_for(asked, vehicle, name), vehicle)
+    problem = problem_for(asked, vehicle, name)
+    trusted(problem, trust)
+    fitted = fitted_for(problem, vehicle)
     return answered(asked, out, lambda command: _answer(fitted, price, asked, command))
 
 

@@ -14,7 +14,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import Spread
 from hdev_jax.inference.sheet import Sheet
 from hdev_jax.logs import Log
-from hdev_jax.problem import Problem, prepare
+from hdev_jax.problem import Problem, implausible, prepare
 from hdev_jax.rundir import open_run
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.arguments import seed_of
@@ -36,7 +36,7 @@ from hdev_jax.verbs.opening import (
 from hdev_jax.verbs.result import PREDICTIVE, Result
 from hdev_jax.verbs.states import given_states
 
-__all__ = ["Asked", "answered", "battery_target", "fitted_for", "problem_for", "synthetic"]
+__all__ = ["Asked", "answered", "battery_target", "fitted_for", "problem_for", "synthetic", "trusted"]
 
 KNOWN = 200.0  # degrees of freedom of a table's sd: as good as a normal
 
@@ -129,6 +129,16 @@ def problem_for(
     problem = prepare(asked.log, asked.sheet(vehicle, name), target, need_measured=measured)
     tried(problem, known_effects(asked.effects), asked.effects)
     return problem
+
+
+def trusted(problem: Problem, trust: bool) -> None:
+    """Raise `InputError`, one line, where what the log measures cannot be right for this vehicle; nothing with `trust`.
+
+    An answer in kWh or percent would be that of the fault.
+    """
+    if not trust and (found := implausible(problem)):
+        lines = "; ".join(s.line() for s in found)
+        raise InputError(f"the log is suspect: {lines} (--trust answers all the same)")
 
 
 def fitted_for(problem: Problem, vehicle: Vehicles, *, calibrate: bool = True) -> Fitted:

@@ -13,7 +13,7 @@ from hdev_jax.problem import prepare
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import trip_intervals
 from hdev_jax.report.energy.page import Page, Section, span, table_of
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, tried
 
@@ -28,6 +28,7 @@ def saved(
     adapter: str | Path | None = None,
     target: str | None = None,
     effects: Effects = None,
+    trust: bool = False,
     *,
     out: str | Path | None = None,
     seed: int = 0,
@@ -41,7 +42,9 @@ def saved(
     log `T01..T08`, or names `T01,T02`. **Returns:** an `EnergyResult`: the share saved with a 90 % interval, how many
     further trips would settle it, the tables `trips` and `circumstances` (what else changed). **Raises:** `InputError`.
     """
-    asked = Asked.of("saved", logs, adapter, effects, seed, {"target": target, "before": before, "after": after})
+    asked = Asked.of(
+        "saved", logs, adapter, effects, seed, {"target": target, "before": before, "after": after, "trust": trust}
+    )
     name, sheet = battery_target(asked.log, target), asked.sheet(vehicle)
     first, then = trips_of(asked.log, before, "--before"), trips_of(asked.log, after, "--after")
     if both := set(first) & set(then):
@@ -52,6 +55,7 @@ def saved(
     opened, notes = forgotten(sheet)
     problem = prepare(asked.log, opened, name)
     tried(problem, known_effects(effects), effects)
+    trusted(problem, trust)
 
     def work(command: str) -> EnergyResult:
         fitted = calibrated_on(problem, first)

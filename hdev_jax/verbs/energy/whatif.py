@@ -15,7 +15,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import differences, label, trip_intervals
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
-from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic
+from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
 from hdev_jax.verbs.opening import Effects, Logs, Vehicles
 
@@ -31,6 +31,7 @@ def whatif(
     adapter: str | Path | None = None,
     target: str | None = None,
     effects: Effects = None,
+    trust: bool = False,
     *,
     out: str | Path | None = None,
     seed: int = 0,
@@ -46,7 +47,7 @@ def whatif(
     `InputError`; for a key that is none with the near name.
     """
     wanted = [changes] if isinstance(changes, str) else list(changes)
-    options = {"target": target, "set": wanted}
+    options = {"target": target, "set": wanted, "trust": trust}
     place = (str(vehicle),) if isinstance(vehicle, str | Path) else ()
     asked = Asked.of("whatif", logs, adapter, effects, seed, options, place)
     measured = bool(asked.log.measured)
@@ -55,6 +56,8 @@ def whatif(
     steps = parse_changes(problem, wanted)
     if not np.any(np.asarray(asked.log.segments.distance_m)):
         raise InputError("the log never moves; a log of driving is expected")
+    if measured:
+        trusted(problem, trust)
     fitted = fitted_for(problem, vehicle, calibrate=measured)
     return answered(asked, out, lambda command: _answer(fitted, steps, asked, command))
 

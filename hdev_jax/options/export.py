@@ -1,0 +1,36 @@
+"""Arguments of the verb `export`."""
+
+from typing import Any
+
+from hdev_jax.options.common import effects_option, file_argument, names
+
+__all__ = ["export_parser"]
+
+
+def export_parser(verbs: Any) -> None:
+    """Add the verb."""
+    export = verbs.add_parser(
+        "export",
+        help="a vehicle sheet for other programs: compiled function, table, simulators' vehicle files",
+        description="Write the vehicle of a sheet, entered at the road and up to the battery, in the format of another "
+        "program. What a format cannot hold is said, and stands with inputs and errors in FILE.json beside.",
+        epilog="examples:\n  hdev export truck.toml --to stablehlo --out truck.stablehlo\n"
+        "  hdev export result/augmented_vehicle.toml --to lookup --out truck.csv\n"
+        "  hdev export truck.toml --to sumo --out truck.add.xml",
+    )
+    file_argument(export, "vehicle", "SHEET", "the vehicle sheet, declared or fitted")
+    export.add_argument(
+        "--to",
+        required=True,
+        choices=["stablehlo", "onnx", "lookup", "fastsim", "sumo"],
+        help="stablehlo, onnx: energy of rows as a compiled function; lookup: a table of steady consumption; fastsim, "
+        "sumo: a vehicle of that simulator",
+    )
+    export.add_argument(
+        "--channels",
+        type=names,
+        metavar="A,B",
+        help="inputs beside the interval of driving (default: slope, mass and what the sheet's effects read)",
+    )
+    effects_option(export)
+    file_argument(export, "--out", "FILE", "the file to write; FILE.json is written beside it", required=True)

@@ -1,0 +1,3 @@
+"""The verbs that write a vehicle for other programs: export."""
+
+__all__ = []
