@@ -261,6 +261,6 @@ def _figure(run: Run, forecasts: Sequence[Any], shares: Sequence[float], alarms:
     ax.set(xlabel="streams with an alarm [%]", xlim=(0, 100))
     ax.set_title("Alarms, an effect planted, synthetic")
     if shown:
-        ax.legend()
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     tidy(ax, grid="x")
     save_figure(run, fig, "while_driving")
