@@ -11,7 +11,7 @@ from hdev_jax.many.pooling import cauchy, pooled
 from hdev_jax.many.scan import FOUND
 from hdev_jax.physics import LIBRARY
 
-__all__ = ["by_type", "effects_of_types", "families"]
+__all__ = ["by_type", "effects_of_types", "families", "heavier"]
 
 Record = Mapping[str, Any]
 
@@ -60,7 +60,7 @@ def _effect(each: Sequence[Record], id_: str, settings: FleetSettings) -> dict[s
         if len(there) < settings.least_vehicles:
             continue
         # an error from few trips is known to few degrees of freedom: as wide as Student's t
-        sd = np.array([s["sd"] * _heavier(s["clusters"]) for s in there])
+        sd = np.array([s["sd"] * heavier(s["clusters"]) for s in there])
         pool = pooled(np.array([s["value"] for s in there]), sd)
         tried.append((pool.p(), form, pool))
     if not tried:
@@ -76,7 +76,8 @@ def _effect(each: Sequence[Record], id_: str, settings: FleetSettings) -> dict[s
     }  # fmt: skip
 
 
-def _heavier(clusters: float) -> float:
+def heavier(clusters: float) -> float:
+    """Standard deviation over standard error, of an error known from so many clusters (Student's t)."""
     freedom = max(clusters - 1.0, 3.0)
     return float(np.sqrt(freedom / (freedom - 2.0)))
 

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
+from hdev_jax.many.evidence import heavier
 from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, MEASURED, axis_label, figure, tidy
 from hdev_jax.report.energy.figures import COLOURS, label
@@ -37,7 +38,7 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
     strong: dict[str, float] = {}
     for r in there:
         for s in r["scan"].values():
-            strong[s["id"]] = max(strong.get(s["id"], 0.0), abs(s["value"] / s["sd"]))
+            strong[s["id"]] = max(strong.get(s["id"], 0.0), abs(_z(s)))
         for e in r["effects"]:
             strong[e["id"]] = np.inf
     of_type = {e["id"] for e in effects if e["found"]}
@@ -50,9 +51,9 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
     for i, r in enumerate(there):
         for j, id_ in enumerate(ids):
             own = [s for s in r["scan"].values() if s["id"] == id_]
-            s = r["scan"].get(forms.get(id_, "")) or max(own, key=lambda s: abs(s["value"] / s["sd"]), default=None)
+            s = r["scan"].get(forms.get(id_, "")) or max(own, key=lambda s: abs(_z(s)), default=None)
             if s is not None:
-                z[i, j] = s["value"] / s["sd"]
+                z[i, j] = _z(s)
     fig = figure(WIDTH, 2.0 + 0.17 * len(there))
     ax = fig.add_subplot()
     image = ax.imshow(z, cmap="RdBu_r", vmin=-STRONGEST, vmax=STRONGEST, aspect="auto", interpolation="nearest")
@@ -72,9 +73,15 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
     return fig
 
 
+def _z(s: Mapping[str, Any]) -> float:
+    return s["value"] / (s["sd"] * heavier(s["clusters"]))
+
+
 def time_line(records: Sequence[Record], unlike: Sequence[Mapping[str, Any]]) -> Any | None:
     """Each coefficient week by week: a thin line for each vehicle, a thick one for those that changed, with the date.
     None where no trip has a date."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
     changed = {(e["vehicle"], e["coefficient"]): e for e in unlike if e["kind"] == "change"}
     lines: dict[str, list[tuple[str, np.ndarray, np.ndarray]]] = {}
     units: dict[str, str] = {}
@@ -116,6 +123,9 @@ def time_line(records: Sequence[Record], unlike: Sequence[Mapping[str, Any]]) ->
         if ax.get_legend_handles_labels()[0]:
             ax.legend(loc="upper left", ncols=5, fontsize=7)
         tidy(ax)
+    locator = AutoDateLocator(maxticks=9)
+    axes[-1].xaxis.set_major_locator(locator)
+    axes[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator))
     axes[0].set_title("Coefficients week by week; thick: vehicles that changed, dotted: since when")
     return fig
 
