@@ -205,9 +205,11 @@ class FleetSettings:
         8, "least number of trips for a change of a coefficient", "trips", "as for trips as clusters"
     )
     least_side: int = _number(3, "least trips before and after a change", "trips", "two are a day's weather")
-    most_of_type: float = _number(
-        0.5, "share of a type's vehicles above which a named effect is the type's, not the vehicle's", "1", "half"
-    )
+    least_clusters: float = _number(
+        4.0, "least number of trips that a vehicle's size rests on, to be added up over vehicles", "trips",
+        "a variance of three degrees of freedom",
+    )  # fmt: skip
+    most_effects: int = _number(6, "effects that a type's vehicles show together at most", "effects", "a bound on time")
 
 
 FLEET_SETTINGS = FleetSettings()

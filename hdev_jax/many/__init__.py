@@ -2,7 +2,7 @@
 
 from hdev_jax.many.result import FleetResult, fleet_result
 from hdev_jax.many.sources import Source, sources
-from hdev_jax.many.vehicle import vehicle_record
+from hdev_jax.many.vehicle import scanned_again, vehicle_record
 from hdev_jax.many.workers import Workers, computed
 
-__all__ = ["FleetResult", "Source", "Workers", "computed", "fleet_result", "sources", "vehicle_record"]
+__all__ = ["FleetResult", "Source", "Workers", "computed", "fleet_result", "scanned_again", "sources", "vehicle_record"]

@@ -1,8 +1,8 @@
 """Trip by trip: what each trip says of every coefficient, what it took and in which conditions.
 
-With the rows whitened, J the Jacobian of the fitted coefficients and r the residual, and J⊥ a coefficient's column less
-what the others explain of it, a trip tells of that coefficient the information a = J⊥ᵀJ⊥ and the score b = J⊥ᵀr: b/a
-is its own estimate, less the fitted one, and its variance 1/a where the noise is as it was taken.
+With the rows whitened, J the Jacobian of the fitted coefficients and r the residual, a trip tells of them its normal
+equations JᵀJ and Jᵀr. Those of several trips add up; a step of a coefficient at any trip is algebra on them
+(`hdev_jax.many.unlike`).
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
 from hdev_jax.energy.saved import conditions
 from hdev_jax.inference import jacobian, padded
-from hdev_jax.segments import trip_slices
+from hdev_jax.physics import LIBRARY
 from hdev_jax.targets import TARGETS
 
 __all__ = ["CONDITIONS", "course_of"]
@@ -23,9 +23,10 @@ CONDITIONS = {"speed in motion": "speed_kmh", "outside temperature": "ambient_te
 
 def course_of(outcome: Outcome) -> dict[str, Any]:
     """By trip, in the order of the log: `trip`, `started_s` (None without a date), `km`, `hours`, `kwh` (measured),
-    `model_kwh`, conditions; `coefficients`, by name `information`, `score` and `kwh_per_unit`, the energy that a unit
-    of the coefficient costs in the trip."""
-    problem, fit = outcome.problem, outcome.fit
+    `model_kwh`, conditions; `coefficients` (None where none is free): `names`, which of them the sheet has
+    (`declared`), and by trip `gram` (upper triangle of JᵀJ, row by row), `score` Jᵀr, `kwh_per_unit`, the energy that a unit of each
+    costs in the trip."""
+    problem = outcome.problem
     log = problem.log
     names = log.trip_names
     there, first = np.unique(log.trip, return_index=True)
@@ -47,30 +48,30 @@ def course_of(outcome: Outcome) -> dict[str, Any]:
     for words, (_, x) in conditions(problem).items():
         if words in CONDITIONS:
             out[CONDITIONS[words]] = x[there].tolist()
-    free = fit.table.free
-    if not free or outcome.given is not None:
-        return {**out, "coefficients": {}}
+    vehicle, table, predicted = outcome.fit.vehicle, outcome.fit.table, outcome.predicted_after
+    if outcome.given is not None or any(_compares_trips(e) for e in outcome.found):
+        vehicle, table, predicted = outcome.before, problem.table, outcome.predicted_before
+    if not table.free:
+        return {**out, "coefficients": None}
     rows = padded(problem.segments, problem.measured)
-    j = np.asarray(jacobian(fit.vehicle, fit.table, rows.segments, problem.target))[: rows.rows]
-    residual = problem.measured - outcome.predicted_after
+    j = np.asarray(jacobian(vehicle, table, rows.segments, problem.target))[: rows.rows]
+    residual = problem.measured - predicted
     trip = np.asarray(problem.segments.trip)
-    levels = len(list(trip_slices(trip))) > 1
-    noise = estimate_noise(residual, trip, seconds, levels=levels)
+    noise = estimate_noise(residual, trip, seconds, levels=len(there) > 1)
     white = whiten(np.column_stack([j, residual]), noise, trip, seconds)[:, :-1]
-    k = len(free)
-    scale = np.sqrt(np.maximum(np.sum(white[:, :k] ** 2, axis=0), 1e-300))
-    told: dict[str, Any] = {}
+    k = len(table.free)
+    upper = np.triu_indices(k)
     declared = {c.name for c in problem.table.free}
-    for i, c in enumerate(free):
-        if c.name not in declared:
-            continue
-        other = [n for n in range(k) if n != i]
-        own = white[:, i]
-        if other:
-            beside = white[:, other] / scale[other]
-            own = own - beside @ np.linalg.lstsq(beside, own, rcond=1e-10)[0]
-        told[c.name] = {
-            "information": by_trip(own * own), "score": by_trip(own * white[:, k]),
-            "kwh_per_unit": by_trip(weight * j[:, i]) if per_kwh is not None else None,
-        }  # fmt: skip
-    return {**out, "coefficients": told}
+    at = [np.flatnonzero(log.trip == i) for i in there]
+    return {**out, "coefficients": {
+        "names": [c.name for c in table.free], "declared": [c.name in declared for c in table.free],
+        "gram": [(white[a, :k].T @ white[a, :k])[upper] for a in at],
+        "score": [white[a, :k].T @ white[a, k] for a in at],
+        "kwh_per_unit": None if per_kwh is None else [weight[a] @ j[a] for a in at],
+    }}  # fmt: skip
+
+
+def _compares_trips(id_: str) -> bool:
+    """Whether an effect is a difference between trips itself: what changed is then not left to be found."""
+    effect = LIBRARY[id_]
+    return bool(effect.searched) or any(p.name == "at_trip" for p in effect.parameters)

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from hdev_jax.diagnosis.settings import FLEET_SETTINGS
-from hdev_jax.many.evidence import by_type, effects_of_types, families
+from hdev_jax.many.evidence import Again, by_type, effects_of_types, families
 from hdev_jax.many.ledger import fleet_ledger
 from hdev_jax.many.unlike import changes, levels, pooled_coefficients
 from hdev_jax.many.vehicle import plain
@@ -30,9 +30,9 @@ class FleetResult:
 
 def fleet_result(
     records: Sequence[Mapping[str, Any]], *, fdr: float, seed: int, price: float | None = None,
-    notes: Sequence[str] = (),
+    notes: Sequence[str] = (), again: Again | None = None,
 ) -> FleetResult:  # fmt: skip
-    """What `records` (`vehicle_record` of each vehicle) tell: alone, and together.
+    """What `records` (`vehicle_record` of each vehicle) tell: alone, and together; `again` as `effects_of_types`.
 
     **Returns:** a `FleetResult` whose summary has `vehicles` (one record each), `counts` by status, `effects` by type,
     `coefficients` pooled by type, `unlike` (vehicles that differ from their like, or changed, by cost), `ledger` of the
@@ -44,7 +44,7 @@ def fleet_result(
     for r in each:
         for e in r.get("effects", ()):
             e["counts_in_fleet"] = e["q_value"] <= bound
-    effects = effects_of_types(each, settings)
+    effects = effects_of_types(each, settings, again)
     pooled = pooled_coefficients(each, settings)
     unlike = [*levels(each, settings), *changes(each, settings, seed)]
     named = [e for e in unlike if e["found"]]

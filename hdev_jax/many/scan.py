@@ -13,13 +13,14 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.diagnose import Outcome, training_of
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import Settings
-from hdev_jax.physics import LIBRARY
-from hdev_jax.problem import Split
+from hdev_jax.inference import ParameterTable
+from hdev_jax.physics import LIBRARY, Vehicle
+from hdev_jax.problem import Problem, Split
 
-__all__ = ["FOUND", "key_of", "scan_of"]
+__all__ = ["FOUND", "key_of", "scan_beside", "scan_of"]
 
 FOUND = "found"  # in place of shapes: a size that the vehicle's own diagnosis fitted
-LEAST_LEFT = 1e-3  # share of a column outside the fitted coefficients' span, below which no log tells it from them
+MANY = 1e3  # clusters of an error that has few clusters in it already
 
 
 def key_of(candidate: Candidate) -> str:
@@ -29,38 +30,51 @@ def key_of(candidate: Candidate) -> str:
 
 
 def scan_of(outcome: Outcome, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
-    """Size and standard error of each candidate, from its null, by its key (`key_of`).
+    """Size and standard error of each candidate, from its null, by its key (`key_of`), beside the effects found.
 
-    **Returns:** of each `id`, `value`, `sd`, `clusters` (how many trips, or blocks, it rests on), `left` (share of its
-    column that the fitted coefficients do not hold). Empty where the model has loads with a state.
+    **Returns:** of each `id`, `kind` ("size", or "limit": a switch, whose size is a share of its full difference),
+    `value`, `sd`, `clusters` (how many trips, or blocks, it rests on). Empty where the model has loads with a state.
     """
-    problem, fit = outcome.problem, outcome.fit
     if outcome.given is not None:
         return {}
+    vehicle = outcome.fit.vehicle if outcome.found else outcome.problem.vehicle
+    table = outcome.fit.table if outcome.found else outcome.problem.table
+    out = _scanned(outcome.problem, split, settings, vehicle, table)
+    for id_, parameters in outcome.found.items():
+        for name, (value, sd, _) in parameters.items():
+            p = next((p for p in LIBRARY[id_].parameters if p.name == name), None)
+            if p is not None and p.has_column and sd > 0 and np.isfinite(p.null):
+                away = value - float(p.null)
+                out[f"{id_}.{name} {FOUND}"] = {
+                    "id": id_, "kind": "size", "value": away, "sd": sd, "clusters": MANY
+                }  # fmt: skip
+    return out
+
+
+def scan_beside(problem: Problem, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
+    """The same beside the effects of the problem's sheet, which is calibrated with them."""
+    return _scanned(problem, split, settings, problem.vehicle, problem.table)
+
+
+def _scanned(
+    problem: Problem, split: Split, settings: Settings, vehicle: Vehicle, table: ParameterTable
+) -> dict[str, dict[str, Any]]:
     training, _ = training_of(problem, split, LIBRARY, settings)
-    if outcome.found:
-        fit = training.calibrate(fit.vehicle, fit.table)
-    else:
-        fit = training.calibrate(problem.vehicle, problem.table)
-    scores = score_all(training, fit)
+    scores = score_all(training, training.calibrate(vehicle, table))
     evidence = scores.white
     squares = np.diag(evidence.totals()[0])[evidence.base : -1]
     out = {}
     for c in scores.source.candidates:
-        one = len(c.columns) == 1 and c.groups[0] is None
-        if not one or not squares[c.columns[0]] > 1e-20 or evidence.left(c.columns) < LEAST_LEFT:
+        one = len(c.columns) == 1 and c.groups[0] is None and not _of_own_trips(c)
+        if not one or not squares[c.columns[0]] > 1e-20 or evidence.left(c.columns) < settings.absorbed:
             continue
         value, sd = (float(x[0]) for x in evidence.estimate(c))
         if np.isfinite(value) and np.isfinite(sd) and sd > 0:
-            out[key_of(c)] = {
-                "id": c.id, "value": value, "sd": sd, "clusters": evidence.rests_on(c), "left": evidence.left(c.columns)
-            }  # fmt: skip
-    for id_, parameters in outcome.found.items():
-        for name, (value, sd, _) in parameters.items():
-            p = next(p for p in LIBRARY[id_].parameters if p.name == name)
-            if p.has_column and sd > 0 and np.isfinite(p.null):
-                away = value - float(p.null)
-                out[f"{id_}.{name} {FOUND}"] = {
-                    "id": id_, "value": away, "sd": sd, "clusters": float(evidence.count), "left": 1.0
-                }  # fmt: skip
+            known = {"value": value, "sd": sd, "clusters": evidence.rests_on(c)}
+            out[key_of(c)] = {"id": c.id, "kind": c.kind, **known}
     return out
+
+
+def _of_own_trips(c: Candidate) -> bool:
+    """Whether it compares trips of the one log with each other: another vehicle's have nothing to do with them."""
+    return bool(c.by_trip) or any(p.name == "at_trip" for p in c.effect.parameters)

@@ -1,6 +1,7 @@
 """Which vehicles differ from their like, by what, since when, and what that costs."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,14 @@ from hdev_jax.diagnosis.settings import FleetSettings
 from hdev_jax.many.evidence import by_type
 from hdev_jax.many.pooling import pooled, shrunk, without_each
 
-__all__ = ["Change", "change_point", "changes", "levels", "pooled_coefficients"]
+__all__ = ["Change", "Weeks", "change_point", "changes", "equations", "levels", "pooled_coefficients"]
 
 Record = Mapping[str, Any]
 DAY_S, WEEK_S = 86_400.0, 604_800.0
 DRAWS = 999, 19_999  # permutations: for all, and for those that the first do not decide
 UNDECIDED = 0.02  # p-value of the first permutations below which more are drawn
 LEAST_OTHERS = 5  # vehicles of the type with trips in a week, for the type's own course there
+LEAST_TOLD = 1e-4  # of a coefficient's information: with less beside the others, no step of it is told
 CLOSE = 1.92  # log-likelihood of the best split less that of another which is as good: half of χ²₁ at 95 %
 
 
@@ -81,124 +83,162 @@ def changes(records: Sequence[Record], settings: FleetSettings, seed: int) -> li
     seconds since 1970, None without a date) and the range of trips where a step fits as well.
 
     What all vehicles of a type do alike in a week (a season) is taken off first, where there are enough of them. Where
-    several coefficients of a vehicle changed, the one that explains most is kept, as it shows in the others too.
+    several coefficients of a vehicle changed, the one that explains most is kept, as it shows in the others too: `q`
+    is of the vehicle.
     """
     out = []
     for kind, each in by_type(records).items():
-        for name in _names(each):
-            common = _Weeks(each, name)
-            for k, r in enumerate(each):
-                told = r["course"]["coefficients"].get(name)
-                if told is None or len(r["course"]["trip"]) < settings.least_trips:
+        alike: dict[tuple[str, ...], list[Record]] = {}
+        for r in each:
+            if r["course"]["coefficients"] is not None:
+                alike.setdefault(tuple(r["course"]["coefficients"]["names"]), []).append(r)
+        for some in alike.values():
+            common = Weeks(some)
+            for k, r in enumerate(some):
+                if len(r["course"]["trip"]) < settings.least_trips:
                     continue
-                estimate, weight, used = common.of(k)
-                if used.sum() < settings.least_trips:
-                    continue
-                rng = np.random.default_rng([seed, *r["name"].encode(), *name.encode()])
-                found = change_point(estimate, weight, rng, side=settings.least_side)
-                at = np.flatnonzero(used)
-                course, value = r["course"], r["coefficients"][name]
-                out.append({
-                    "vehicle": r["name"], "type": kind, "kind": "change", "coefficient": name, "unit": value["unit"],
-                    "difference": found.size, "sd": found.sd, "p": found.p, "percent": _percent(found.size,
-                    np.array([value["value"]])), "gain": found.gain,
-                    "since_trip": course["trip"][at[found.at]],
-                    "since": course["started_s"][at[found.at]],
-                    "since_low": course["started_s"][at[found.low]], "since_high": course["started_s"][at[found.high]],
-                    "kwh_per_day": _per_day(course, name, found.size, int(at[found.at])),
-                })  # fmt: skip
-    out = _adjusted(out, settings)
-    best: dict[str, dict[str, Any]] = {}
+                for name, found in _of_vehicle(r, *common.of(k), settings, seed):
+                    course, value = r["course"], r["coefficients"][name]
+                    when = course["started_s"]
+                    out.append({
+                        "vehicle": r["name"], "type": kind, "kind": "change", "coefficient": name,
+                        "unit": value["unit"], "difference": found.size, "sd": found.sd, "p": found.p,
+                        "percent": _percent(found.size, np.array([value["value"]])), "gain": found.gain,
+                        "since_trip": course["trip"][found.at], "since": when[found.at],
+                        "since_low": when[found.low], "since_high": when[found.high],
+                        "kwh_per_day": _per_day(course, name, found.size, found.at),
+                    })  # fmt: skip
+    # one hypothesis a vehicle, as a step of one coefficient shows in the others
+    by_vehicle: dict[str, list[dict[str, Any]]] = {}
     for e in out:
-        if e["found"] and (e["vehicle"] not in best or e["gain"] > best[e["vehicle"]]["gain"]):
-            best[e["vehicle"]] = e
-    for e in out:
-        e["also"] = e["found"] and best[e["vehicle"]] is not e
-        e["found"] = e["found"] and not e["also"]
+        by_vehicle.setdefault(e["vehicle"], []).append(e)
+    first = [max(v, key=lambda e: (-e["p"], e["gain"])) for v in by_vehicle.values()]
+    tried = [min(1.0, e["p"] * len(by_vehicle[e["vehicle"]])) for e in first]
+    for e, q in zip(first, stats.false_discovery_control(tried) if tried else (), strict=True):
+        for other in by_vehicle[e["vehicle"]]:
+            other |= {"q": float(q), "found": other is e and bool(q <= settings.fdr)}
     return out
 
 
+def _of_vehicle(
+    r: Record, gram: np.ndarray, score: np.ndarray, settings: FleetSettings, seed: int
+) -> Iterator[tuple[str, "Change"]]:
+    told = r["course"]["coefficients"]
+    for j, name in enumerate(told["names"]):
+        if told["declared"][j] and name in r["coefficients"]:
+            rng = np.random.default_rng([seed, *r["name"].encode(), *name.encode()])
+            found = change_point(gram, score, j, rng, side=settings.least_side)
+            if found is not None:
+                yield name, found
+
+
+@dataclass(frozen=True)
 class Change:
-    """A step: before which place it is (`at`; as likely from `low` to `high`), its `size` with `sd`, `gain` in
+    """A step: before which trip it is (`at`; as likely from `low` to `high`), its `size` with `sd`, `gain` in
     log-likelihood, `p` by permutation of the trips."""
 
-    def __init__(self, at: int, low: int, high: int, size: float, sd: float, gain: float, p: float):
-        self.at, self.low, self.high = at, low, high
-        self.size, self.sd, self.gain, self.p = size, sd, gain, p
+    at: int
+    low: int
+    high: int
+    size: float
+    sd: float
+    gain: float
+    p: float
 
 
 def change_point(
-    estimate: Float[np.ndarray, " trip"], weight: Float[np.ndarray, " trip"], rng: np.random.Generator, *, side: int
-) -> Change:
-    """The likeliest step of estimates with weights (1/variance, up to a factor), with `side` or more on either side.
+    gram: Float[np.ndarray, "trip k k"], score: Float[np.ndarray, "trip k"], j: int, rng: np.random.Generator, *,
+    side: int,
+) -> Change | None:  # fmt: skip
+    """The likeliest step of coefficient `j`, with `side` or more trips on either side; None where no trip tells of it.
 
-    Two means against one, normal with a variance that is estimated: gain ½n·ln(RSS₀/RSS₁) at its best split, against
-    the same of trips in random order.
+    From each trip's normal equations: with a column more, J_j on the trips from s on, beside all k. Its score is
+    U = Σ_{t≥s} g_tj − a'H⁻¹Σg_t, its information V = Σ_{t≥s} G_tjj − a'H⁻¹a, with H = ΣG_t and a = Σ_{t≥s} G_t·j; the
+    gain at its best split, ½U²/V, is compared with that of the trips in random order. The error of its size is from how
+    trips differ (a sandwich).
     """
-    n = len(estimate)
-    gain = _gains(estimate[None], weight[None], side)[0]
-    best = int(np.argmax(gain))
-    top = float(gain[best])
+    n = len(score)
+    scale = np.sqrt(np.maximum(np.einsum("tii->i", gram), 1e-300))
+    gram, score = gram / np.outer(scale, scale), score / scale
+    whole, total = gram.sum(axis=0), score.sum(axis=0)
+    bread = np.linalg.pinv(whole, rcond=1e-10, hermitian=True)
+    column, own = gram[:, :, j], score[:, j]
+
+    def gains(order: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        after = np.cumsum(column[order][:, ::-1], axis=1)[:, ::-1][:, side : n - side + 1]
+        u = np.cumsum(own[order][:, ::-1], axis=1)[:, ::-1][:, side : n - side + 1] - after @ (bread @ total)
+        v = after[..., j] - np.einsum("wsi,ik,wsk->ws", after, bread, after)
+        told = v > LEAST_TOLD * whole[j, j]
+        return np.where(told, 0.5 * u**2 / np.where(told, v, 1.0), 0.0), u, v
+
+    first, u, v = (x[0] for x in gains(np.arange(n)[None]))
+    best = int(np.argmax(first))
+    top = float(first[best])
+    if top <= 0.0:
+        return None
     p = 1.0
     for draws in DRAWS:
         more = 0
         for start in range(0, draws, 1000):
             order = rng.permuted(np.tile(np.arange(n), (min(1000, draws - start), 1)), axis=1)
-            more += int(np.sum(np.max(_gains(estimate[order], weight[order], side), axis=1) >= top * (1 - 1e-12)))
+            more += int(np.sum(np.max(gains(order)[0], axis=1) >= top * (1 - 1e-12)))
         p = (more + 1.0) / (draws + 1.0)
         if p > UNDECIDED:
             break
-    as_good = np.flatnonzero(gain > top - CLOSE)
-    at = best + side
-    before, after = slice(0, at), slice(at, n)
-    a, b = weight[before].sum(), weight[after].sum()
-    m0, m1 = (weight[before] @ estimate[before]) / a, (weight[after] @ estimate[after]) / b
-    rss = weight[before] @ (estimate[before] - m0) ** 2 + weight[after] @ (estimate[after] - m1) ** 2
-    sd = float(np.sqrt(rss / max(n - 2, 1) * (1 / a + 1 / b)))
-    return Change(at, int(as_good[0]) + side, int(as_good[-1]) + side, float(m1 - m0), sd, top, p)
+    at, size = best + side, float(u[best] / v[best])
+    # what is left of each trip's score when the step and the other coefficients are fitted
+    late = (np.arange(n) >= at).astype(float)
+    a = column[at:].sum(axis=0)
+    moved = bread @ (total - a * size)
+    left = score - gram @ moved - (late * size)[:, None] * column
+    each = late * left[:, j] - left @ (bread @ a)
+    over = max(float(np.sum(each**2)) / float(v[best]), 1.0)  # trips that differ by more than their rows: as that often
+    as_good = np.flatnonzero(first > top - CLOSE * over)
+    sd = float(np.sqrt(over / v[best]))
+    return Change(
+        at, int(as_good[0]) + side, int(as_good[-1]) + side, size / scale[j], sd / scale[j], top / over, p
+    )  # fmt: skip
 
 
-def _gains(y: Float[np.ndarray, "way trip"], w: Float[np.ndarray, "way trip"], side: int) -> np.ndarray:
-    """Gain of a step at every place with `side` or more trips on either side."""
-    n = y.shape[1]
-    a, b = np.cumsum(w, axis=1), np.cumsum(w * y, axis=1)
-    whole, total = a[:, -1:], b[:, -1:]
-    rss0 = np.sum(w * y * y, axis=1, keepdims=True) - total**2 / whole
-    a, b = a[:, side - 1 : n - side], b[:, side - 1 : n - side]
-    taken = b**2 / a + (total - b) ** 2 / (whole - a) - total**2 / whole
-    return -0.5 * n * np.log1p(-np.clip(taken / np.maximum(rss0, 1e-300), 0.0, 1.0 - 1e-12))
+class Weeks:
+    """Normal equations by trip of vehicles with the same coefficients, and what they have in common week by week."""
 
-
-class _Weeks:
-    """Estimates of a coefficient by trip of the vehicles of a type, and what they have in common week by week."""
-
-    def __init__(self, each: Sequence[Record], name: str):
-        self.own = []
-        for r in each:
-            told = r["course"]["coefficients"].get(name)
-            a = np.array(told["information"] if told else [], dtype=float)
-            b = np.array(told["score"] if told else [], dtype=float)
-            when = np.array([np.nan if s is None else s for s in r["course"]["started_s"]], dtype=float)
-            self.own.append((a, b, np.floor(when[: len(a)] / WEEK_S)))
-        self.sums: dict[float, np.ndarray] = {}
-        for a, b, week in self.own:
+    def __init__(self, each: Sequence[Record]):
+        self.own = [(*equations(r["course"]), *_weeks(r["course"])) for r in each]
+        self.sums: dict[float, tuple[np.ndarray, np.ndarray, int]] = {}
+        for gram, score, _, week in self.own:
             for w in np.unique(week[np.isfinite(week)]).tolist():
-                at = week == w
-                here = self.sums.setdefault(w, np.zeros(3))
-                here += [a[at].sum(), b[at].sum(), 1.0]
+                g, b, n = self.sums.get(w, (0.0, 0.0, 0))
+                self.sums[w] = g + gram[week == w].sum(axis=0), b + score[week == w].sum(axis=0), n + 1
 
-    def of(self, k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Estimates and weights of a vehicle's trips that tell anything, and which those are."""
-        a, b, week = self.own[k]
-        used = a > 1e-9 * max(float(np.max(a, initial=0.0)), 1e-300)
-        y = b[used] / a[used]
-        w = week[used]
-        for x in np.unique(w[np.isfinite(w)]).tolist():
-            mine = week == x
-            info, score, vehicles = self.sums[x] - [a[mine].sum(), b[mine].sum(), 1.0]
-            if vehicles >= LEAST_OTHERS and info > 0:
-                y[w == x] -= score / info
-        return y, a[used], used
+    def of(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of a vehicle, less what the others have in common in each trip's week."""
+        gram, score, _, week = self.own[k]
+        score = score.copy()
+        for w in np.unique(week[np.isfinite(week)]).tolist():
+            mine = week == w
+            g, b, n = self.sums[w]
+            others = g - gram[mine].sum(axis=0), b - score[mine].sum(axis=0)
+            if n - 1 >= LEAST_OTHERS:
+                # drawn towards none by as much as one vehicle tells: a week of few trips is not taken for a season
+                common = np.linalg.lstsq(others[0] * (1.0 + 1.0 / (n - 1)), others[1], rcond=1e-10)[0]
+                score[mine] -= gram[mine] @ common
+        return gram, score
+
+
+def equations(course: Mapping[str, Any]) -> tuple[Float[np.ndarray, "trip k k"], Float[np.ndarray, "trip k"]]:
+    """JᵀJ and Jᵀr of each trip."""
+    told = course["coefficients"]
+    k = len(told["names"])
+    upper = np.triu_indices(k)
+    gram = np.zeros((len(told["gram"]), k, k))
+    gram[:, upper[0], upper[1]] = gram[:, upper[1], upper[0]] = np.asarray(told["gram"], dtype=float)
+    return gram, np.asarray(told["score"], dtype=float)
+
+
+def _weeks(course: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    when = np.array([np.nan if s is None else s for s in course["started_s"]], dtype=float)
+    return when, np.floor(when / WEEK_S)
 
 
 def _percent(difference: float, of: np.ndarray) -> float | None:
@@ -208,12 +248,18 @@ def _percent(difference: float, of: np.ndarray) -> float | None:
 
 def _per_day(course: Mapping[str, Any], name: str, difference: float, first: int) -> float | None:
     """What a difference costs from the trip `first` on [kWh a day]; None where trips have no date."""
-    told = course["coefficients"].get(name)
+    told = course["coefficients"]
     when = [s for s in course["started_s"][first:] if s is not None]
-    if told is None or told["kwh_per_unit"] is None or len(when) < len(course["started_s"]) - first or len(when) < 2:
+    if (
+        told is None
+        or told["kwh_per_unit"] is None
+        or name not in told["names"]
+        or len(when) < len(course["started_s"]) - first
+        or len(when) < 2
+    ):
         return None
     days = max((max(when) - min(when)) / DAY_S, 1.0)
-    return difference * float(np.sum(told["kwh_per_unit"][first:])) / days
+    return difference * float(np.sum(np.asarray(told["kwh_per_unit"])[first:, told["names"].index(name)])) / days
 
 
 def _adjusted(out: list[dict[str, Any]], settings: FleetSettings) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 import math
 import time
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +16,15 @@ from hdev_jax.energy.fitted import Fitted
 from hdev_jax.energy.ledger import ledger_of
 from hdev_jax.errors import InputError
 from hdev_jax.inference import cluster_rows, left_out, padded
-from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
 from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.many.course import course_of
-from hdev_jax.many.scan import scan_of
+from hdev_jax.many.scan import scan_beside, scan_of
 from hdev_jax.physics import LIBRARY
-from hdev_jax.problem import Problem, implausible, prepare, split_trips, without_harmful_slope
+from hdev_jax.problem import Problem, Split, implausible, prepare, split_trips, without_harmful_slope
 from hdev_jax.targets import TARGETS
 
-__all__ = ["plain", "vehicle_record"]
+__all__ = ["plain", "scanned_again", "vehicle_record"]
 
 LEAST_KNOWN = 1e-3  # of a table's precision: with less, the log says nothing of a coefficient
 
@@ -71,11 +72,28 @@ def _log(task: Mapping[str, Any]) -> Log:
     return log_from_frame(table, name=str(files[0].parent), adapter=adapter)
 
 
+def scanned_again(task: Mapping[str, Any]) -> dict[str, Any]:
+    """The scan of a vehicle beside its own effects and those that its type shows.
+
+    **Arguments:** `task` as for `vehicle_record`, with `beside`: values and sds (0: known) by effect and parameter.
+    **Returns:** `name` and `scan`.
+    """
+    sheet = read_sheet(task["sheet"], library=LIBRARY)
+    more = {e: {n: (v, sd, "") for n, (v, sd) in ps.items()} for e, ps in task["beside"].items()}
+    text = tomllib.loads(augmented_sheet(sheet, {}, more))
+    problem, split = _opened(task, Sheet(library=LIBRARY, path=task["sheet"], **text))
+    return plain({"name": task["name"], "scan": scan_beside(problem, split, Settings(fdr=task["fdr"]))})
+
+
+def _opened(task: Mapping[str, Any], sheet: Sheet) -> tuple[Problem, Split]:
+    split = split_trips(_log(task))
+    return without_harmful_slope(prepare(split.log, sheet, task["target"]), split), split
+
+
 def _analysed(task: Mapping[str, Any]) -> dict[str, Any]:
     sheet = read_sheet(task["sheet"], library=LIBRARY)
-    log = _log(task)
-    split = split_trips(log)
-    problem = without_harmful_slope(prepare(split.log, sheet, task["target"]), split)
+    problem, split = _opened(task, sheet)
+    log = problem.log
     doubts = () if task["trust"] else implausible(problem, split.train)
     settings = Settings(fdr=task["fdr"])
     outcome = diagnose(problem, split, {} if doubts else LIBRARY, settings=settings, seed=task["seed"])
@@ -98,6 +116,7 @@ def _analysed(task: Mapping[str, Any]) -> dict[str, Any]:
         "verdict": "suspect_log" if doubts else summary["verdict"],
         "effects": [{k: e[k] for k in ("id", "verdict", "parameters", "q_value", "indistinguishable_from")}
                     for e in summary["effects"]],
+        "fitted": {e: {n: [v, sd] for n, (v, sd, _) in ps.items()} for e, ps in outcome.found.items()},
         "coefficients": _coefficients(outcome, problem),
         "scan": {} if doubts else scan_of(outcome, split, settings),
         "course": course_of(outcome),

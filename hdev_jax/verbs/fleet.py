@@ -16,7 +16,7 @@ import numpy as np
 from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import read_sheet
-from hdev_jax.many import FleetResult, Source, Workers, computed, fleet_result, sources, vehicle_record
+from hdev_jax.many import FleetResult, Source, Workers, computed, fleet_result, scanned_again, sources, vehicle_record
 from hdev_jax.report.many import fleet_page, fleet_text
 from hdev_jax.rundir import Run, atomic_file, open_run
 from hdev_jax.targets import TARGETS
@@ -25,6 +25,8 @@ from hdev_jax.verbs.energy.result import EnergyResult
 from hdev_jax.verbs.opening import digest
 
 __all__ = ["fleet"]
+
+LOOSE = 10.0  # times the sd with which a vehicle's own effect was fitted
 
 
 def fleet(
@@ -83,7 +85,15 @@ def fleet(
             first = next(r for r in records if r["status"] != "done")
             raise InputError(f"none of {len(records)} vehicles could be used; the first: {first['message']}")
         progress.step("what the vehicles tell together")
-        result = fleet_result(records, fdr=fdr, seed=seed, price=price, notes=notes)
+        where = Workers(workers, scheduler)
+        tasks = {t["name"]: t for t in _tasks(each, common)}
+
+        def again(some: Sequence[Mapping[str, Any]], shown: Mapping[str, Any]) -> dict[str, Any]:
+            progress.step(f"{len(some)} vehicles again, beside {', '.join(shown)}")
+            todo = [{**tasks[r["name"]], "beside": {**shown, **_loose(r["fitted"])}} for r in some]
+            return {r["name"]: r["scan"] for _, r in computed(scanned_again, todo, where)}
+
+        result = fleet_result(records, fdr=fdr, seed=seed, price=price, notes=notes, again=again)
         progress.step("writing the report")
         run.place(run.kept("fleet"))
         answer = _answer(result, _command(config, out), price)
@@ -123,8 +133,7 @@ def _records(run: Run, each: Sequence[Source], common: Mapping[str, Any], where:
     todo = [s for s in each if s.name not in found]
     kept = f", {len(found)} done before" if found else ""
     progress.step(f"{len(each)} vehicles{kept}")
-    tasks = [{**vars(s), "files": [str(Path(f).resolve()) for f in s.files],
-              "sheet": None if s.sheet is None else str(Path(s.sheet).resolve()), **common} for s in todo]  # fmt: skip
+    tasks = _tasks(todo, common)
     for i, record in progress.track(computed(vehicle_record, tasks, where), "diagnosing", total=len(tasks)):
         record["sheet"] = todo[i].sheet
         with atomic_file(at[todo[i].name]) as temporary:
@@ -133,6 +142,20 @@ def _records(run: Run, each: Sequence[Source], common: Mapping[str, Any], where:
         if len(found) % 50 == 0:
             progress.step(f"{len(found)} of {len(each)} vehicles")
     return [found[s.name] for s in each]
+
+
+def _tasks(each: Sequence[Source], common: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What a worker is given: paths from the root, as it may run elsewhere."""
+
+    def whole(path: str | None) -> str | None:
+        return None if path is None else str(Path(path).resolve())
+
+    return [{**vars(s), "files": [whole(f) for f in s.files], "sheet": whole(s.sheet), **common} for s in each]
+
+
+def _loose(fitted: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, list[float]]]:
+    """A vehicle's own effects, their sizes to be fitted anew: wide enough that they are not counted twice."""
+    return {e: {n: [v, LOOSE * sd] for n, (v, sd) in ps.items()} for e, ps in fitted.items()}
 
 
 def _command(config: Mapping[str, Any], out: str | Path) -> str:

@@ -9,6 +9,7 @@ import pandas as pd
 
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
 from hdev_jax.many.evidence import heavier
+from hdev_jax.many.unlike import equations
 from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, MEASURED, axis_label, figure, tidy
 from hdev_jax.report.energy.figures import COLOURS, label
@@ -87,18 +88,22 @@ def time_line(records: Sequence[Record], unlike: Sequence[Mapping[str, Any]]) ->
     units: dict[str, str] = {}
     for r in records:
         course = r.get("course") or {}
-        for name, told in (course.get("coefficients") or {}).items():
-            when = np.array([np.nan if s is None else s for s in course["started_s"]], dtype=float)
-            week = np.floor(when / WEEK_S)
-            good = np.isfinite(week)
-            if not good.any():
-                continue
-            at = np.unique(week[good])
-            a, b = (np.array([np.sum(np.asarray(told[k])[week == w]) for w in at]) for k in ("information", "score"))
-            used = a > 0.02 * np.max(a)
-            y = r["coefficients"][name]["value"] + b[used] / a[used]
-            lines.setdefault(name, []).append((r["name"], (at[used] + 0.5) * WEEK_S, y))
-            units[name] = r["coefficients"][name]["unit"]
+        told = course.get("coefficients")
+        week = np.floor(np.array([np.nan if x is None else x for x in course.get("started_s", [])], float) / WEEK_S)
+        if told is None or not np.isfinite(week).any():
+            continue
+        gram, score = equations(course)
+        at = np.unique(week[np.isfinite(week)])
+        # what a week tells of all coefficients at once, drawn a little towards the whole log
+        little = 0.1 * gram.sum(axis=0) / len(at)
+        moved = np.array(
+            [np.linalg.lstsq(gram[week == w].sum(0) + little, score[week == w].sum(0), rcond=1e-10)[0] for w in at]
+        )
+        for k, name in enumerate(told["names"]):
+            if told["declared"][k] and name in r["coefficients"]:
+                mine = r["coefficients"][name]
+                lines.setdefault(name, []).append((r["name"], (at + 0.5) * WEEK_S, mine["value"] + moved[:, k]))
+                units[name] = mine["unit"]
     if not lines:
         return None
     chosen = sorted(lines, key=lambda n: -sum(k == n for _, k in changed))[:4]
