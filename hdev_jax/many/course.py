@@ -24,8 +24,8 @@ CONDITIONS = {"speed in motion": "speed_kmh", "outside temperature": "ambient_te
 def course_of(outcome: Outcome) -> dict[str, Any]:
     """By trip, in the order of the log: `trip`, `started_s` (None without a date), `km`, `hours`, `kwh` (measured),
     `model_kwh`, conditions; `coefficients` (None where none is free): `names`, which of them the sheet has
-    (`declared`), and by trip `gram` (upper triangle of JᵀJ, row by row), `score` Jᵀr, `kwh_per_unit`, the energy that a unit of each
-    costs in the trip."""
+    (`declared`), and by trip `gram` (upper triangle of JᵀJ, row by row), `score` Jᵀr, `kwh_per_unit`, the energy that a
+    unit of each costs in the trip."""
     problem = outcome.problem
     log = problem.log
     names = log.trip_names

@@ -82,10 +82,19 @@ def changes(records: Sequence[Record], settings: FleetSettings, seed: int) -> li
     """Each vehicle's coefficients, trip by trip, against one step: as `levels`, with the trip and the date (`since`, in
     seconds since 1970, None without a date) and the range of trips where a step fits as well.
 
-    What all vehicles of a type do alike in a week (a season) is taken off first, where there are enough of them. Where
+    What all vehicles of a type do alike in a week (a season) is taken off first, where there are enough of them; those
+    that changed are no part of that, which takes a second look at all. Where
     several coefficients of a vehicle changed, the one that explains most is kept, as it shows in the others too: `q`
     is of the vehicle.
     """
+    first = {e["vehicle"] for e in _changes(records, settings, seed, frozenset()) if e["found"]}
+    return _changes(records, settings, seed, frozenset(first))
+
+
+def _changes(
+    records: Sequence[Record], settings: FleetSettings, seed: int, without: frozenset[str]
+) -> list[dict[str, Any]]:
+    """As `changes`, with the vehicles `without` no part of what is common."""
     out = []
     for kind, each in by_type(records).items():
         alike: dict[tuple[str, ...], list[Record]] = {}
@@ -93,7 +102,7 @@ def changes(records: Sequence[Record], settings: FleetSettings, seed: int) -> li
             if r["course"]["coefficients"] is not None:
                 alike.setdefault(tuple(r["course"]["coefficients"]["names"]), []).append(r)
         for some in alike.values():
-            common = Weeks(some)
+            common = Weeks(some, without)
             for k, r in enumerate(some):
                 if len(r["course"]["trip"]) < settings.least_trips:
                     continue
@@ -203,10 +212,11 @@ def change_point(
 class Weeks:
     """Normal equations by trip of vehicles with the same coefficients, and what they have in common week by week."""
 
-    def __init__(self, each: Sequence[Record]):
+    def __init__(self, each: Sequence[Record], without: frozenset[str] = frozenset()):
+        self.counts = [r["name"] not in without for r in each]
         self.own = [(*equations(r["course"]), *_weeks(r["course"])) for r in each]
         self.sums: dict[float, tuple[np.ndarray, np.ndarray, int]] = {}
-        for gram, score, _, week in self.own:
+        for gram, score, _, week in (o for o, counts in zip(self.own, self.counts, strict=True) if counts):
             for w in np.unique(week[np.isfinite(week)]).tolist():
                 g, b, n = self.sums.get(w, (0.0, 0.0, 0))
                 self.sums[w] = g + gram[week == w].sum(axis=0), b + score[week == w].sum(axis=0), n + 1
@@ -217,11 +227,13 @@ class Weeks:
         score = score.copy()
         for w in np.unique(week[np.isfinite(week)]).tolist():
             mine = week == w
-            g, b, n = self.sums[w]
-            others = g - gram[mine].sum(axis=0), b - score[mine].sum(axis=0)
-            if n - 1 >= LEAST_OTHERS:
+            g, b, n = self.sums.get(w, (np.zeros(gram.shape[1:]), np.zeros(score.shape[1:]), 0))
+            others = g, b
+            if self.counts[k]:
+                others, n = (g - gram[mine].sum(axis=0), b - score[mine].sum(axis=0)), n - 1
+            if n >= LEAST_OTHERS:
                 # drawn towards none by as much as one vehicle tells: a week of few trips is not taken for a season
-                common = np.linalg.lstsq(others[0] * (1.0 + 1.0 / (n - 1)), others[1], rcond=1e-10)[0]
+                common = np.linalg.lstsq(others[0] * (1.0 + 1.0 / n), others[1], rcond=1e-10)[0]
                 score[mine] -= gram[mine] @ common
         return gram, score
 
