@@ -41,6 +41,7 @@ __all__ = ["FOLDERS", "main", "parser"]
 FOLDERS = {
     **dict.fromkeys(ENERGY_VERBS, "energy."),
     "follow": "live.",
+    "fleet": "many.",
 }  # within `verbs`
 
 _ABOUT = """\

@@ -13,6 +13,7 @@ __all__ = ["LEDGER_COLUMNS", "fleet_ledger"]
 LEDGER_COLUMNS = ("level", "name", "cause", "kwh", "lower", "upper", "kwh_per_100km", "share_percent", "cost")
 _ABOUT = ("km", "hours", "trips", "measured_kwh", "regenerated_kwh", "auxiliary_kwh", "parked_kwh")
 _LEVELS = ("fleet", "type", "vehicle", "week")
+_LAST = {UNEXPLAINED: 1, TOTAL: 2}
 
 
 def fleet_ledger(
@@ -26,31 +27,35 @@ def fleet_ledger(
 
     **Returns:** `LEDGER_COLUMNS`, and km, hours, trips, kWh measured, regenerated, by auxiliary loads, while parked.
     """
-    there = [r for r in records if r.get("ledger")]
-    each = [{**row, "vehicle": r["name"], "type": r["type"]} for r in there for row in r["ledger"]["rows"]]
-    abouts = [{**row, "vehicle": r["name"], "type": r["type"]} for r in there for row in r["ledger"]["about"]]
-    if not each:
-        return pd.DataFrame(columns=list(LEDGER_COLUMNS)), pd.DataFrame(columns=["level", "name", *_ABOUT])
-    causes, facts = pd.DataFrame(each), pd.DataFrame(abouts)
-    causes["down"], causes["up"] = (causes["kwh"] - causes["lower"]) ** 2, (causes["upper"] - causes["kwh"]) ** 2
-    blocks, about = [], []
-    for level in _LEVELS:
-        part, fact = (pd.DataFrame(f[f["level"] == ("week" if level == "week" else "all")]) for f in (causes, facts))
-        if part.empty:
-            continue
-        key = {"fleet": lambda f: "fleet", "week": lambda f: f["name"]}.get(level, lambda f, k=level: f[k])
-        sums = part.assign(name=key(part)).groupby(["name", "cause"], sort=False)[["kwh", "down", "up"]].sum()
-        block = sums.reset_index().assign(level=level)
-        block["lower"] = block["kwh"] - np.sqrt(block["down"])
-        block["upper"] = block["kwh"] + np.sqrt(block["up"])
-        known = fact.assign(name=key(fact)).groupby("name", sort=True)[list(_ABOUT)].sum().reset_index()
-        about.append(known.assign(level=level))
-        km, total = (known.set_index("name")[c] for c in ("km", "measured_kwh"))
-        block["kwh_per_100km"] = 100.0 * block["kwh"] / block["name"].map(km).replace(0.0, np.nan)
-        block["share_percent"] = 100.0 * block["kwh"] / block["name"].map(total).replace(0.0, np.nan)
-        block["cost"] = np.nan if price is None else price * block["kwh"]
+    causes: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+    facts: dict[tuple[str, str], np.ndarray] = {}
+    for r in (r for r in records if r.get("ledger")):
+        for row in r["ledger"]["rows"]:
+            error = (row["kwh"] - row["lower"]) ** 2, (row["upper"] - row["kwh"]) ** 2
+            for block in _blocks(r, row):
+                sums = causes.setdefault(block, {}).setdefault(row["cause"], np.zeros(3))
+                sums += [row["kwh"], *error]
+        for row in r["ledger"]["about"]:
+            for block in _blocks(r, row):
+                known = facts.setdefault(block, np.zeros(len(_ABOUT)))
+                known += [row[k] for k in _ABOUT]
+    order = sorted(causes, key=lambda b: (_LEVELS.index(b[0]), b[1]))
+    rows = []
+    for level, name in order:
+        km, total = (float(facts[level, name][_ABOUT.index(k)]) for k in ("km", "measured_kwh"))
         # what was measured last, what is unexplained before it, as in the ledger of one vehicle
-        last = block["cause"].map({UNEXPLAINED: 1, TOTAL: 2}).fillna(0)
-        blocks.append(block.assign(last=last).sort_values(["name", "last"], kind="stable"))
-    rows = pd.concat(blocks, ignore_index=True)[list(LEDGER_COLUMNS)]
-    return rows, pd.concat(about, ignore_index=True)[["level", "name", *_ABOUT]]
+        for cause, (kwh, down, up) in sorted(causes[level, name].items(), key=lambda x: _LAST.get(x[0], 0)):
+            rows.append((
+                level, name, cause, kwh, kwh - np.sqrt(down), kwh + np.sqrt(up),
+                100.0 * kwh / km if km > 0 else np.nan, 100.0 * kwh / total if total else np.nan,
+                np.nan if price is None else price * kwh,
+            ))  # fmt: skip
+    about = [(level, name, *facts[level, name].tolist()) for level, name in order]
+    return pd.DataFrame(rows, columns=list(LEDGER_COLUMNS)), pd.DataFrame(about, columns=["level", "name", *_ABOUT])
+
+
+def _blocks(r: Mapping[str, Any], row: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The blocks that a line of a vehicle's ledger belongs to."""
+    if row["level"] == "week":
+        return [("week", row["name"])]
+    return [("fleet", "fleet"), ("type", r["type"]), ("vehicle", r["name"])]

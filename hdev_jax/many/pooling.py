@@ -51,7 +51,7 @@ def pooled(value: Float[np.ndarray, " n"], sd: Float[np.ndarray, " n"]) -> Poole
         most = float(np.sum((value - np.mean(value)) ** 2)) + float(np.max(own))
         while misfit(most) > 0:
             most *= 4.0
-        t2 = float(optimize.brentq(misfit, 0.0, most, xtol=1e-12 * most, rtol=1e-12))
+        t2 = optimize.root_scalar(misfit, bracket=(0.0, most), xtol=1e-12 * most, rtol=1e-12).root
     w = 1.0 / (own + t2)
     mean = float(np.sum(w * value) / np.sum(w))
     spread = float(np.sum(w * (value - mean) ** 2)) / (n - 1)

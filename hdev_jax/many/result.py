@@ -70,7 +70,7 @@ def fleet_result(
         "coefficients": pooled,
         "unlike": named,
         "tested": {"types_times_effects": len(effects), "vehicles_times_coefficients": len(unlike)},
-        "ledger": rows[rows["level"].isin(["fleet", "type"])].to_dict("records"),
+        "ledger": [r for r in rows.to_dict("records") if r["level"] in ("fleet", "type")],
         "notes": said,
     }  # fmt: skip
     tables = {

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from hdev_jax.diagnosis.diagnose import Outcome, diagnose
 from hdev_jax.diagnosis.settings import Settings
@@ -63,7 +64,7 @@ def _log(task: Mapping[str, Any]) -> Log:
     import pyarrow.parquet as pq
 
     try:
-        parts = [pq.read_table(f, partitioning=None) for f in files]
+        parts = [pq.ParquetFile(f).read() for f in files]
         table = pa.concat_tables(parts, promote_options="permissive")
     except (OSError, pa.ArrowException) as e:
         raise InputError(f"{files[0].parent}: cannot be read as Parquet ({e})") from None
@@ -159,14 +160,17 @@ def _energy(outcome: Outcome, seed: int) -> dict[str, Any]:
     spread, _ = left_out(fit, rows, problem.target, problem.weight()[used])
     freedom = max(cluster_rows(problem.segments.take(used)).count - 1.0, 2.0)
     found = ledger_of(Fitted(problem, fit.vehicle, fit.covariance, freedom, spread, "diagnosed"), seed=seed)
-    rows_ = found.rows[found.rows["level"].isin(["all", "week"])]
-    about = found.about[found.about["level"].isin(["all", "week"])]
     return {
-        "rows": rows_[["level", "name", "cause", "kwh", "lower", "upper"]].to_dict("records"),
-        "about": about[["level", "name", "km", "hours", "trips", "measured_kwh", "regenerated_kwh", "auxiliary_kwh",
-                        "parked_kwh"]].to_dict("records"),
+        "rows": _lines(found.rows, ("level", "name", "cause", "kwh", "lower", "upper")),
+        "about": _lines(found.about, ("level", "name", "km", "hours", "trips", "measured_kwh", "regenerated_kwh",
+                                      "auxiliary_kwh", "parked_kwh")),
         "undated": found.undated,
     }  # fmt: skip
+
+
+def _lines(frame: pd.DataFrame, columns: Sequence[str]) -> list[dict[str, Any]]:
+    """The blocks of the whole log and of each week."""
+    return [{k: r[k] for k in columns} for r in frame.to_dict("records") if r["level"] in ("all", "week")]
 
 
 def plain(x: Any) -> Any:

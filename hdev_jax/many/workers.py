@@ -54,8 +54,9 @@ def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> 
             # threads are set before the processes start: they load NumPy before anything of ours runs
             stack.enter_context(_environment({**_ONE_THREAD, "XLA_FLAGS": _one_thread_xla()}))
             cluster = distributed.LocalCluster(
-                n_workers=min(where.count, len(tasks)), threads_per_worker=1, processes=True, dashboard_address=None,
-                memory_limit=0, silence_logs=50,
+                n_workers=min(where.count, len(tasks)), threads_per_worker=1, processes=True, memory_limit=0,
+                silence_logs=50,
+                dashboard_address=None,  # pyright: ignore[reportArgumentType]
             )  # fmt: skip
             stack.callback(cluster.close)
             client = distributed.Client(cluster, set_as_default=False)

@@ -15,7 +15,7 @@ from hdev_jax import cli
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.many import Workers, computed
 from hdev_jax.many import workers as workers_module
-from hdev_jax.verbs import fleet as verb_module
+from hdev_jax.verbs.many import fleet as verb_module
 
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs the extra fleet")
 

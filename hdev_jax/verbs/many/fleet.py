@@ -16,7 +16,7 @@ import numpy as np
 from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import read_sheet
-from hdev_jax.many import FleetResult, Source, Workers, computed, fleet_result, scanned_again, sources, vehicle_record
+from hdev_jax.many import FleetResult, Source, Workers, computed, fleet_result, looking_again, sources, vehicle_record
 from hdev_jax.report.many import fleet_page, fleet_text
 from hdev_jax.rundir import Run, atomic_file, open_run
 from hdev_jax.targets import TARGETS
@@ -25,8 +25,6 @@ from hdev_jax.verbs.energy.result import EnergyResult
 from hdev_jax.verbs.opening import digest
 
 __all__ = ["fleet"]
-
-LOOSE = 10.0  # times the sd with which a vehicle's own effect was fitted
 
 
 def fleet(
@@ -85,14 +83,7 @@ def fleet(
             first = next(r for r in records if r["status"] != "done")
             raise InputError(f"none of {len(records)} vehicles could be used; the first: {first['message']}")
         progress.step("what the vehicles tell together")
-        where = Workers(workers, scheduler)
-        tasks = {t["name"]: t for t in _tasks(each, common)}
-
-        def again(some: Sequence[Mapping[str, Any]], shown: Mapping[str, Any]) -> dict[str, Any]:
-            progress.step(f"{len(some)} vehicles again, beside {', '.join(shown)}")
-            todo = [{**tasks[r["name"]], "beside": {**shown, **_loose(r["fitted"])}} for r in some]
-            return {r["name"]: r["scan"] for _, r in computed(scanned_again, todo, where)}
-
+        again = looking_again(_tasks(each, common), Workers(workers, scheduler), progress.step)
         result = fleet_result(records, fdr=fdr, seed=seed, price=price, notes=notes, again=again)
         progress.step("writing the report")
         run.place(run.kept("fleet"))
@@ -151,11 +142,6 @@ def _tasks(each: Sequence[Source], common: Mapping[str, Any]) -> list[dict[str, 
         return None if path is None else str(Path(path).resolve())
 
     return [{**vars(s), "files": [whole(f) for f in s.files], "sheet": whole(s.sheet), **common} for s in each]
-
-
-def _loose(fitted: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, list[float]]]:
-    """A vehicle's own effects, their sizes to be fitted anew: wide enough that they are not counted twice."""
-    return {e: {n: [v, LOOSE * sd] for n, (v, sd) in ps.items()} for e, ps in fitted.items()}
 
 
 def _command(config: Mapping[str, Any], out: str | Path) -> str:
