@@ -108,8 +108,7 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
         ),
         Section(
             "Effects, vehicle by vehicle",
-            f"Adjusted for all types and effects together; a vehicle's own finds count in the fleet where their q is "
-            f"at most {s['highest_q_in_vehicle']:.2g}.",
+            _bound(s["highest_q_in_vehicle"]),
             {"effects_map": (lambda: effects_map(done, s["effects"]), "A map of effects by vehicle.",
                              "First-order size of each effect that the sheet does not declare, in standard errors.")},
             (_effects(s["effects"]),) if s["effects"] else (),
@@ -153,6 +152,11 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
                 sections, s["notes"], command, "each calibrated and diagnosed on its own log")  # fmt: skip
 
 
+def _bound(q: float) -> str:
+    own = f"those with q up to {q:.2g} count in the fleet" if q > 0 else "none counts in the fleet"
+    return f"Adjusted for all types and effects together. Of the vehicles' own finds {own}."
+
+
 def _unlike(unlike: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         (e["vehicle"], names.coefficient(e["coefficient"])[0], "changed" if e["kind"] == "change" else "differs",
@@ -169,10 +173,11 @@ def _effects(effects: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         (e["type"], names.effect(e["id"]), words.plus_minus(e["value"], e["sd"], e["unit"]), str(e["vehicles"]),
          str(e["named_in"]), f"{e['q']:.2g}", "yes" if e["found"] else "no")
-        for e in effects
+        for k, e in enumerate(effects) if e["found"] or k < MOST_LINES
     ]  # fmt: skip
     head = ("Type", "Effect", "Size", "Vehicles", "named alone", "q", "shown")
-    return Table("Effects added up over the vehicles of a type", head, rows, 2, "effects.csv")
+    caption = f"Effects added up over the vehicles of a type: the clearest of {len(effects)}, all in effects.csv"
+    return Table(caption, head, rows, 2, "effects.csv")
 
 
 def _pooled(pooled: Sequence[Mapping[str, Any]]) -> Table:
