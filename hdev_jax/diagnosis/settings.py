@@ -206,8 +206,8 @@ class FleetSettings:
     )
     least_side: int = _number(3, "least trips before and after a change", "trips", "two are a day's weather")
     least_clusters: float = _number(
-        4.0, "least number of trips that a vehicle's size rests on, to be added up over vehicles", "trips",
-        "a variance of three degrees of freedom",
+        2.0, "least number of trips that a vehicle's size rests on, to be added up over vehicles", "trips",
+        "the error of one trip is not known",
     )  # fmt: skip
     most_effects: int = _number(6, "effects that a type's vehicles show together at most", "effects", "a bound on time")
 

@@ -77,13 +77,20 @@ def scanned_again(task: Mapping[str, Any]) -> dict[str, Any]:
     """The scan of a vehicle beside its own effects and those that its type shows.
 
     **Arguments:** `task` as for `vehicle_record`, with `beside`: values and sds (0: known) by effect and parameter.
-    **Returns:** `name` and `scan`.
+    **Returns:** `name`, `scan`, and `message`: why it is empty, where the vehicle cannot be fitted so.
     """
+    try:
+        return plain({"name": task["name"], "scan": _beside(task), "message": ""})
+    except Exception as e:  # as in `vehicle_record`
+        return {"name": task["name"], "scan": {}, "message": " ".join(f"{type(e).__name__}: {e}".split())[:300]}
+
+
+def _beside(task: Mapping[str, Any]) -> dict[str, Any]:
     sheet = read_sheet(task["sheet"], library=LIBRARY)
     more = {e: {n: (v, sd, "") for n, (v, sd) in ps.items()} for e, ps in task["beside"].items()}
     text = tomllib.loads(augmented_sheet(sheet, {}, more))
     problem, split = _opened(task, Sheet(library=LIBRARY, path=task["sheet"], **text))
-    return plain({"name": task["name"], "scan": scan_beside(problem, split, Settings(fdr=task["fdr"]))})
+    return scan_beside(problem, split, Settings(fdr=task["fdr"]))
 
 
 def _opened(task: Mapping[str, Any], sheet: Sheet) -> tuple[Problem, Split]:
