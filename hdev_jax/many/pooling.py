@@ -11,7 +11,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, stats
 
-__all__ = ["Pooled", "cauchy", "pooled", "shrunk", "without_each"]
+__all__ = ["MANY", "Pooled", "cauchy", "pooled", "shrunk", "without_each"]
+
+
+MANY = 200  # estimates above which the spread over all stands for that without one: its error is 5 % or less
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,14 @@ def without_each(
     Student's t of n − 2 degrees of freedom."""
     n = len(value)
     away, error = np.empty(n), np.empty(n)
+    if n > MANY:  # one of so many hardly moves the spread: that of all, and the mean of the others in closed form
+        pool = pooled(value, sd)
+        w = 1.0 / (sd**2 + pool.between**2)
+        left = np.sum(w) - w
+        away = value - (np.sum(w * value) - w * value) / left
+        widened = pool.error**2 * np.sum(w) / left
+        error = np.sqrt(sd**2 + pool.between**2 + widened)
+        return away, error, 2.0 * stats.t.sf(np.abs(away) / error, n - 2)
     for k in range(n):
         other = np.arange(n) != k
         pool = pooled(value[other], sd[other])

@@ -7,7 +7,7 @@ from scipy import stats
 from hdev_jax.diagnosis.settings import FLEET_SETTINGS
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
 from hdev_jax.errors import InputError
-from hdev_jax.many import fleet_result, sources
+from hdev_jax.many import fleet_result, pooling, sources
 from hdev_jax.many.evidence import effects_of_types, families
 from hdev_jax.many.ledger import fleet_ledger
 from hdev_jax.many.pooling import cauchy, pooled, shrunk, without_each
@@ -56,6 +56,15 @@ def test_a_vehicle_is_compared_with_the_others_alone():
     assert away[7] == pytest.approx(6.0, abs=1.5)
     calm = np.array([without_each(*estimates(rng))[2] for _ in range(60)])
     assert 0.02 < np.mean(calm < 0.05) < 0.08
+
+
+def test_of_many_vehicles_each_is_compared_as_of_few(monkeypatch):
+    value, sd = estimates(np.random.default_rng(11), n=120)
+    few = without_each(value, sd)
+    monkeypatch.setattr(pooling, "MANY", 100)
+    many = without_each(value, sd)
+    np.testing.assert_allclose(many[0], few[0], atol=0.02)
+    np.testing.assert_allclose(many[1], few[1], rtol=0.03)
 
 
 def test_forms_of_one_effect_are_combined_whatever_their_correlation():
