@@ -35,6 +35,7 @@ from hdev_jax.options.common import (
 )
 from hdev_jax.options.energy import ENERGY_VERBS, energy_parsers
 from hdev_jax.options.export import export_parser
+from hdev_jax.options.fleet import fleet_parser
 
 __all__ = ["FOLDERS", "main", "parser"]
 
@@ -42,6 +43,7 @@ FOLDERS = {
     **dict.fromkeys(ENERGY_VERBS, "energy."),
     "follow": "live.",
     "export": "programs.",
+    "fleet": "many.",
 }  # within `verbs`
 
 _ABOUT = """\
@@ -73,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         _print(_run(verb, arguments))
     except KeyboardInterrupt:
-        resumes = verb in ("diagnose", "calibrate")
+        resumes = verb in ("diagnose", "calibrate", "fleet")
         return _fail("interrupted; the same command resumes" if resumes else "interrupted", 130)
     except BrokenPipeError:  # `hdev effects | head`: the reader has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -234,6 +236,7 @@ def parser() -> argparse.ArgumentParser:
 
     energy_parsers(verbs)
     export_parser(verbs)
+    fleet_parser(verbs)
 
     verbs.add_parser(
         "effects",
@@ -261,7 +264,7 @@ class _Help(argparse.HelpFormatter):
 
 
 def _run(verb: str, arguments: dict[str, Any]) -> Any:
-    if verb == "demo" or ("logs" in arguments and compiles_long(arguments["logs"])):
+    if verb == "demo" or ("logs" in arguments and compiles_long(_files_of(verb, arguments["logs"]))):
         compile_quickly()
     import jax
 
@@ -271,6 +274,13 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
     keep_compiled()
     with progress.shown():
         return getattr(import_module(f"hdev_jax.verbs.{FOLDERS.get(verb, '')}{verb}"), verb)(**arguments)
+
+
+def _files_of(verb: str, logs: Sequence[Path]) -> list[Path]:
+    """The logs whose size decides how programs are compiled: those given, and what is in a fleet's folders."""
+    if verb != "fleet":
+        return list(logs)
+    return [f for p in logs for f in ([p] if p.is_file() else p.rglob("*")) if f.is_file()]
 
 
 def _print(result: Any) -> None:

@@ -26,7 +26,8 @@ LAYERS = [
     {"inference", "learn", "fleet"},
     {"problem"},
     {"diagnosis", "energy", "export"},
-    {"online", "report"},
+    {"many", "online"},
+    {"report"},
     {"options", "verbs"},
     {"cli", "experiments"},
 ]

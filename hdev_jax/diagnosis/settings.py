@@ -8,7 +8,7 @@ grid, rounds of a search, draws, tolerances of a solver) are not among them.
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-__all__ = ["SETTINGS", "Settings", "described"]
+__all__ = ["FLEET_SETTINGS", "SETTINGS", "FleetSettings", "Settings", "described"]
 
 
 def _number(default: Any, meaning: str, unit: str, source: str) -> Any:
@@ -160,6 +160,32 @@ class Settings:
 
 
 SETTINGS = Settings()
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """Numbers that decide what is said of a fleet, beside those of each vehicle."""
+
+    fdr: float = _number(
+        0.05, "highest FDR-adjusted p-value of an effect of a type, of a vehicle that differs, of a change", "1",
+        "Benjamini and Hochberg, JRSS B 57 (1995)",
+    )  # fmt: skip
+    least_vehicles: int = _number(
+        4, "least number of vehicles of a type that are compared or pooled", "vehicles",
+        "a variance between vehicles of three degrees of freedom",
+    )  # fmt: skip
+    least_trips: int = _number(
+        8, "least number of trips for a change of a coefficient", "trips", "as for trips as clusters"
+    )
+    least_side: int = _number(3, "least trips before and after a change", "trips", "two are a day's weather")
+    least_clusters: float = _number(
+        2.0, "least number of trips that a vehicle's size rests on, to be added up over vehicles", "trips",
+        "the error of one trip is not known",
+    )  # fmt: skip
+    most_effects: int = _number(6, "effects that a type's vehicles show together at most", "effects", "a bound on time")
+
+
+FLEET_SETTINGS = FleetSettings()
 
 
 def described() -> list[dict[str, Any]]:

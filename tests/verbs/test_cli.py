@@ -18,7 +18,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.options.energy import ENERGY_VERBS
 
 VERBS = (
-    "check", "init", "diagnose", "calibrate", "predict", "follow", "export", "simulate", "demo", "effects",
+    "check", "init", "diagnose", "calibrate", "predict", "follow", "export", "fleet", "simulate", "demo", "effects",
     *ENERGY_VERBS,
 )  # fmt: skip
 SHEET = ["--vehicle", "v.toml"]

@@ -1,0 +1,3 @@
+"""Synthetic fleets of measured vehicles: what only a fleet can tell, is it true?"""
+
+__all__ = []

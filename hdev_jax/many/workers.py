@@ -1,0 +1,118 @@
+"""Where vehicles are worked out: in this process, in worker processes, or on a Dask cluster whose workers come and go.
+
+Each way yields `(index, record)` in the order in which vehicles end. What a lost worker had in hand another one does.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hdev_jax.compiling import keep_compiled
+from hdev_jax.errors import InputError
+
+__all__ = ["Workers", "computed"]
+
+PATIENCE_S = 30  # for a scheduler to answer
+RETRIES = 3  # of a vehicle whose worker was lost
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+_NO_DASK = "needs Dask: pip install 'hdev_jax[fleet]'"
+
+Work = Callable[[Mapping[str, Any]], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Workers:
+    """`count` processes on this machine, or the Dask cluster at `scheduler` (its address, or its file)."""
+
+    count: int = 1
+    scheduler: str | None = None
+
+
+def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> Iterator[tuple[int, dict[str, Any]]]:
+    """`work(task)` of each task, with its index, as they end.
+
+    **Arguments:** `work`, a function that a module of this package defines, of plain values to plain values.
+    **Raises:** `InputError` where Dask is needed and not installed, or no scheduler answers.
+    """
+    if not tasks:
+        return
+    if where.scheduler is None and (where.count < 2 or len(tasks) < 2):
+        for i, task in enumerate(tasks):
+            yield i, work(task)
+        return
+    option = f"--scheduler {where.scheduler}" if where.scheduler else f"--workers {where.count}"
+    try:
+        import distributed
+    except ImportError as e:
+        raise InputError(f"{option}: {_NO_DASK}") from e
+    with contextlib.ExitStack() as stack:
+        if where.scheduler is None:
+            # threads are set before the processes start: they load NumPy before anything of ours runs
+            stack.enter_context(_environment({**_ONE_THREAD, "XLA_FLAGS": _one_thread_xla()}))
+            cluster = distributed.LocalCluster(
+                n_workers=min(where.count, len(tasks)), threads_per_worker=1, processes=True, memory_limit=0,
+                silence_logs=50,
+                dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            )  # fmt: skip
+            stack.callback(cluster.close)
+            client = distributed.Client(cluster, set_as_default=False)
+        else:
+            client = _client_of(where.scheduler, option)
+        stack.callback(client.close)
+        futures = [client.submit(_there, work, dict(t), pure=False, retries=RETRIES) for t in tasks]
+        index = {f.key: i for i, f in enumerate(futures)}
+        for future in distributed.as_completed(futures, loop=client.loop):
+            if future.status in ("cancelled", "lost"):
+                raise InputError(f"{option}: the scheduler is gone; start it, and the same command goes on")
+            try:
+                record = future.result()
+            except distributed.KilledWorker as e:
+                raise InputError(
+                    f"{option}: every worker that took {tasks[index[future.key]].get('name')} was killed (out of "
+                    "memory?); what is done is kept, and the same command goes on"
+                ) from e
+            yield index[future.key], record
+            future.release()
+
+
+def _client_of(address: str, option: str) -> Any:
+    import distributed
+
+    try:
+        at = json.loads(Path(address).read_text())["address"] if Path(address).is_file() else address
+    except (OSError, ValueError, LookupError, TypeError) as e:
+        raise InputError(f"{option}: is no scheduler's file") from e
+    try:
+        return distributed.Client(at, timeout=PATIENCE_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as e:
+        raise InputError(f"{option}: no scheduler answers there ({type(e).__name__})") from e
+
+
+def _one_thread_xla() -> str:
+    one = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    asked = os.environ.get("XLA_FLAGS", "")
+    return asked if one in asked else f"{asked} {one}".strip()
+
+
+@contextlib.contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+def _there(work: Work, task: dict[str, Any]) -> dict[str, Any]:
+    """What a worker does: double precision, the cache of compiled programs that all of them share, the task."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    keep_compiled()
+    return work(task)

@@ -1,0 +1,3 @@
+"""Verbs about many vehicles, as commands and as Python functions."""
+
+__all__ = []

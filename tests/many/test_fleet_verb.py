@@ -1,0 +1,178 @@
+"""`hdev fleet` from files to its folder: bad logs, a resumed run, worker processes, a data set by vehicle."""
+
+import contextlib
+import importlib.util
+import io
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from hdev_jax import cli
+from hdev_jax.fleet import synthetic_log
+from hdev_jax.many import Workers, computed
+from hdev_jax.many import workers as workers_module
+from hdev_jax.verbs.many import fleet as verb_module
+
+needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs the extra fleet")
+
+
+def hdev(*argv: object) -> tuple[int, str, str]:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = cli.main([str(a) for a in argv])
+    assert status != 1, err.getvalue()
+    said = [line for line in err.getvalue().splitlines() if line.startswith("hdev: ")]
+    return status, out.getvalue(), said[0] if said else ""
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory) -> Path:
+    """Four short logs of one type, as a folder of files; one of them is bad, one a data set's partition."""
+    folder = tmp_path_factory.mktemp("fleet")
+    (folder / "logs").mkdir()
+    for k in range(3):
+        made = synthetic_log(seed=40 + k, trips=9, rows_per_trip=60)
+        frame = made.frame.drop(columns="vehicle_id")
+        trip = frame["trip_id"].str[1:].astype(int)
+        frame["time_unix"] = 1.7e9 + trip * 4 * 86_400.0 + frame.pop("time_s")
+        if k < 2:
+            frame.to_csv(folder / "logs" / f"V{k}.csv", index=False)
+            continue
+        at = folder / "logs" / f"vehicle_id=V{k}"
+        at.mkdir()
+        # a trip begins in one part and ends in the next
+        for part, rows in enumerate((frame.iloc[:100], frame.iloc[100:])):
+            rows.to_parquet(at / f"part-{part}.parquet")
+    (folder / "logs" / "bad.csv").write_text("a,b\n1,2\n")
+    (folder / "truck.toml").write_text(made.sheet)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(logs) -> Path:
+    out = logs / "out"
+    assert hdev("fleet", logs / "logs", "--vehicles", logs / "truck.toml", "--price", 0.2, "--out", out)[0] == 0
+    return out
+
+
+def same(a, b, where=""):
+    """Equal but for times, numbers to 1e-9."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for k in a.keys() - {"seconds"}:
+            same(a[k], b[k], f"{where}/{k}")
+    elif isinstance(a, list):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            same(x, y, f"{where}[{i}]")
+    elif isinstance(a, float):
+        assert a == pytest.approx(b, rel=1e-9, abs=1e-12), where
+    else:
+        assert a == b, where
+
+
+def read(out: Path) -> dict:
+    return json.loads((out / "fleet.json").read_text())
+
+
+def test_every_vehicle_has_a_line_the_bad_one_with_what_check_says(logs, whole):
+    found = read(whole)
+    assert found["counts"] == {"done": 3, "suspect": 0, "refused": 1, "failed": 0}
+    line = pd.read_csv(whole / "fleet.csv").set_index("name").loc["bad"]
+    assert f"hdev: {line['message']}" == hdev("check", logs / "logs" / "bad.csv")[2]
+    assert {p.stem for p in (whole / "vehicles").iterdir()} == {"V0", "V1", "V2", "bad"}
+    page = (whole / "report.html").read_text()
+    assert "synthetic" in page
+    assert line["message"].split(";")[0] in page
+    for v in found["vehicles"]:
+        assert v["status"] == "refused" or v["trips"] == 9, "parts of a data set are one log"
+
+
+def test_the_ledger_adds_up_to_what_the_meters_measured(logs, whole):
+    rows = pd.read_csv(whole / "ledger.csv")
+    block = rows[rows["level"] == "fleet"].set_index("cause")["kwh"]
+    logs_wh = [pd.read_csv(logs / "logs" / f"V{k}.csv")["energy_wh"].sum() for k in range(2)]
+    logs_wh.append(pd.read_parquet(logs / "logs" / "vehicle_id=V2", partitioning=None)["energy_wh"].sum())
+    assert block["measured"] == pytest.approx(sum(logs_wh) / 1e3, rel=1e-6)
+    assert block.drop("measured").sum() == pytest.approx(block["measured"], rel=1e-6)
+
+
+def test_a_run_that_was_killed_goes_on_and_gives_the_same(logs, whole, monkeypatch):
+    out = logs / "resumed"
+    seen = []
+
+    def stops(work, tasks, where):
+        for i, record in computed(work, tasks, where):
+            if len(seen) == 2:
+                raise KeyboardInterrupt
+            seen.append(tasks[i]["name"])
+            yield i, record
+
+    command = ("fleet", logs / "logs", "--vehicles", logs / "truck.toml", "--price", 0.2, "--out", out)
+    monkeypatch.setattr(verb_module, "computed", stops)
+    assert hdev(*command)[0] == 130
+    again = []
+    monkeypatch.setattr(
+        verb_module, "computed", lambda w, t, p: (again.extend(x["name"] for x in t), computed(w, t, p))[1]
+    )
+    assert hdev(*command)[0] == 0
+    assert sorted(seen + again) == ["V0", "V1", "V2", "bad"]
+    same(read(whole), read(out))
+    again.clear()
+    assert hdev(*command)[1].startswith("3 vehicles diagnosed")
+    assert again == [], "a folder that is complete is returned"
+
+
+def dies_once(task):
+    """A worker that is killed by the first task that has no mark yet."""
+    mark = Path(task["mark"])
+    if task["name"] == "b" and not mark.exists():
+        mark.touch()
+        os._exit(9)
+    return {"name": task["name"], "twice": 2 * task["value"]}
+
+
+@needs_dask
+@pytest.mark.slow
+def test_worker_processes_give_the_same(logs, whole):
+    out = logs / "spread"
+    command = ("fleet", logs / "logs", "--vehicles", logs / "truck.toml", "--price", 0.2, "--out", out)
+    assert hdev(*command, "--workers", 2)[0] == 0
+    same(read(whole), read(out))
+
+
+@needs_dask
+@pytest.mark.slow
+def test_a_worker_that_is_killed_changes_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
+    tasks = [{"name": n, "value": k, "mark": str(tmp_path / "mark")} for k, n in enumerate("abcd")]
+    found = dict(computed(dies_once, tasks, Workers(2)))
+    assert found == {k: {"name": n, "twice": 2 * k} for k, n in enumerate("abcd")}
+    assert (tmp_path / "mark").exists()
+
+
+def test_without_dask_more_workers_are_refused_in_one_line(logs, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    command = ("fleet", logs / "logs", "--vehicles", logs / "truck.toml", "--workers", 2, "--out", logs / "none")
+    status, _, said = hdev(*command)
+    assert status == 2
+    assert "--workers 2: needs Dask: pip install 'hdev_jax[fleet]'" in said
+
+
+@needs_dask
+def test_a_scheduler_that_is_not_there_is_refused_in_one_line(monkeypatch):
+    monkeypatch.setattr(workers_module, "PATIENCE_S", 0.2)
+    with pytest.raises(workers_module.InputError, match="no scheduler answers"):
+        list(computed(dies_once, [{}], Workers(1, "tcp://127.0.0.1:9")))
+
+
+def test_a_fleet_of_bad_logs_alone_is_refused(logs, tmp_path):
+    shutil.copy(logs / "logs" / "bad.csv", tmp_path / "bad.csv")
+    status, _, said = hdev("fleet", tmp_path / "bad.csv", "--vehicles", logs / "truck.toml", "--out", tmp_path / "out")
+    assert status == 2
+    assert "none of 1 vehicles could be used" in said
+    assert "no column speed_mps" in said
