@@ -120,7 +120,7 @@ def _effect(scans: Sequence[Mapping[str, Any]], id_: str, settings: FleetSetting
         inside = parameter.lower <= float(parameter.null) + pool.mean <= parameter.upper
         plausible = inside and abs(pool.mean) >= parameter.least
     else:
-        plausible = SETTINGS.switch_low <= pool.mean <= SETTINGS.switch_high
+        plausible = SETTINGS.switch_low <= pool.mean <= 1.0 / SETTINGS.switch_low
     return {
         "id": id_, "kind": kind, "size": parameter.name, "unit": parameter.unit if kind == "size" else "1",
         "shapes": shapes, "value": pool.mean, "sd": pool.error, "between": pool.between, "vehicles": pool.n,
