@@ -91,8 +91,8 @@ def open_sheet(
     """The sheet with c_rr, C_d·A and B estimated from the log: half of each is its sd, or what the sheet has.
 
     Weather that the log (`segments`) has, and the sheet no effect for, is corrected as a coast-down's would be: wind
-    along and across the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is what is
-    measured, loads that would pass for a force are estimated too: the auxiliary one, heating and cooling.
+    along and across the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is
+    what is measured, loads that would pass for a force are estimated too: the auxiliary one, heating and cooling.
 
     **Raises:** `InputError` for a sheet without `road.c_rr` or `road.cda_m2`.
     """
