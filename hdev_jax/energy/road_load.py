@@ -88,11 +88,11 @@ def driven_range(segments: Segments) -> tuple[float, float]:
 def open_sheet(
     sheet: Sheet, mass_kg: float, segments: Segments | None = None, *, battery: bool = True
 ) -> tuple[Sheet, list[str]]:
-    """The sheet with c_rr, C_d·A and B estimated from the log: half of the value is its sd, unless the sheet's is wider.
+    """The sheet with c_rr, C_d·A and B estimated from the log: half of each is its sd, or what the sheet has.
 
     Weather that the log (`segments`) has, and the sheet no effect for, is corrected as a coast-down's would be: wind
-    along and across the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is what is
-    measured, loads that would pass for a force are estimated too: the auxiliary one, heating and cooling.
+    along and across the road, density of the air, rolling resistance with temperature. Where energy at the `battery` is
+    what is measured, loads that would pass for a force are estimated too: the auxiliary one, heating and cooling.
 
     **Raises:** `InputError` for a sheet without `road.c_rr` or `road.cda_m2`.
     """
@@ -205,7 +205,7 @@ def _left_open(
     for name, c, s in zip((c.path for c in table.free), table.free, sd, strict=True):
         letter = {"road.c_rr": "A", "road.b_n_per_mps": "B", "road.cda_m2": "C"}.get(name)
         if letter and c.sd and s > UNSAID * c.sd:
-            out.append(f"{letter}: the log says next to nothing of it; its interval is the sheet's ({name})")
+            out.append(f"{letter}: the log says next to nothing of it; its interval is as wide as before it ({name})")
     if not driven[0] < SHOWN_KMH[0] < driven[1] or not driven[0] < SHOWN_KMH[1] < driven[1]:
         out.append(
             f"90 % of the way was driven at {driven[0]:.0f} to {driven[1]:.0f} km/h: forces at other speeds are "
