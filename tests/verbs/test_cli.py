@@ -18,7 +18,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.options.energy import ENERGY_VERBS
 
 VERBS = (
-    "check", "init", "diagnose", "calibrate", "predict", "follow", "simulate", "demo", "effects", *ENERGY_VERBS
+    "check", "init", "diagnose", "calibrate", "predict", "follow", "serve", "simulate", "demo", "effects", *ENERGY_VERBS
 )  # fmt: skip
 SHEET = ["--vehicle", "v.toml"]
 
