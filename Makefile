@@ -10,11 +10,14 @@ PIP := $(PY) -m pip --disable-pip-version-check --no-input install -qq -c constr
 # What one process has compiled to bytecode the others read, where the environment says otherwise too.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo paper test lint types docs FORCE
+.PHONY: demo live paper test lint types docs FORCE
 .DELETE_ON_ERROR:
 
 demo: $(READY)
 	@$(PY) -m hdev_jax.cli demo --out out/demo
+
+live: $(READY)
+	@$(PY) -m experiments.live $(ARGS)
 
 paper: $(READY)
 	@$(PY) -m experiments configs/paper.toml --out out/paper --workers 0 $(ARGS)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from hdev_jax.verbs.energy.whatif import whatif
     from hdev_jax.verbs.init import init
     from hdev_jax.verbs.live.follow import follow
+    from hdev_jax.verbs.live.serve import serve
     from hdev_jax.verbs.predict import predict
     from hdev_jax.verbs.programs.export import export
     from hdev_jax.verbs.result import CalibrationResult, Diagnosis, Prediction
@@ -51,6 +52,7 @@ __all__ = [
     "read_sheet",
     "roadload",
     "saved",
+    "serve",
     "simulate",
     "whatif",
 ]
@@ -72,6 +74,7 @@ _HOME = {
     "effects": "hdev_jax.verbs.effects",
     "export": "hdev_jax.verbs.programs.export",
     "follow": "hdev_jax.verbs.live.follow",
+    "serve": "hdev_jax.verbs.live.serve",
     "init": "hdev_jax.verbs.init",
     "compare": "hdev_jax.verbs.energy.compare",
     "saved": "hdev_jax.verbs.energy.saved",

@@ -36,12 +36,13 @@ from hdev_jax.options.common import (
 from hdev_jax.options.energy import ENERGY_VERBS, energy_parsers
 from hdev_jax.options.export import export_parser
 from hdev_jax.options.fleet import fleet_parser
+from hdev_jax.options.live import LIVE_VERBS, live_parsers
 
 __all__ = ["FOLDERS", "main", "parser"]
 
 FOLDERS = {
     **dict.fromkeys(ENERGY_VERBS, "energy."),
-    "follow": "live.",
+    **dict.fromkeys(LIVE_VERBS, "live."),
     "export": "programs.",
     "fleet": "many.",
 }  # within `verbs`
@@ -192,25 +193,7 @@ def parser() -> argparse.ArgumentParser:
     predict.add_argument("--level", type=share, default=0.9, metavar="P", help=level)
     predict.add_argument("--online", action="store_true", help="loads that switch follow the power of the rows before")
 
-    follow = verbs.add_parser(
-        "follow",
-        help="rows of a vehicle as they arrive: its energy, its coefficients, what its sheet lacks",
-        description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
-        "is predicted from those before it, and tells more of the sheet's coefficients.",
-        epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
-        "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
-        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
-    )
-    file_argument(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
-    file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
-    file_argument(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
-    file_argument(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
-    target_option(follow)
-    effects_option(follow)
-    follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
-    follow.add_argument(
-        "--no-watch", dest="watch", action="store_false", help="do not look for effects that the sheet lacks"
-    )
+    live_parsers(verbs)
 
     simulate = verbs.add_parser(
         "simulate",

@@ -7,15 +7,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.inference.sheet import Sheet
+from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.logs.adapter import Adapter
 from hdev_jax.online.form import Form
 from hdev_jax.online.live import Live
-from hdev_jax.online.state import Now, start
+from hdev_jax.online.state import Now, State, start
 from hdev_jax.online.stream import Arrived, Stream, channels_of, target_in
 from hdev_jax.online.watch import Alarm, Watch
+from hdev_jax.physics import LIBRARY
 
 __all__ = ["Followed", "plain", "plain_alarm"]
+
+
+MOST_BEGUN = 32
+_BEGUN: dict[Any, tuple[State, Watch | None, list[str]]] = {}  # vehicles of one sheet begin alike
 
 
 class Followed:
@@ -39,21 +44,34 @@ class Followed:
         """What rows are. Raises `ValueError` before the first one."""
         if self.live is None:
             raise ValueError("no row has come yet")
-        return self.live.state.form
+        return self.live.form
 
     def begin(self, names: Iterable[str]) -> None:
         """The state, once it is known which columns rows have. Raises `InputError`."""
         self.columns = sorted(names)
         self.target = target_in(self.columns, self.target)
-        channels = channels_of(self.columns)
-        state, self.notes = start(self.sheet, channels, self.target)  # type: ignore[arg-type]
-        if self.watching:
-            self.watch = Watch.of(state, self.sheet.library)
-            state, _ = start(self.sheet, channels, self.target, candidates=self.watch.candidates)  # type: ignore[arg-type]
-        if "grade_rad" not in channels and state.vehicle.entry == "road":
-            self.notes.append("the rows have no slope (grade_rad): the road is taken as level")
+        key = (augmented_sheet(self.sheet, {}, {}), tuple(self.columns), self.target, self.watching)
+        if self.sheet.library is not LIBRARY:
+            state, self.watch, self.notes = self._begun()
+        elif key in _BEGUN:
+            state, self.watch, self.notes = _BEGUN[key]
+        else:
+            if len(_BEGUN) >= MOST_BEGUN:
+                _BEGUN.pop(next(iter(_BEGUN)))
+            state, self.watch, self.notes = _BEGUN[key] = self._begun()
         self.live = Live(state)
         self.began()
+
+    def _begun(self) -> tuple[State, Watch | None, list[str]]:
+        """The state before the first row, what is watched beside it, and notes."""
+        channels = channels_of(self.columns)
+        state, notes = start(self.sheet, channels, self.target)  # type: ignore[arg-type]
+        watch = Watch.of(state, self.sheet.library) if self.watching else None
+        if watch is not None:
+            state, _ = start(self.sheet, channels, self.target, candidates=watch.candidates)  # type: ignore[arg-type]
+        if "grade_rad" not in channels and state.vehicle.entry == "road":
+            notes.append("the rows have no slope (grade_rad): the road is taken as level")
+        return state, watch, notes
 
     def take(self, records: Iterable[Mapping[str, Any] | None]) -> Iterator[tuple[Arrived, Now]]:
         """Some rows by header, in order; None for one that does not read. Raises `InputError` where none reads."""

@@ -20,6 +20,28 @@ from hdev_jax.rundir import atomic_file
 __all__ = ["Live", "keep", "kept"]
 
 SCHEMA = "hdev-follow/1"
+MOST_PROGRAMS = 32  # forms of which the compiled program is kept
+_PROGRAMS: dict[Any, "_Program"] = {}
+
+
+class _Program:
+    """One row, compiled: from all that changes as one vector to the same and what is known."""
+
+    def __init__(self, state: State):
+        changing, constant = eqx.partition(state, _changes(state))
+        _, whole = ravel_pytree(changing)
+        _, structure = jax.tree.flatten(constant)
+        self.restored = lambda flat, leaves: eqx.combine(whole(flat), jax.tree.unflatten(structure, leaves))
+        form = state.form
+        now = jax.eval_shape(update, state, jnp.zeros(len(form.columns)), jnp.zeros(len(form.candidates)))[1]
+        self.sizes = [(leaf.shape, int(leaf.size)) for leaf in jax.tree.leaves(now)]
+        self.shape = jax.tree.structure(now)
+
+        def step(flat: Any, leaves: Any, row: Any, candidates: Any) -> tuple[Any, Any]:
+            new, now = update(self.restored(flat, leaves), row, candidates)
+            return ravel_pytree(eqx.filter(new, _changes(new)))[0], ravel_pytree(now)[0]
+
+        self.step = jax.jit(step, donate_argnums=0)
 
 
 class Live:
@@ -31,38 +53,33 @@ class Live:
 
     def __init__(self, state: State):
         changing, constant = eqx.partition(state, _changes(state))
-        self._flat, self._whole = ravel_pytree(changing)
-        self._constant, structure = jax.tree.flatten(constant)
-        now = jax.eval_shape(update, state, jnp.zeros(len(state.form.columns)), jnp.zeros(len(state.form.candidates)))[
-            1
-        ]
-        empty = jax.tree.map(lambda leaf: np.zeros(leaf.shape), now)
-        _, self._now = ravel_pytree(empty)
-        self._sizes = [(leaf.shape, int(leaf.size)) for leaf in jax.tree.leaves(empty)]
-        self._shape = jax.tree.structure(empty)
-        self._restored = lambda flat, leaves: eqx.combine(self._whole(flat), jax.tree.unflatten(structure, leaves))
-
-        def step(flat: Any, leaves: Any, row: Any, candidates: Any) -> tuple[Any, Any]:
-            new, now = update(self._restored(flat, leaves), row, candidates)
-            return ravel_pytree(eqx.filter(new, _changes(new)))[0], ravel_pytree(now)[0]
-
-        self._step = jax.jit(step, donate_argnums=0)
+        self.form = state.form
+        self._flat, _ = ravel_pytree(changing)
+        self._constant = jax.tree.leaves(constant)
+        # vehicles of one form share a compiled program
+        leaves, structure = jax.tree.flatten(state)
+        key = (structure, tuple((x.shape, str(x.dtype)) for x in leaves))
+        if key not in _PROGRAMS:
+            if len(_PROGRAMS) >= MOST_PROGRAMS:
+                _PROGRAMS.pop(next(iter(_PROGRAMS)))
+            _PROGRAMS[key] = _Program(state)
+        self._program = _PROGRAMS[key]
         self._none = np.zeros(len(state.form.candidates))
 
     def __call__(self, row: Float[np.ndarray, " column"], candidates: Any = None) -> Now:
         """One row more, as `update`; what is known now, as NumPy arrays."""
         each = self._none if candidates is None else candidates
-        self._flat, told = self._step(self._flat, self._constant, row, each)
+        self._flat, told = self._program.step(self._flat, self._constant, row, each)
         told, at, leaves = np.asarray(told), 0, []
-        for shape, size in self._sizes:
+        for shape, size in self._program.sizes:
             leaves.append(told[at : at + size].reshape(shape))
             at += size
-        return jax.tree.unflatten(self._shape, leaves)
+        return jax.tree.unflatten(self._program.shape, leaves)
 
     @property
     def state(self) -> State:
         """What is known after the rows so far."""
-        return self._restored(self._flat, self._constant)
+        return self._program.restored(self._flat, self._constant)
 
     @property
     def numbers(self) -> Float[np.ndarray, " number"]:

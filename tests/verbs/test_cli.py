@@ -18,8 +18,8 @@ from hdev_jax.errors import InputError
 from hdev_jax.options.energy import ENERGY_VERBS
 
 VERBS = (
-    "check", "init", "diagnose", "calibrate", "predict", "follow", "export", "fleet", "simulate", "demo", "effects",
-    *ENERGY_VERBS,
+    "check", "init", "diagnose", "calibrate", "predict", "follow", "serve", "export", "fleet", "simulate", "demo",
+    "effects", *ENERGY_VERBS,
 )  # fmt: skip
 SHEET = ["--vehicle", "v.toml"]
 

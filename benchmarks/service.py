@@ -1,0 +1,154 @@
+"""Load on `hdev serve` on this machine: rows a second and the times of its answers; and what a kill costs.
+
+    python benchmarks/service.py --vehicles 100 --seconds 20
+    python benchmarks/service.py --kills 20
+
+Needs the extras `serve` and `test`. Rows are the demo's, sent by a few clients, each row once.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2 as httpx
+import numpy as np
+
+from hdev_jax.fleet import demo_log
+
+__all__ = ["main"]
+
+COLUMNS = ["trip_id", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "mass_kg", "grade_rad",
+           "energy_wh"]  # fmt: skip
+
+
+def main() -> int:
+    """Run it."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("--vehicles", type=int, default=100)
+    arguments.add_argument("--seconds", type=float, default=20.0)
+    arguments.add_argument("--batch", type=int, default=100, help="rows of a request, of one vehicle each")
+    arguments.add_argument("--clients", type=int, default=4)
+    arguments.add_argument("--kills", type=int, default=0, help="instead: kill -9 it so many times while rows come")
+    a = arguments.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder, log = Path(name), demo_log(3, trips=12)
+        files = log.write(folder / "log", truth=False)
+        (folder / "sheets").mkdir()
+        shutil.copy(files["sheet"], folder / "sheets" / "default.toml")
+        rows = json.loads(log.frame[COLUMNS].to_json(orient="records"))
+        if a.kills:
+            return _killed(folder, rows, a.kills)
+        _loaded(folder, rows, a)
+    return 0
+
+
+@contextlib.contextmanager
+def _service(folder: Path, *options: str) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = s.getsockname()[1]
+    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(folder / "sheets"), "--state",
+               str(folder / "state.sqlite"), "--port", str(port), *options]  # fmt: skip
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    url = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(600):
+            with contextlib.suppress(httpx.TransportError):
+                httpx.get(f"{url}/healthz")
+                break
+            time.sleep(0.1)
+        yield url, process
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def _loaded(folder: Path, rows: list[dict[str, Any]], a: argparse.Namespace) -> None:
+    for watch in ((), ("--no-watch",)):
+        shutil.rmtree(folder / "state", ignore_errors=True)
+        for f in folder.glob("state.sqlite*"):
+            f.unlink()
+        with _service(folder, *watch) as (url, _):
+            first = [{"vehicle_id": "warm", **r} for r in rows[:300]]
+            httpx.post(f"{url}/v1/rows", json={"rows": first}, timeout=300).raise_for_status()
+            times, sent, until = [], [0], time.monotonic() + a.seconds
+            lock = threading.Lock()
+
+            def client(k: int, url: str = url, times: list[float] = times, sent: list[int] = sent,
+                       until: float = until, lock: Any = lock) -> None:  # fmt: skip
+                with httpx.Client(timeout=60) as http:
+                    at = dict.fromkeys(range(k, a.vehicles, a.clients), 0)
+                    while time.monotonic() < until:
+                        for v in at:
+                            part = rows[at[v] : at[v] + a.batch]
+                            if not part or time.monotonic() > until:
+                                continue
+                            body = {"rows": [{"vehicle_id": f"V{v}", **r} for r in part]}
+                            begun = time.monotonic()
+                            http.post(f"{url}/v1/rows", json=body).raise_for_status()
+                            with lock:
+                                times.append(time.monotonic() - begun)
+                                sent[0] += len(part)
+                            at[v] += len(part)
+
+            begun = time.monotonic()
+            threads = [threading.Thread(target=client, args=(k,)) for k in range(a.clients)]
+            for t in threads:
+                t.start()
+            for t in threads:
+                t.join()
+            ms = 1e3 * np.quantile(times, [0.5, 0.99])
+            print(
+                f"{'not watched' if watch else 'effects watched'}: {sent[0] / (time.monotonic() - begun):,.0f} rows a "
+                f"second in requests of {a.batch}; answers after {ms[0]:.0f} ms in the median, 99 % by {ms[1]:.0f} "
+                f"ms; "
+                f"{a.clients} clients, {a.vehicles} vehicles, load of the machine {os.getloadavg()[0]:.1f}",
+                flush=True,
+            )
+
+
+def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
+    """Kill it while a batch is on its way, start it, send the batch again; then compare with one that ran through."""
+    from hdev_jax.online.service import Fleet, Journal, sheets_in
+    from hdev_jax.online.service.fleet import checked
+
+    size, rng = max(len(rows) // (kills + 1), 1), np.random.default_rng(0)
+    for k in range(kills + 1):
+        part = {"rows": [{"vehicle_id": "T", **r} for r in rows[k * size : (k + 1) * size]]}
+        with _service(folder, "--no-watch") as (url, process):
+            if k < kills:
+                killer = threading.Timer(float(rng.uniform(0.0, 1.0)), lambda p=process: p.send_signal(signal.SIGKILL))
+                killer.start()
+                with contextlib.suppress(httpx.TransportError):
+                    for i in range(0, len(part["rows"]), 10):
+                        body = {"rows": part["rows"][i : i + 10]}
+                        httpx.post(f"{url}/v1/rows", json=body, timeout=60)
+                process.wait()
+        with _service(folder, "--no-watch") as (url, _):
+            httpx.post(f"{url}/v1/rows", json=part, timeout=120).raise_for_status()
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    through = Fleet(Journal(":memory:"), sheets_in(folder / "sheets"), watch=False)
+    through.put("fleet", checked([{"vehicle_id": "T", **r} for r in rows[: (kills + 1) * size]]))
+    again = Fleet(Journal(folder / "state.sqlite"), sheets_in(folder / "sheets"), watch=False)
+    own, other = (f.known("fleet", "T") for f in (again, through))
+    same = own == other
+    print(f"{kills} kills: {'the same' if same else 'ANOTHER'} state and counts as without: {own and own['rows']}")
+    return 0 if same else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

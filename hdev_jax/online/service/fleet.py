@@ -1,0 +1,313 @@
+"""The vehicles of all fleets in one process: rows put in order, used, and kept."""
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdev_jax.errors import InputError
+from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
+from hdev_jax.logs.adapter import Adapter
+from hdev_jax.online.followed import Followed, plain, plain_alarm
+from hdev_jax.online.forecast import forecast
+from hdev_jax.online.service.journal import Journal, Kept, Sent
+from hdev_jax.online.stream import Arrived
+
+__all__ = ["Fleet", "RefusedError", "checked", "sheets_in"]
+
+ORDERED_S = 60.0  # rows that come this much late are put in order; so much the estimates are behind the newest row
+KEPT_ROWS = 500  # of a vehicle between two states that are written: what a start has to use again
+KEPT_S = 10.0
+LONGEST_NAME = 200
+HUGE = 1e300  # NaN, infinity and integers that no float holds are no numbers
+FARTHEST_S = 86_400.0  # ahead of the newest row of its trip: a clock at fault
+TEXTS = ("vehicle_id", "trip_id")
+SHOWN = 240  # rows that a page of a vehicle has
+
+
+class RefusedError(Exception):
+    """A batch of which nothing was kept: `where`, the row and its field; `why`, what was expected."""
+
+    def __init__(self, where: list[str | int], why: str):
+        super().__init__(f"{'.'.join(map(str, where))}: {why}")
+        self.where, self.why = where, why
+
+
+def checked(rows: Any) -> list[tuple[str, str, float, dict[str, Any]]]:
+    """Rows of a request as the journal takes them. Raises `RefusedError` at the first field that is something else."""
+    if not isinstance(rows, list):
+        raise RefusedError(["rows"], "a list of rows is expected")
+    out = []
+    for i, row in enumerate(rows):
+        if not isinstance(row, dict):
+            raise RefusedError(["rows", i], "an object with vehicle_id, trip_id, time_s and channels is expected")
+        for name in TEXTS:
+            value = row.get(name, "" if name == "trip_id" else None)
+            if isinstance(value, bool) or not isinstance(value, str | int):
+                raise RefusedError(["rows", i, name], "a text is expected")
+            if (name == "vehicle_id" and not str(value).strip()) or len(str(value)) > LONGEST_NAME:
+                raise RefusedError(["rows", i, name], f"a text of 1 to {LONGEST_NAME} characters is expected")
+        for name, value in row.items():
+            if name in TEXTS or value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
+                raise RefusedError(["rows", i, name], "a finite number is expected, or null")
+        if row.get("time_s") is None:
+            raise RefusedError(["rows", i, "time_s"], "the time of the row in seconds is expected")
+        body = {k: v for k, v in row.items() if k not in TEXTS}
+        out.append((str(row["vehicle_id"]), str(row.get("trip_id", "")), float(row["time_s"]), body))
+    return out
+
+
+@dataclass
+class _Vehicle:
+    """One vehicle in memory: its estimator, rows that wait for those before them, what is new since it was kept."""
+
+    followed: Followed
+    upto: int = 0
+    waiting: list[Sent] = field(default_factory=list)
+    newest: tuple[str, float] | None = None
+    used_s: float = -math.inf  # time of the last row that was used, in its trip
+    ended: list[str] = field(default_factory=list)  # trips
+    late: int = 0
+    ahead: int = 0
+    refused: str | None = None  # why its rows cannot be used at all
+    last: dict[str, Any] = field(default_factory=dict)
+    recent: list[dict[str, Any]] = field(default_factory=list)
+    since: int = 0
+    kept_at: float = field(default_factory=time.monotonic)
+
+    def about(self) -> dict[str, Any]:
+        """All but the numbers of the state, as plain values."""
+        return {
+            **(self.followed.about() if self.followed.live is not None else {}),
+            "waiting": [s.seq for s in self.waiting], "newest": self.newest, "used_s": _finite(self.used_s),
+            "ended": self.ended, "late": self.late, "ahead": self.ahead, "refused": self.refused, "last": self.last, "recent": self.recent,
+        }  # fmt: skip
+
+
+def _finite(x: float) -> float | None:
+    return x if math.isfinite(x) else None
+
+
+class Fleet:
+    """Every vehicle that sends rows. `sheet_for(fleet, vehicle)` gives its sheet, or raises `InputError`.
+
+    Rows are used in the order of their time, `ORDERED_S` behind the newest of their vehicle, or at once where a new
+    trip begins: an order that follows from the rows alone, so that a start from the journal ends in the same state.
+    """
+
+    def __init__(self, journal: Journal, sheet_for: Callable[[str, str], Sheet], *, watch: bool = True):
+        self.journal, self._sheet_for, self._watch = journal, sheet_for, watch
+        self._vehicles: dict[tuple[str, str], _Vehicle] = {}
+        self._lock = threading.RLock()
+        self.changed = threading.Condition()
+        self.version = 0
+
+    # --- rows in -----------------------------------------------------------------------------------------------------
+
+    def put(self, fleet: str, rows: Sequence[tuple[str, str, float, dict[str, Any]]]) -> dict[str, int]:
+        """Keep rows, then use those whose turn it is. **Returns:** how many were `accepted`, and `repeated` before."""
+        for vehicle in {r[0] for r in rows}:
+            self._vehicle(fleet, vehicle)  # a vehicle without a sheet is refused before anything is kept
+        with self._lock:
+            new = self.journal.put(fleet, rows)
+            by: dict[str, list[Sent]] = {}
+            for vehicle, sent in new:
+                by.setdefault(vehicle, []).append(sent)
+            for vehicle, sents in by.items():
+                self._take(self._vehicle(fleet, vehicle), sents)
+            self._keep(fleet, by)
+        with self.changed:
+            self.version += 1
+            self.changed.notify_all()
+        return {"accepted": len(new), "repeated": len(rows) - len(new)}
+
+    def _vehicle(self, fleet: str, name: str) -> _Vehicle:
+        """The vehicle as it is in memory, or as the journal has it. Raises `InputError` where it has no sheet."""
+        with self._lock:
+            found = self._vehicles.get((fleet, name))
+            if found is None:
+                found = self._vehicles[fleet, name] = self._again(fleet, name)
+        return found
+
+    def _again(self, fleet: str, name: str) -> _Vehicle:
+        sheet = self._sheet_for(fleet, name)
+        vehicle, kept = _Vehicle(Followed(sheet, watch=self._watch)), self.journal.kept(fleet, name)
+        digest = augmented_sheet(sheet, {}, {})
+        if kept is not None and kept.about.get("sheet") == digest:
+            about, vehicle.upto = kept.about, kept.upto
+            if kept.numbers is not None:
+                vehicle.followed.again(about, kept.numbers, Adapter())
+                vehicle.followed.stream.continued = False  # what came twice is the journal's to say
+            vehicle.newest = tuple(about["newest"]) if about["newest"] else None
+            vehicle.used_s = -math.inf if about["used_s"] is None else about["used_s"]
+            vehicle.ended, vehicle.refused = about["ended"], about["refused"]
+            vehicle.late, vehicle.ahead = about["late"], about["ahead"]
+            vehicle.last, vehicle.recent = about["last"], about["recent"]
+            sents = [*self.journal.since(fleet, name, vehicle.upto, about["waiting"])]
+            vehicle.waiting = [s for s in sents if s.seq <= vehicle.upto]
+            sents = [s for s in sents if s.seq > vehicle.upto]
+        else:
+            sents = [*self.journal.since(fleet, name, 0)]  # a changed sheet: from its first row
+        for sent in sents:  # as they came: one by one ends as any batches do
+            self._take(vehicle, [sent])
+        return vehicle
+
+    def _take(self, vehicle: _Vehicle, sents: Sequence[Sent]) -> None:
+        """Rows in the order in which they came; what follows does not depend on how many come at once."""
+        due: list[Sent] = []
+        for sent in sents:
+            vehicle.upto = max(vehicle.upto, sent.seq)
+            vehicle.since += 1
+            if vehicle.newest is not None and sent.trip != vehicle.newest[0]:
+                if sent.trip in vehicle.ended:
+                    vehicle.late += 1
+                    continue
+                due += sorted(vehicle.waiting, key=lambda s: s.time_s)
+                vehicle.ended.append(vehicle.newest[0])
+                vehicle.waiting, vehicle.newest, vehicle.used_s = [], None, -math.inf
+            if sent.time_s <= vehicle.used_s:
+                vehicle.late += 1
+                continue
+            if vehicle.newest is not None and sent.time_s > vehicle.newest[1] + FARTHEST_S:
+                vehicle.ahead += 1
+                continue
+            vehicle.waiting.append(sent)
+            if vehicle.newest is None or sent.time_s > vehicle.newest[1]:
+                vehicle.newest = (sent.trip, sent.time_s)
+                until = sent.time_s - ORDERED_S
+                ready = sorted((s for s in vehicle.waiting if s.time_s <= until), key=lambda s: s.time_s)
+                if ready:
+                    vehicle.used_s = ready[-1].time_s
+                    vehicle.waiting = [s for s in vehicle.waiting if s.time_s > until]
+                    due += ready
+        self._use(vehicle, due)
+
+    def _use(self, vehicle: _Vehicle, due: Sequence[Sent]) -> None:
+        records = [{**s.body, **({"trip_id": s.trip} if s.trip else {})} for s in due]
+        # the first row says which columns there are
+        for part in (records[:1], records[1:]) if vehicle.followed.live is None else (records,):
+            try:
+                for arrived, now in vehicle.followed.take(part) if part else ():
+                    vehicle.last = self._told(vehicle.followed, arrived, now)
+                    shown = {k: vehicle.last[k] for k in ("time_s", "measured", "predicted", "lower", "upper")}
+                    vehicle.recent = [*vehicle.recent[-(SHOWN - 1) :], shown]
+                vehicle.refused = None
+            except InputError as e:
+                sheet = str(vehicle.followed.sheet.path)  # no path of this machine goes to a client
+                vehicle.refused = str(e).removeprefix("standard input: ").replace(sheet, Path(sheet).name)
+
+    @staticmethod
+    def _told(followed: Followed, arrived: Arrived, now: Any) -> dict[str, Any]:
+        by = dict(zip(followed.form.columns, arrived.vector, strict=True))
+        each = zip(followed.form.names, now.values, now.sd, strict=True)
+        return {
+            "trip_id": arrived.trip, "time_s": plain(by["time_s"]), "measured": plain(by["measured"]),
+            **{k: plain(getattr(now, k)) for k in ("predicted", "lower", "upper", "sigma")},
+            "unit": followed.form.unit, "values": {n: [plain(v), plain(s)] for n, v, s in each},
+        }  # fmt: skip
+
+    # --- kept --------------------------------------------------------------------------------------------------------
+
+    def _keep(self, fleet: str, names: Mapping[str, Any] | Sequence[str], *, all_: bool = False) -> None:
+        now, states = time.monotonic(), []
+        for name in names:
+            v = self._vehicle(fleet, name)
+            if v.since and (all_ or v.since >= KEPT_ROWS or now - v.kept_at > KEPT_S):
+                numbers = None if v.followed.live is None else np.array(v.followed.live.numbers)
+                sheet = augmented_sheet(v.followed.sheet, {}, {})
+                states.append((fleet, name, Kept(v.upto, {"sheet": sheet, **v.about()}, numbers)))
+                v.since, v.kept_at = 0, now
+        if states:
+            self.journal.keep(states)
+
+    def close(self) -> None:
+        """Write every state; the journal is closed."""
+        with self._lock:
+            for fleet in {f for f, _ in self._vehicles}:
+                self._keep(fleet, [n for f, n in self._vehicles if f == fleet], all_=True)
+            self.journal.close()
+
+    # --- what is known -----------------------------------------------------------------------------------------------
+
+    def names(self, fleet: str) -> list[str]:
+        """Vehicles of a fleet that have sent rows."""
+        return sorted(v for _, v in self.journal.vehicles(fleet))
+
+    def known(self, fleet: str, name: str) -> dict[str, Any] | None:
+        """What is known of a vehicle now; None where the fleet has none of this name."""
+        if name not in self.names(fleet):
+            return None
+        with self._lock:
+            v = self._vehicle(fleet, name)
+            alarm = v.followed.alarm()
+            return {
+                "vehicle_id": name, "sheet": v.followed.sheet.name, **v.last,
+                "alarm": None if alarm is None else plain_alarm(alarm) | {"text": alarm.line()},
+                "rows": v.followed.counted() | {"late": v.late, "far ahead": v.ahead, "waiting": len(v.waiting)},
+                "notes": v.followed.notes, "refused": v.refused,
+            }  # fmt: skip
+
+    def recent(self, fleet: str, name: str) -> list[dict[str, Any]]:
+        """The last rows that were used: time, measured, predicted with its interval."""
+        with self._lock:
+            return list(self._vehicle(fleet, name).recent)
+
+    def ahead(self, fleet: str, name: str, rows: Sequence[Mapping[str, Any]], **battery: Any) -> dict[str, Any]:
+        """Energy of rows to come, and what of the battery is left. Raises `RefusedError` before a first row."""
+        with self._lock:
+            v = self._vehicle(fleet, name)
+            if v.followed.live is None:
+                raise RefusedError(["rows"], "no row of this vehicle has been used yet; send its trip first")
+            state, trips = v.followed.live.state, v.followed.stream.trips
+        vectors = []
+        for i, row in enumerate(rows):
+            for key in ("duration_s", "speed_start_mps", "speed_end_mps"):
+                if row.get(key) is None:
+                    raise RefusedError(["rows", i, key], "a finite number is expected: rows to come are intervals")
+            vectors.append(
+                Arrived.of(
+                    state.form,
+                    trips[-1],
+                    len(trips),
+                    {k: float(x) for k, x in row.items() if isinstance(x, int | float)},
+                ).vector
+            )
+        reserve = battery.pop("reserve", 0.0)
+        if battery.get("capacity_wh") is None:
+            battery["capacity_wh"] = v.followed.sheet.capacity_wh
+        told = forecast(state, np.stack(vectors), **battery)
+        end = told.soc_at_end
+        return {
+            "energy_wh": told.energy_wh, "interval_wh": list(told.interval_wh), "level": told.level,
+            "soc_at_end": None if end is None else list(end), "chance_of_arriving": told.chance_of_arriving(reserve),
+        }  # fmt: skip
+
+
+def sheets_in(folder: str | Path) -> Callable[[str, str], Sheet]:
+    """The sheet of a vehicle: FOLDER/FLEET/VEHICLE.toml, FOLDER/VEHICLE.toml, or `default.toml` in place of it."""
+    root, read = Path(folder).resolve(), dict[Path, Sheet]()
+    if not root.is_dir():
+        raise InputError(f"--sheets {folder}: no such folder")
+    there = {p.relative_to(root).as_posix(): p for p in root.rglob("*.toml")}
+    if not there:
+        raise InputError(f"--sheets {folder}: holds no .toml; a sheet for each vehicle, or default.toml, is expected")
+
+    def sheet_for(fleet: str, vehicle: str) -> Sheet:
+        for name in (f"{fleet}/{vehicle}.toml", f"{vehicle}.toml", f"{fleet}/default.toml", "default.toml"):
+            if (path := there.get(name)) is not None:
+                if path not in read:
+                    read[path] = read_sheet(path)
+                return read[path]
+        raise InputError(f"no sheet for vehicle {vehicle!r}: {vehicle}.toml or default.toml is expected in --sheets")
+
+    with contextlib.suppress(KeyError):
+        read_sheet(there["default.toml"])
+    return sheet_for

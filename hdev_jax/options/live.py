@@ -1,0 +1,51 @@
+"""The parsers of the verbs about vehicles on the road: follow, serve."""
+
+from pathlib import Path
+from typing import Any
+
+from hdev_jax.options.common import effects_option, file_argument, target_option
+
+__all__ = ["LIVE_VERBS", "live_parsers"]
+
+LIVE_VERBS = ("follow", "serve")
+
+
+def live_parsers(verbs: Any) -> None:
+    """Add a parser for each verb to the subparsers `verbs`."""
+    follow = verbs.add_parser(
+        "follow",
+        help="rows of a vehicle as they arrive: its energy, its coefficients, what its sheet lacks",
+        description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
+        "is predicted from those before it, and tells more of the sheet's coefficients.",
+        epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
+        "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
+        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
+    )
+    file_argument(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
+    file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
+    file_argument(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
+    file_argument(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
+    target_option(follow)
+    effects_option(follow)
+    follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
+    follow.add_argument(
+        "--no-watch", dest="watch", action="store_false", help="do not look for effects that the sheet lacks"
+    )
+
+    serve = verbs.add_parser(
+        "serve",
+        help="follow many vehicles behind HTTP: rows in, estimates, alarms and forecasts out, a live page",
+        description="Take rows of many vehicles over HTTP, keep each before it is acknowledged, follow every vehicle, "
+        "and show estimates, alarms and forecasts as JSON and on a page that lives. Needs the extra serve.",
+        epilog="example:\n  hdev serve --sheets sheets --state fleet.sqlite --tokens tokens.toml",
+    )
+    serve.add_argument(
+        "--sheets", type=Path, required=True, metavar="DIR", help="VEHICLE.toml or FLEET/VEHICLE.toml; default.toml"
+    )
+    file_argument(serve, "--state", "DB", "the database that keeps rows and states (SQLite)", required=True)
+    file_argument(serve, "--tokens", "TOKENS.toml", 'fleet = "SHA-256 of its token"; without: one fleet, here')
+    serve.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default: 127.0.0.1)")
+    serve.add_argument("--port", type=int, default=8000, metavar="P", help="port to listen at (default: 8000)")
+    serve.add_argument(
+        "--no-watch", dest="watch", action="store_false", help="do not look for effects that the sheets lack"
+    )

@@ -1,0 +1,57 @@
+"""The verb `serve`: many vehicles followed behind HTTP."""
+
+import tomllib
+from pathlib import Path
+
+from hdev_jax import progress
+from hdev_jax.errors import InputError
+from hdev_jax.online.service import Fleet, Journal, sheets_in
+
+__all__ = ["serve"]
+
+EXTRA = "hdev serve needs FastAPI and uvicorn: pip install 'hdev_jax[serve]'"
+HERE = ("127.0.0.1", "::1", "localhost")
+
+
+def serve(
+    sheets: str | Path,
+    state: str | Path,
+    tokens: str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    watch: bool = True,
+) -> None:
+    """Take rows of many vehicles over HTTP and give estimates, alarms and forecasts, until it is stopped.
+
+    **Arguments:** `sheets`: a folder with VEHICLE.toml or FLEET/VEHICLE.toml, `default.toml` for the others; `state`:
+    the database that keeps rows and states; `tokens`: a TOML file, `fleet = "SHA-256 of its token"`; without it there
+    is one fleet, and only this machine may call. **Raises:** `InputError`.
+    """
+    try:
+        import uvicorn
+
+        from hdev_jax.online.service.app import app_of
+    except ImportError as e:
+        raise InputError(EXTRA) from e
+    if tokens is None and host not in HERE:
+        raise InputError(f"--host {host}: other machines may call only where --tokens says which fleets there are")
+    digests = None if tokens is None else _tokens(Path(tokens))
+    fleet = Fleet(Journal(state), sheets_in(sheets), watch=watch)
+    progress.step(f"http://{host}:{port}/ shows the vehicles; rows go to /v1/rows")
+    try:
+        uvicorn.run(app_of(fleet, digests), host=host, port=port, log_level="warning")
+    finally:
+        fleet.close()
+
+
+def _tokens(path: Path) -> dict[str, str]:
+    try:
+        found = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as e:
+        raise InputError(f"--tokens {path}: cannot be read ({e})") from e
+    for name, digest in found.items():
+        if not (isinstance(digest, str) and len(digest) == 64 and set(digest) <= set("0123456789abcdef")):
+            raise InputError(f"--tokens {path}: {name}: the SHA-256 of a token, 64 hexadecimal digits, is expected")
+    if not found:
+        raise InputError(f"--tokens {path}: names no fleet; fleet = 'SHA-256 of its token' is expected")
+    return found

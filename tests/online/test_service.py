@@ -1,0 +1,249 @@
+"""The service: rows of many vehicles in, estimates out; nothing that was acknowledged is lost or counted twice."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from hdev_jax.errors import InputError
+from hdev_jax.fleet import demo_log
+from hdev_jax.online.service import Fleet, Journal, RefusedError, sheets_in
+from hdev_jax.online.service.fleet import checked
+
+pytest.importorskip("fastapi", reason="fastapi is in the extra serve")
+from fastapi.testclient import TestClient
+
+from hdev_jax.online.service.app import Limits, app_of, digest_of
+from hdev_jax.verbs.live.serve import serve
+
+A, B = ({"Authorization": f"Bearer {t}"} for t in ("token a", "token b"))
+TOKENS = {"a": digest_of("token a"), "b": digest_of("token b")}
+
+
+@pytest.fixture(scope="module")
+def sheets(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sheets")
+    files = demo_log(3, trips=1).write(folder / "log", truth=False)
+    (folder / "sheets").mkdir()
+    shutil.copy(files["sheet"], folder / "sheets" / "default.toml")
+    return folder / "sheets"
+
+
+@pytest.fixture(scope="module")
+def rows():
+    frame = demo_log(3, trips=2).frame.groupby("trip_id").head(90)
+    keep = ["trip_id", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "mass_kg",
+            "grade_rad", "energy_wh"]  # fmt: skip
+    return json.loads(frame[keep].to_json(orient="records"))
+
+
+def named(rows, vehicle):
+    return [{"vehicle_id": vehicle, **r} for r in rows]
+
+
+@pytest.fixture
+def fleet(tmp_path, sheets):
+    return Fleet(Journal(tmp_path / "state.sqlite"), sheets_in(sheets), watch=False)
+
+
+@pytest.fixture
+def client(fleet):
+    return TestClient(app_of(fleet, TOKENS, Limits(body=200_000, rows=300)))
+
+
+def numbers(fleet, vehicle="T1"):
+    return fleet._vehicle("a", vehicle).followed.live.numbers
+
+
+def test_the_service_knows_what_rows_one_by_one_tell(fleet, rows, sheets):
+    from hdev_jax.inference.sheet import read_sheet
+    from hdev_jax.online.followed import Followed
+
+    fleet.put("a", checked(named(rows, "T1")))
+    alone = Followed(read_sheet(sheets / "default.toml"), watch=False)
+    used = fleet.known("a", "T1")["rows"]["used"]
+    for row in rows[:used]:
+        list(alone.take([row]))
+    assert used > 150
+    np.testing.assert_allclose(numbers(fleet), alone.live.numbers, rtol=1e-9, atol=1e-9)
+
+
+def test_rows_twice_late_and_out_of_order(tmp_path, fleet, rows, sheets):
+    fleet.put("a", checked(named(rows, "T1")))
+    other = Fleet(Journal(tmp_path / "other.sqlite"), sheets_in(sheets), watch=False)
+    shuffled = [*rows]
+    for k in range(0, len(rows) - 1, 7):  # neighbours, a few seconds apart; trips stay in order
+        if rows[k]["trip_id"] == rows[k + 1]["trip_id"]:
+            shuffled[k : k + 2] = shuffled[k : k + 2][::-1]
+    told = [other.put("a", checked(named(part, "T1"))) for part in (shuffled[:50], shuffled[:50], shuffled[50:])]
+    assert [t["repeated"] for t in told] == [0, 50, 0]
+    assert other.known("a", "T1")["rows"] == fleet.known("a", "T1")["rows"]
+    np.testing.assert_array_equal(numbers(other), numbers(fleet))
+    late = {**rows[10], "time_s": rows[10]["time_s"] + 0.5}
+    far = {**rows[-1], "time_s": 1e9}  # a clock at fault must not make all that follows late
+    other.put("a", checked(named([late, far], "T1")))
+    assert other.known("a", "T1")["rows"]["late"] == 1
+    assert other.known("a", "T1")["rows"]["far ahead"] == 1
+    np.testing.assert_array_equal(numbers(other), numbers(fleet))
+
+
+def test_a_start_from_the_journal_is_as_if_it_had_never_stopped(tmp_path, fleet, rows, sheets):
+    for part in (rows[:60], rows[60:100], rows[100:]):
+        fleet.put("a", checked(named(part, "T1")))
+    path = tmp_path / "again.sqlite"
+    first = Fleet(Journal(path), sheets_in(sheets), watch=False)
+    first.put("a", checked(named(rows[:60], "T1")))
+    first.close()  # its state is written
+    second = Fleet(Journal(path), sheets_in(sheets), watch=False)
+    second.put("a", checked(named(rows[60:100], "T1")))  # in the journal alone
+    third = Fleet(Journal(path), sheets_in(sheets), watch=False)
+    third.put("a", checked(named(rows[100:], "T1")))
+    np.testing.assert_array_equal(numbers(third), numbers(fleet))
+    assert third.known("a", "T1")["rows"] == fleet.known("a", "T1")["rows"]
+
+
+def test_one_fleet_never_sees_another(client, rows):
+    assert client.post("/v1/rows", json={"rows": named(rows[:60], "T1")}, headers=A).json()["accepted"] == 60
+    assert [v["vehicle_id"] for v in client.get("/v1/vehicles", headers=A).json()] == ["T1"]
+    assert client.get("/v1/vehicles", headers=B).json() == []
+    assert client.get("/v1/vehicles/T1", headers=A).status_code == 200
+    for path in ("/v1/vehicles/T1", "/v1/vehicles/none"):
+        assert client.get(path, headers=B).status_code == 404, "not even that it exists"
+    assert client.post("/v1/vehicles/T1/forecast", json={"rows": rows[:2]}, headers=B).status_code == 404
+    for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "Basic token a"}):
+        assert client.get("/v1/vehicles", headers=headers).status_code == 401
+        assert client.post("/v1/rows", json={"rows": []}, headers=headers).status_code == 401
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"speed_start_mps": "fast"}, "speed_start_mps"),
+        ({"time_s": None}, "time_s"),
+        ({"vehicle_id": ""}, "vehicle_id"),
+        ({"vehicle_id": "x" * 300}, "vehicle_id"),
+        ({"energy_wh": True}, "energy_wh"),
+        ({"mass_kg": [1]}, "mass_kg"),
+        ({"mass_kg": 10**400}, "mass_kg"),
+        ({"trip_id": {"a": 1}}, "trip_id"),
+    ],
+)
+def test_of_a_bad_batch_nothing_is_kept_and_the_field_is_named(client, fleet, rows, change, field):
+    batch = named(rows[:3], "T1")
+    batch[1] = {**batch[1], **change}
+    answer = client.post("/v1/rows", json={"rows": batch}, headers=A)
+    assert answer.status_code == 422
+    assert answer.json()["detail"][0]["loc"] == ["rows", 1, field]
+    assert fleet.names("a") == []
+
+
+def test_bodies_that_are_none_and_limits(client, rows):
+    post = lambda **k: client.post("/v1/rows", headers=A, **k).status_code  # noqa: E731
+    assert post(content=b"{") == 422
+    assert post(content=b"[1]") == 422
+    assert post(json={"rows": 3}) == 422
+    assert post(content=b'{"rows": [{"vehicle_id": "T", "time_s": NaN}]}') == 422
+    assert post(json={"rows": named(rows * 2, "T1")}) == 413, "more rows than a request may have"
+    assert post(content=b'{"rows": []' + b" " * 300_000 + b"}") == 413
+    slow = TestClient(app_of(Fleet(Journal(":memory:"), lambda *_: pytest.fail("asked")), TOKENS, Limits(rows_per_s=1)))
+    answer = slow.post("/v1/rows", json={"rows": named(rows, "T1")}, headers=A)
+    assert answer.status_code == 429
+    assert int(answer.headers["Retry-After"]) > 100
+
+
+def test_a_vehicle_without_a_sheet_is_refused_in_one_line(tmp_path, sheets, rows):
+    (tmp_path / "own").mkdir()
+    shutil.copy(sheets / "default.toml", tmp_path / "own" / "T1.toml")
+    client = TestClient(app_of(Fleet(Journal(":memory:"), sheets_in(tmp_path / "own"), watch=False), TOKENS))
+    answer = client.post("/v1/rows", json={"rows": named(rows[:2], "T2")}, headers=A)
+    assert answer.status_code == 422
+    assert "no sheet for vehicle 'T2'" in answer.json()["detail"][0]["msg"]
+    assert client.post("/v1/rows", json={"rows": named(rows[:2], "../T1")}, headers=A).status_code == 422
+    for folder, words in ((tmp_path / "none", "no such folder"), (tmp_path, None)):
+        if words:
+            with pytest.raises(InputError, match=words):
+                sheets_in(folder)
+
+
+def test_the_rest_of_the_way(client, rows):
+    client.post("/v1/rows", json={"rows": named(rows[:90], "T1")}, headers=A)
+    ask = lambda **k: client.post("/v1/vehicles/T1/forecast", json=k, headers=A)  # noqa: E731
+    told = ask(rows=rows[60:90], soc=0.5, capacity_wh=3e5).json()
+    true = sum(r["energy_wh"] for r in rows[60:90])
+    assert told["interval_wh"][0] < true < told["interval_wh"][1]
+    assert told["soc_at_end"][0] == pytest.approx(0.5 - told["energy_wh"] / 3e5)
+    assert ask(rows=[]).status_code == 422
+    assert ask(rows=[{"speed_start_mps": 3.0}]).json()["detail"][0]["loc"] == ["rows", 0, "duration_s"]
+    assert ask(rows=rows[:2], soc="half").status_code == 422
+    with pytest.raises(RefusedError):
+        checked([3])
+
+
+def test_names_stay_text_and_the_page_loads_nothing(client, rows):
+    hostile = "<img src=x onerror=alert(1)>'; DROP TABLE rows; --"
+    client.post("/v1/rows", json={"rows": named(rows[:30], hostile)}, headers=A)
+    assert client.get("/v1/vehicles", headers=A).json()[0]["vehicle_id"] == hostile
+    page = client.get("/")
+    assert "innerHTML" not in page.text, "what vehicles send goes in as text"
+    assert not re.findall(r"https?://(?!www\.w3\.org/)", page.text)
+    assert "default-src 'none'" in page.headers["Content-Security-Policy"]
+    assert "/v1/rows" in client.get("/openapi.json").json()["paths"]
+
+
+def test_a_database_of_something_else_is_refused(tmp_path):
+    (tmp_path / "text").write_text("no database" * 100)
+    with pytest.raises(InputError, match="no database of hdev serve"):
+        Journal(tmp_path / "text")
+    (tmp_path / "tokens.toml").write_text('a = "short"')
+    with pytest.raises(InputError, match="64 hexadecimal digits"):
+        serve(tmp_path, tmp_path / "s", tokens=tmp_path / "tokens.toml")
+    with pytest.raises(InputError, match="--tokens says which fleets"):
+        serve(tmp_path, tmp_path / "s", host="0.0.0.0")
+
+
+@pytest.mark.slow
+def test_killed_while_rows_come_it_loses_and_repeats_none(tmp_path, fleet, rows, sheets):
+    import httpx2 as httpx
+
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = s.getsockname()[1]
+    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(sheets), "--state",
+               str(tmp_path / "killed.sqlite"), "--port", str(port), "--no-watch"]  # fmt: skip
+
+    def started():
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        for _ in range(600):
+            try:
+                httpx.get(f"http://127.0.0.1:{port}/healthz")
+            except httpx.TransportError:
+                time.sleep(0.1)
+            else:
+                return process
+        raise AssertionError("the service does not answer")
+
+    process, at, kills = started(), 0, 0
+    while at < len(rows):
+        batch = named(rows[at : at + 45], "T1")
+        if kills < 2 and at >= 45 * (1 + kills):
+            os.kill(process.pid, signal.SIGKILL)  # whatever it was at
+            process.wait()
+            kills, process = kills + 1, started()
+            batch = named(rows[at - 45 : at + 45], "T1")  # the sender is not sure of its last batch
+        assert httpx.post(f"http://127.0.0.1:{port}/v1/rows", json={"rows": batch}, timeout=120).status_code == 200
+        at += 45
+    process.terminate()
+    process.wait()
+    fleet.put("fleet", checked(named(rows, "T1")))
+    again = Fleet(Journal(tmp_path / "killed.sqlite"), sheets_in(sheets), watch=False)
+    assert again.known("fleet", "T1")["rows"] == fleet.known("fleet", "T1")["rows"]
+    live = [f._vehicle("fleet", "T1").followed.live.numbers for f in (again, fleet)]
+    np.testing.assert_array_equal(*live)
