@@ -2,7 +2,8 @@
 
     python -m experiments.live --out out/live --speed 60
 
-Ten synthetic trucks; one of them regenerates no more than 60 kW, which its sheet does not know. The page is at the address that is printed; Ctrl-C ends it.
+Ten synthetic trucks; one of them regenerates no more than 60 kW, which its sheet does not know.
+The page is at the address that is printed; Ctrl-C ends it.
 """
 
 import argparse
@@ -45,10 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     (a.out / "sheets").mkdir(parents=True)
     rows = _vehicles(a.out)
     with _service(a.out, a.port) as url, contextlib.suppress(KeyboardInterrupt):
-        print(
-            f"open {url}/ : {TRUCKS} synthetic trucks at {a.speed:g} times real time; truck_{LIMITED} regenerates little"
-        )
-        print("Ctrl-C ends it.", flush=True)
+        print(f"open {url}/ : {TRUCKS} synthetic trucks at {a.speed:g} times real time. Ctrl-C ends it.")
+        print(f"truck_{LIMITED} regenerates no more than 60 kW, which its sheet does not know.", flush=True)
         named = _drive(url, rows, a.speed, a.seconds)
         print(f"alarms: {', '.join(f'{k}: {v}' for k, v in named.items()) or 'none'}")
     return 0

@@ -88,7 +88,8 @@ class _Vehicle:
         return {
             **(self.followed.about() if self.followed.live is not None else {}),
             "waiting": [s.seq for s in self.waiting], "newest": self.newest, "used_s": _finite(self.used_s),
-            "ended": self.ended, "late": self.late, "ahead": self.ahead, "refused": self.refused, "last": self.last, "recent": self.recent,
+            "ended": self.ended, "late": self.late, "ahead": self.ahead, "refused": self.refused,
+            "last": self.last, "recent": self.recent,
         }  # fmt: skip
 
 
