@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hdev_jax.errors import InputError
 from hdev_jax.export.exported import LeftOut
 from hdev_jax.inference.sheet import Sheet, build
-from hdev_jax.physics import EfficiencyMap, Vehicle
+from hdev_jax.physics import EfficiencyMap, ModeChange, StepChange, Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.units import AIR_DENSITY_KGPM3, unit_of
 
@@ -108,10 +108,9 @@ def kernel_of(sheet: Sheet, channels: Iterable[str] | None = None) -> Kernel:
     for path, d in sheet.declared.items():
         if d.per_vehicle:
             left.append(LeftOut(path, "it is by vehicle: the first vehicle's value is used"))
-    for note in ("step_change", "mode_change"):
-        if vehicle.has(note):
-            what = "the state after the change" if note == "step_change" else "the mean over its modes"
-            left.append(LeftOut(f"effects.{note}", f"it goes by trips: {what} is used"))
+    for effect, what in ((StepChange, "the state after the change"), (ModeChange, "the mean over its modes")):
+        if vehicle.has(effect.id):
+            left.append(LeftOut(f"effects.{effect.id}", f"it goes by trips: {what} is used"))
     if free := [c.path for c in built.table.free]:
         left.append(LeftOut("sd", f"the uncertainty of {', '.join(dict.fromkeys(free))} is not in the file"))
     if (

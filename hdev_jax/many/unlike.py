@@ -213,8 +213,10 @@ class Weeks:
     """Normal equations by trip of vehicles with the same coefficients, and what they have in common week by week."""
 
     def __init__(self, each: Sequence[Record], without: frozenset[str] = frozenset()):
-        self.counts = [r["name"] not in without for r in each]
-        self.own = [(*equations(r["course"]), *_weeks(r["course"])) for r in each]
+        self.counts: list[bool] = [r["name"] not in without for r in each]
+        self.own: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = [
+            (*equations(r["course"]), *_weeks(r["course"])) for r in each
+        ]
         self.sums: dict[float, tuple[np.ndarray, np.ndarray, int]] = {}
         for gram, score, _, week in (o for o, counts in zip(self.own, self.counts, strict=True) if counts):
             for w in np.unique(week[np.isfinite(week)]).tolist():

@@ -31,8 +31,10 @@ class Followed:
     """
 
     def __init__(self, sheet: Sheet, rules: Adapter | None = None, target: str | None = None, *, watch: bool = True):
-        self.sheet, self.target, self.watching = sheet, target, watch
-        self.stream = Stream() if rules is None else Stream(rules)
+        self.sheet: Sheet = sheet
+        self.target: str | None = target
+        self.watching: bool = watch
+        self.stream: Stream = Stream() if rules is None else Stream(rules)
         self.live: Live | None = None
         self.watch: Watch | None = None
         self.columns: list[str] = []

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from hdev_jax.errors import InputError
+from hdev_jax.online.form import Form
 from hdev_jax.online.state import Now, State
 from hdev_jax.online.update import update
 from hdev_jax.rundir import atomic_file
@@ -53,7 +54,7 @@ class Live:
 
     def __init__(self, state: State):
         changing, constant = eqx.partition(state, _changes(state))
-        self.form = state.form
+        self.form: Form = state.form
         self._flat, _ = ravel_pytree(changing)
         self._constant = jax.tree.leaves(constant)
         # vehicles of one form share a compiled program

@@ -18,6 +18,16 @@ ELSEWHERE: dict[str, set[str]] = {
     "fleet": IDS,
     # the two coefficients of paper 1 that a network takes over, and the declared load as a feature
     "learn/pinn/rows.py": {"rolling", "aero", "auxiliary", "cornering"},
+    # fields of other programs' vehicles that hold these terms
+    "export/simulators.py": {
+        "inertia",
+        "rolling",
+        "rolling_linear",
+        "aero",
+        "auxiliary",
+        "auxiliary_power",
+        "rotating_mass",
+    },
     # columns of a linear fit that is given as one
     "learn/sources.py": {"copper_loss", "inverter_loss"},
     # parts of a name that say what a column holds; bins and words of a figure

@@ -27,10 +27,11 @@ document.getElementById("f").onload = () => {{
   const figures = [...d.querySelectorAll("figure img")];
   first.click();
   const opened = zoom.open && zoom.firstElementChild.alt === first.alt, image = zoom.firstElementChild;
-  const at = image.getBoundingClientRect(), wheel = {{deltaY: -400, clientX: 100, clientY: 100, cancelable: true}};
+  const at = image.getBoundingClientRect(), x = at.left + at.width / 2;
+  const wheel = {{deltaY: -400, clientX: x, clientY: at.top + at.height / 2, cancelable: true}};
   zoom.dispatchEvent(new WheelEvent("wheel", wheel));
   const now = image.getBoundingClientRect(), by = now.width / at.width;
-  const stays = Math.abs(now.left - (100 - by * (100 - at.left)));
+  const stays = Math.abs(now.left - (x - by * (x - at.left)));
   zoom.click();
   document.getElementById("found").textContent = JSON.stringify({{
     width: wide.clientWidth, scroll: wide.scrollWidth,

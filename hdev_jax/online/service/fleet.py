@@ -36,7 +36,8 @@ class RefusedError(Exception):
 
     def __init__(self, where: list[str | int], why: str):
         super().__init__(f"{'.'.join(map(str, where))}: {why}")
-        self.where, self.why = where, why
+        self.where: list[str | int] = where
+        self.why: str = why
 
 
 def checked(rows: Any) -> list[tuple[str, str, float, dict[str, Any]]]:
@@ -105,11 +106,11 @@ class Fleet:
     """
 
     def __init__(self, journal: Journal, sheet_for: Callable[[str, str], Sheet], *, watch: bool = True):
-        self.journal, self._sheet_for, self._watch = journal, sheet_for, watch
+        self.journal: Journal = journal
+        self._sheet_for, self._watch = sheet_for, watch
         self._vehicles: dict[tuple[str, str], _Vehicle] = {}
         self._lock = threading.RLock()
-        self.changed = threading.Condition()
-        self.version = 0
+        self.version: int = 0  # of what is known: more with each batch
 
     # --- rows in -----------------------------------------------------------------------------------------------------
 
@@ -125,9 +126,7 @@ class Fleet:
             for vehicle, sents in by.items():
                 self._take(self._vehicle(fleet, vehicle), sents)
             self._keep(fleet, by)
-        with self.changed:
-            self.version += 1
-            self.changed.notify_all()
+        self.version += 1
         return {"accepted": len(new), "repeated": len(rows) - len(new)}
 
     def _vehicle(self, fleet: str, name: str) -> _Vehicle:
