@@ -36,6 +36,7 @@ from hdev_jax.units import J_PER_WH
 
 __all__ = ["expected", "one_row", "scan", "update", "wh_per_unit"]
 
+LONGEST_S = 86_400.0  # a row of more than a day is none
 ENOUGH = 20.0  # rows that show the noise, from which on models of it are weighed by what they predict
 FAULT = 6.0  # scales: beyond, a row is an instrument's fault; it is no neighbour of the next (`inference.predictive`)
 ALIKE = 20.0  # rows that are believed to be equally noisy, before any are seen
@@ -97,7 +98,7 @@ def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
     form = state.form
     at = {name: i for i, name in enumerate(form.columns)}
     duration, v0, v1 = row[at["duration_s"]], row[at["speed_start_mps"]], row[at["speed_end_mps"]]
-    good = jnp.isfinite(duration) & (duration > 0) & jnp.isfinite(row[at["trip"]])
+    good = jnp.isfinite(duration) & (duration > 0) & (duration <= LONGEST_S) & jnp.isfinite(row[at["trip"]])
     for v in (v0, v1):
         good &= (v >= -REVERSE_MPS) & (v <= MAX_SPEED_MPS)  # false for NaN
     duration = jnp.where(good, duration, 1.0)

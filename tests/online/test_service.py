@@ -149,6 +149,7 @@ def test_bodies_that_are_none_and_limits(client, rows):
     post = lambda **k: client.post("/v1/rows", headers=A, **k).status_code  # noqa: E731
     assert post(content=b"{") == 422
     assert post(content=b"[1]") == 422
+    assert post(content=b"[" * 90_000) == 422
     assert post(json={"rows": 3}) == 422
     assert post(content=b'{"rows": [{"vehicle_id": "T", "time_s": NaN}]}') == 422
     assert post(json={"rows": named(rows * 2, "T1")}) == 413, "more rows than a request may have"

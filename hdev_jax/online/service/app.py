@@ -97,7 +97,7 @@ def app_of(fleet: Fleet, tokens: Mapping[str, str] | None = None, limits: Limits
             parts.append(part)
         try:
             found = json.loads(b"".join(parts))
-        except ValueError:
+        except (ValueError, RecursionError):
             raise RefusedError(["body"], "JSON is expected") from None
         if not isinstance(found, dict):
             raise RefusedError(["body"], 'an object is expected: {"rows": […]}')

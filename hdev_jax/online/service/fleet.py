@@ -81,6 +81,7 @@ class _Vehicle:
     refused: str | None = None  # why its rows cannot be used at all
     last: dict[str, Any] = field(default_factory=dict)
     recent: list[dict[str, Any]] = field(default_factory=list)
+    shown: tuple[int, dict[str, Any]] | None = None  # what was told of it last, and after which row
     since: int = 0
     kept_at: float = field(default_factory=time.monotonic)
 
@@ -110,6 +111,9 @@ class Fleet:
         self._sheet_for, self._watch = sheet_for, watch
         self._vehicles: dict[tuple[str, str], _Vehicle] = {}
         self._lock = threading.RLock()
+        self._names: dict[str, set[str]] = {}
+        for name, vehicle in journal.vehicles():
+            self._names.setdefault(name, set()).add(vehicle)
         self.version: int = 0  # of what is known: more with each batch
 
     # --- rows in -----------------------------------------------------------------------------------------------------
@@ -125,6 +129,7 @@ class Fleet:
                 by.setdefault(vehicle, []).append(sent)
             for vehicle, sents in by.items():
                 self._take(self._vehicle(fleet, vehicle), sents)
+            self._names.setdefault(fleet, set()).update(by)
             self._keep(fleet, by)
         self.version += 1
         return {"accepted": len(new), "repeated": len(rows) - len(new)}
@@ -239,21 +244,26 @@ class Fleet:
 
     def names(self, fleet: str) -> list[str]:
         """Vehicles of a fleet that have sent rows."""
-        return sorted(v for _, v in self.journal.vehicles(fleet))
+        with self._lock:
+            return sorted(self._names.get(fleet, ()))
 
     def known(self, fleet: str, name: str) -> dict[str, Any] | None:
         """What is known of a vehicle now; None where the fleet has none of this name."""
-        if name not in self.names(fleet):
-            return None
         with self._lock:
+            if name not in self._names.get(fleet, ()):
+                return None
             v = self._vehicle(fleet, name)
+            if v.shown is not None and v.shown[0] == v.upto:
+                return v.shown[1]
             alarm = v.followed.alarm()
-            return {
+            told = {
                 "vehicle_id": name, "sheet": v.followed.sheet.name, **v.last,
                 "alarm": None if alarm is None else plain_alarm(alarm) | {"text": alarm.line()},
                 "rows": v.followed.counted() | {"late": v.late, "far ahead": v.ahead, "waiting": len(v.waiting)},
                 "notes": v.followed.notes, "refused": v.refused,
             }  # fmt: skip
+            v.shown = v.upto, told
+            return told
 
     def recent(self, fleet: str, name: str) -> list[dict[str, Any]]:
         """The last rows that were used: time, measured, predicted with its interval."""

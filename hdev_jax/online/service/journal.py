@@ -87,11 +87,10 @@ class Journal:
                 raise
         return new
 
-    def vehicles(self, fleet: str | None = None) -> list[tuple[str, str]]:
+    def vehicles(self) -> list[tuple[str, str]]:
         """`(fleet, vehicle)` of all that have sent a row."""
-        query = "SELECT DISTINCT fleet, vehicle FROM rows" + (" WHERE fleet = ?" if fleet is not None else "")
         with self._lock:
-            return [(f, v) for f, v in self._db.execute(query, () if fleet is None else (fleet,)).fetchall()]
+            return list(self._db.execute("SELECT DISTINCT fleet, vehicle FROM rows").fetchall())
 
     def kept(self, fleet: str, vehicle: str) -> Kept | None:
         """A vehicle's last state, None where it has none yet."""
