@@ -42,7 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--for", dest="seconds", type=float, help="end after so many seconds")
     parser.add_argument("--port", type=int, default=0, help="port of the page (default: a free one)")
     a = parser.parse_args(argv)
-    shutil.rmtree(a.out, ignore_errors=True)
+    for old in (a.out / "sheets", a.out / "logs"):
+        shutil.rmtree(old, ignore_errors=True)
+    for old in a.out.glob("state.sqlite*"):
+        old.unlink()
     (a.out / "sheets").mkdir(parents=True)
     rows = _vehicles(a.out)
     with _service(a.out, a.port) as url, contextlib.suppress(KeyboardInterrupt):

@@ -99,6 +99,8 @@ def _tested(
 
 def _effect(scans: Sequence[Mapping[str, Any]], id_: str, settings: FleetSettings) -> dict[str, Any] | None:
     forms = sorted({k for scan in scans for k, s in scan.items() if s["id"] == id_ and not k.endswith(f" {FOUND}")})
+    if not forms:  # every vehicle names it by itself
+        forms = sorted({k.split(" ")[0] for scan in scans for k, s in scan.items() if s["id"] == id_})
     tried = []
     for form in forms:
         name = form.split(" ")[0]

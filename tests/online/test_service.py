@@ -130,6 +130,8 @@ def test_one_fleet_never_sees_another(client, rows):
         ({"time_s": None}, "time_s"),
         ({"vehicle_id": ""}, "vehicle_id"),
         ({"vehicle_id": "x" * 300}, "vehicle_id"),
+        ({"vehicle_id": "south/17"}, "vehicle_id"),
+        ({"trip_id": "\ud800"}, "trip_id"),
         ({"energy_wh": True}, "energy_wh"),
         ({"mass_kg": [1]}, "mass_kg"),
         ({"mass_kg": 10**400}, "mass_kg"),
@@ -139,7 +141,7 @@ def test_one_fleet_never_sees_another(client, rows):
 def test_of_a_bad_batch_nothing_is_kept_and_the_field_is_named(client, fleet, rows, change, field):
     batch = named(rows[:3], "T1")
     batch[1] = {**batch[1], **change}
-    answer = client.post("/v1/rows", json={"rows": batch}, headers=A)
+    answer = client.post("/v1/rows", content=json.dumps({"rows": batch}), headers=A)
     assert answer.status_code == 422
     assert answer.json()["detail"][0]["loc"] == ["rows", 1, field]
     assert fleet.names("a") == []
@@ -184,8 +186,40 @@ def test_the_rest_of_the_way(client, rows):
     assert ask(rows=[]).status_code == 422
     assert ask(rows=[{"speed_start_mps": 3.0}]).json()["detail"][0]["loc"] == ["rows", 0, "duration_s"]
     assert ask(rows=rows[:2], soc="half").status_code == 422
+    assert ask(rows=rows[:2], soc=0.5, capacity_wh=0).status_code == 422
+    assert ask(rows=5).status_code == 422
+    assert ask(rows=[{**rows[0], "duration_s": 0}]).status_code == 422
     with pytest.raises(RefusedError):
         checked([3])
+
+
+def test_what_a_row_is_taken_for_does_not_depend_on_its_batch(tmp_path, sheets, rows):
+    """Samples among intervals, a row without a target first, a field that only some have."""
+    mixed = [{k: v for k, v in r.items() if k != "energy_wh"} if i == 0 else dict(r) for i, r in enumerate(rows[:60])]
+    mixed[20] = {"trip_id": mixed[20]["trip_id"], "time_s": mixed[20]["time_s"], "speed_mps": 9.0, "energy_wh": 50.0}
+    mixed[30]["ambient_temp_c"] = 3.0
+    whole, single = (Fleet(Journal(tmp_path / f"{k}.sqlite"), sheets_in(sheets), watch=False) for k in (1, 2))
+    whole.put("a", checked(named(mixed, "T1")))
+    for row in mixed:
+        single.put("a", checked(named([row], "T1")))
+    assert whole.known("a", "T1")["rows"] == single.known("a", "T1")["rows"]
+    np.testing.assert_array_equal(numbers(whole), numbers(single))
+
+
+def test_a_state_of_another_watch_begins_again(tmp_path, sheets, rows):
+    first = Fleet(Journal(tmp_path / "s.sqlite"), sheets_in(sheets), watch=False)
+    first.put("a", checked(named(rows, "T1")))
+    first.close()
+    again = Fleet(Journal(tmp_path / "s.sqlite"), sheets_in(sheets), watch=True)
+    assert again.known("a", "T1")["rows"]["used"] > 150
+
+
+def test_without_tokens_no_other_site_may_call(sheets):
+    fleet = Fleet(Journal(":memory:"), sheets_in(sheets), watch=False)
+    here = TestClient(app_of(fleet), base_url="http://127.0.0.1:8000")
+    assert here.get("/v1/vehicles").status_code == 200
+    assert here.get("/v1/vehicles", headers={"Origin": "https://example.org"}).status_code == 403
+    assert TestClient(app_of(fleet), base_url="http://rebound.example").get("/v1/vehicles").status_code == 403
 
 
 def test_names_stay_text_and_the_page_loads_nothing(client, rows):

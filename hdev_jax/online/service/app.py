@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 from fastapi import Depends, FastAPI, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
@@ -19,10 +20,11 @@ from hdev_jax import __version__
 from hdev_jax.errors import InputError
 from hdev_jax.online.service.fleet import Fleet, RefusedError, checked
 
-__all__ = ["Limits", "app_of", "digest_of"]
+__all__ = ["HERE", "Limits", "app_of", "digest_of"]
 
 TICK_S = 1.0  # between two events of a stream, at least
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self'"
+HERE = ("127.0.0.1", "::1", "localhost")
 ALONE = "fleet"  # the one fleet where no tokens are given
 
 
@@ -74,7 +76,10 @@ def app_of(fleet: Fleet, tokens: Mapping[str, str] | None = None, limits: Limits
     app = FastAPI(title="hdev serve", version=__version__, docs_url=None, redoc_url=None)
 
     def of_token(request: Request) -> str:
-        if tokens is None:
+        if tokens is None:  # no page of another site may call, nor one under another name for this machine
+            origin, host = request.headers.get("origin"), request.url.hostname
+            if host not in HERE or (origin is not None and urlsplit(origin).netloc != request.url.netloc):
+                raise HTTPException(403, "without tokens only this machine may call")
             return ALONE
         kind, _, token = request.headers.get("authorization", "").partition(" ")
         given = digest_of(token) if kind.lower() == "bearer" else ""
@@ -150,15 +155,16 @@ def app_of(fleet: Fleet, tokens: Mapping[str, str] | None = None, limits: Limits
         """Energy of the rows that are sent, and what of the battery is left then."""
         await run_in_threadpool(known, own, name)
         body = await body_of(request)
-        checked(
-            [{"vehicle_id": name, "time_s": 0.0, **r} if isinstance(r, dict) else r for r in body.get("rows") or []]
-        )
+        ahead_rows = body.get("rows")
+        if not isinstance(ahead_rows, list) or not ahead_rows:
+            raise RefusedError(["rows"], "rows to come are expected")
+        checked([{**r, "vehicle_id": name, "time_s": 0.0} if isinstance(r, dict) else r for r in ahead_rows])
         battery = {k: body.get(k) for k in ("soc", "capacity_wh")} | {"reserve": body.get("reserve") or 0.0}
         for k, v in battery.items():
-            if v is not None and (isinstance(v, bool) or not isinstance(v, int | float)):
-                raise RefusedError([k], "a number is expected")
-        if not body.get("rows"):
-            raise RefusedError(["rows"], "rows to come are expected")
+            if v is not None and (isinstance(v, bool) or not isinstance(v, int | float) or not 0 <= v < 1e12):
+                raise RefusedError([k], "a number of 0 or more is expected")
+        if body.get("capacity_wh") == 0:
+            raise RefusedError(["capacity_wh"], "a number above 0 is expected")
         return await run_in_threadpool(lambda: fleet.ahead(own, name, body["rows"], **battery))
 
     @app.get("/v1/events")

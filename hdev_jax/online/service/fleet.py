@@ -1,6 +1,6 @@
 """The vehicles of all fleets in one process: rows put in order, used, and kept."""
 
-import contextlib
+import itertools
 import math
 import threading
 import time
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hdev_jax import __version__
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
 from hdev_jax.logs.adapter import Adapter
@@ -25,6 +26,8 @@ ORDERED_S = 60.0  # rows that come this much late are put in order; so much the 
 KEPT_ROWS = 500  # of a vehicle between two states that are written: what a start has to use again
 KEPT_S = 10.0
 LONGEST_NAME = 200
+MOST_FIELDS = 64
+MOST_WAITING = 5000  # rows of a vehicle; beyond, the first ones wait no longer
 HUGE = 1e300  # NaN, infinity and integers that no float holds are no numbers
 FARTHEST_S = 86_400.0  # ahead of the newest row of its trip: a clock at fault
 TEXTS = ("vehicle_id", "trip_id")
@@ -52,8 +55,13 @@ def checked(rows: Any) -> list[tuple[str, str, float, dict[str, Any]]]:
             value = row.get(name, "" if name == "trip_id" else None)
             if isinstance(value, bool) or not isinstance(value, str | int):
                 raise RefusedError(["rows", i, name], "a text is expected")
-            if (name == "vehicle_id" and not str(value).strip()) or len(str(value)) > LONGEST_NAME:
-                raise RefusedError(["rows", i, name], f"a text of 1 to {LONGEST_NAME} characters is expected")
+            text = str(value)
+            if (name == "vehicle_id" and not text.strip()) or len(text) > LONGEST_NAME or not text.isprintable():
+                raise RefusedError(["rows", i, name], f"1 to {LONGEST_NAME} printable characters are expected")
+            if name == "vehicle_id" and "/" in text:
+                raise RefusedError(["rows", i, name], "a name without / is expected: it is part of an address")
+        if len(row) > MOST_FIELDS:
+            raise RefusedError(["rows", i], f"at most {MOST_FIELDS} fields are expected")
         for name, value in row.items():
             if name in TEXTS or value is None:
                 continue
@@ -78,6 +86,7 @@ class _Vehicle:
     ended: list[str] = field(default_factory=list)  # trips
     late: int = 0
     ahead: int = 0
+    unused: int = 0  # that could not be used
     refused: str | None = None  # why its rows cannot be used at all
     last: dict[str, Any] = field(default_factory=dict)
     recent: list[dict[str, Any]] = field(default_factory=list)
@@ -90,9 +99,16 @@ class _Vehicle:
         return {
             **(self.followed.about() if self.followed.live is not None else {}),
             "waiting": [s.seq for s in self.waiting], "newest": self.newest, "used_s": _finite(self.used_s),
-            "ended": self.ended, "late": self.late, "ahead": self.ahead, "refused": self.refused,
+            "ended": self.ended, "late": self.late, "ahead": self.ahead, "unused": self.unused, "refused": self.refused,
             "last": self.last, "recent": self.recent,
         }  # fmt: skip
+
+
+def _alike(records: Sequence[dict[str, Any]], *, one_by_one: bool) -> list[list[dict[str, Any]]]:
+    """Runs of rows with the same fields: what a row is taken for depends on its own alone, not on its batch."""
+    if one_by_one:  # the first row says which columns there are
+        return [[r] for r in records]
+    return [list(run) for _, run in itertools.groupby(records, key=lambda r: tuple(sorted(r)))]
 
 
 def _finite(x: float) -> float | None:
@@ -131,7 +147,7 @@ class Fleet:
                 self._take(self._vehicle(fleet, vehicle), sents)
             self._names.setdefault(fleet, set()).update(by)
             self._keep(fleet, by)
-        self.version += 1
+            self.version += 1
         return {"accepted": len(new), "repeated": len(rows) - len(new)}
 
     def _vehicle(self, fleet: str, name: str) -> _Vehicle:
@@ -145,8 +161,8 @@ class Fleet:
     def _again(self, fleet: str, name: str) -> _Vehicle:
         sheet = self._sheet_for(fleet, name)
         vehicle, kept = _Vehicle(Followed(sheet, watch=self._watch)), self.journal.kept(fleet, name)
-        digest = augmented_sheet(sheet, {}, {})
-        if kept is not None and kept.about.get("sheet") == digest:
+        # of another sheet, version or watch: from its first row
+        if kept is not None and kept.about.get("of") == self._of(sheet):
             about, vehicle.upto = kept.about, kept.upto
             if kept.numbers is not None:
                 vehicle.followed.again(about, kept.numbers, Adapter())
@@ -154,16 +170,20 @@ class Fleet:
             vehicle.newest = tuple(about["newest"]) if about["newest"] else None
             vehicle.used_s = -math.inf if about["used_s"] is None else about["used_s"]
             vehicle.ended, vehicle.refused = about["ended"], about["refused"]
-            vehicle.late, vehicle.ahead = about["late"], about["ahead"]
+            vehicle.late, vehicle.ahead, vehicle.unused = (about[k] for k in ("late", "ahead", "unused"))
             vehicle.last, vehicle.recent = about["last"], about["recent"]
             sents = [*self.journal.since(fleet, name, vehicle.upto, about["waiting"])]
             vehicle.waiting = [s for s in sents if s.seq <= vehicle.upto]
             sents = [s for s in sents if s.seq > vehicle.upto]
         else:
-            sents = [*self.journal.since(fleet, name, 0)]  # a changed sheet: from its first row
+            sents = [*self.journal.since(fleet, name, 0)]
         for sent in sents:  # as they came: one by one ends as any batches do
             self._take(vehicle, [sent])
         return vehicle
+
+    def _of(self, sheet: Sheet) -> list[Any]:
+        """What a state is of."""
+        return [augmented_sheet(sheet, {}, {}), self._watch, __version__]
 
     def _take(self, vehicle: _Vehicle, sents: Sequence[Sent]) -> None:
         """Rows in the order in which they came; what follows does not depend on how many come at once."""
@@ -178,13 +198,20 @@ class Fleet:
                 due += sorted(vehicle.waiting, key=lambda s: s.time_s)
                 vehicle.ended.append(vehicle.newest[0])
                 vehicle.waiting, vehicle.newest, vehicle.used_s = [], None, -math.inf
-            if sent.time_s <= vehicle.used_s:
+            if sent.time_s <= vehicle.used_s or (
+                vehicle.newest is not None and sent.time_s <= vehicle.newest[1] - ORDERED_S
+            ):
                 vehicle.late += 1
                 continue
             if vehicle.newest is not None and sent.time_s > vehicle.newest[1] + FARTHEST_S:
                 vehicle.ahead += 1
                 continue
             vehicle.waiting.append(sent)
+            if len(vehicle.waiting) > MOST_WAITING:
+                vehicle.waiting.sort(key=lambda s: s.time_s)
+                first, vehicle.waiting = vehicle.waiting[: MOST_WAITING // 2], vehicle.waiting[MOST_WAITING // 2 :]
+                vehicle.used_s = first[-1].time_s
+                due += first
             if vehicle.newest is None or sent.time_s > vehicle.newest[1]:
                 vehicle.newest = (sent.trip, sent.time_s)
                 until = sent.time_s - ORDERED_S
@@ -197,10 +224,9 @@ class Fleet:
 
     def _use(self, vehicle: _Vehicle, due: Sequence[Sent]) -> None:
         records = [{**s.body, **({"trip_id": s.trip} if s.trip else {})} for s in due]
-        # the first row says which columns there are
-        for part in (records[:1], records[1:]) if vehicle.followed.live is None else (records,):
+        for part in _alike(records, one_by_one=vehicle.followed.live is None):
             try:
-                for arrived, now in vehicle.followed.take(part) if part else ():
+                for arrived, now in vehicle.followed.take(part):
                     vehicle.last = self._told(vehicle.followed, arrived, now)
                     shown = {k: vehicle.last[k] for k in ("time_s", "measured", "predicted", "lower", "upper")}
                     vehicle.recent = [*vehicle.recent[-(SHOWN - 1) :], shown]
@@ -208,6 +234,10 @@ class Fleet:
             except InputError as e:
                 sheet = str(vehicle.followed.sheet.path)  # no path of this machine goes to a client
                 vehicle.refused = str(e).removeprefix("standard input: ").replace(sheet, Path(sheet).name)
+                vehicle.unused += len(part)
+            except Exception as e:  # a row that nothing foresaw is counted, and no start fails by it
+                vehicle.refused = f"{len(part)} rows could not be used ({type(e).__name__})"
+                vehicle.unused += len(part)
 
     @staticmethod
     def _told(followed: Followed, arrived: Arrived, now: Any) -> dict[str, Any]:
@@ -227,8 +257,8 @@ class Fleet:
             v = self._vehicle(fleet, name)
             if v.since and (all_ or v.since >= KEPT_ROWS or now - v.kept_at > KEPT_S):
                 numbers = None if v.followed.live is None else np.array(v.followed.live.numbers)
-                sheet = augmented_sheet(v.followed.sheet, {}, {})
-                states.append((fleet, name, Kept(v.upto, {"sheet": sheet, **v.about()}, numbers)))
+                about = {"of": self._of(v.followed.sheet), **v.about()}
+                states.append((fleet, name, Kept(v.upto, about, numbers)))
                 v.since, v.kept_at = 0, now
         if states:
             self.journal.keep(states)
@@ -252,14 +282,20 @@ class Fleet:
         with self._lock:
             if name not in self._names.get(fleet, ()):
                 return None
-            v = self._vehicle(fleet, name)
+            try:
+                v = self._vehicle(fleet, name)
+            except InputError as e:  # its sheet was taken away
+                return {"vehicle_id": name, "sheet": None, "alarm": None, "rows": {}, "notes": [], "refused": str(e)}
             if v.shown is not None and v.shown[0] == v.upto:
                 return v.shown[1]
             alarm = v.followed.alarm()
             told = {
                 "vehicle_id": name, "sheet": v.followed.sheet.name, **v.last,
                 "alarm": None if alarm is None else plain_alarm(alarm) | {"text": alarm.line()},
-                "rows": v.followed.counted() | {"late": v.late, "far ahead": v.ahead, "waiting": len(v.waiting)},
+                "rows": {
+                    **v.followed.counted(), "late": v.late, "far ahead": v.ahead, "not usable": v.unused,
+                    "waiting": len(v.waiting),
+                },
                 "notes": v.followed.notes, "refused": v.refused,
             }  # fmt: skip
             v.shown = v.upto, told
@@ -268,7 +304,8 @@ class Fleet:
     def recent(self, fleet: str, name: str) -> list[dict[str, Any]]:
         """The last rows that were used: time, measured, predicted with its interval."""
         with self._lock:
-            return list(self._vehicle(fleet, name).recent)
+            v = self._vehicles.get((fleet, name))  # in memory, or without a sheet
+            return [] if v is None else list(v.recent)
 
     def ahead(self, fleet: str, name: str, rows: Sequence[Mapping[str, Any]], **battery: Any) -> dict[str, Any]:
         """Energy of rows to come, and what of the battery is left. Raises `RefusedError` before a first row."""
@@ -280,8 +317,9 @@ class Fleet:
         vectors = []
         for i, row in enumerate(rows):
             for key in ("duration_s", "speed_start_mps", "speed_end_mps"):
-                if row.get(key) is None:
-                    raise RefusedError(["rows", i, key], "a finite number is expected: rows to come are intervals")
+                value = row.get(key)
+                if value is None or value < 0 or (key == "duration_s" and value == 0):
+                    raise RefusedError(["rows", i, key], "a number above 0 is expected: rows to come are intervals")
             vectors.append(
                 Arrived.of(
                     state.form,
@@ -293,7 +331,10 @@ class Fleet:
         reserve = battery.pop("reserve", 0.0)
         if battery.get("capacity_wh") is None:
             battery["capacity_wh"] = v.followed.sheet.capacity_wh
-        told = forecast(state, np.stack(vectors), **battery)
+        try:
+            told = forecast(state, np.stack(vectors), **battery)
+        except ValueError as e:
+            raise RefusedError(["rows"], str(e)) from e
         end = told.soc_at_end
         return {
             "energy_wh": told.energy_wh, "interval_wh": list(told.interval_wh), "level": told.level,
@@ -303,21 +344,17 @@ class Fleet:
 
 def sheets_in(folder: str | Path) -> Callable[[str, str], Sheet]:
     """The sheet of a vehicle: FOLDER/FLEET/VEHICLE.toml, FOLDER/VEHICLE.toml, or `default.toml` in place of it."""
-    root, read = Path(folder).resolve(), dict[Path, Sheet]()
+    root = Path(folder).resolve()
     if not root.is_dir():
         raise InputError(f"--sheets {folder}: no such folder")
-    there = {p.relative_to(root).as_posix(): p for p in root.rglob("*.toml")}
+    there = {p.relative_to(root).as_posix(): read_sheet(p) for p in sorted(root.rglob("*.toml"))}
     if not there:
         raise InputError(f"--sheets {folder}: holds no .toml; a sheet for each vehicle, or default.toml, is expected")
 
     def sheet_for(fleet: str, vehicle: str) -> Sheet:
         for name in (f"{fleet}/{vehicle}.toml", f"{vehicle}.toml", f"{fleet}/default.toml", "default.toml"):
-            if (path := there.get(name)) is not None:
-                if path not in read:
-                    read[path] = read_sheet(path)
-                return read[path]
+            if (sheet := there.get(name)) is not None:
+                return sheet
         raise InputError(f"no sheet for vehicle {vehicle!r}: {vehicle}.toml or default.toml is expected in --sheets")
 
-    with contextlib.suppress(KeyError):
-        read_sheet(there["default.toml"])
     return sheet_for

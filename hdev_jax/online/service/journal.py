@@ -104,14 +104,13 @@ class Journal:
 
     def since(self, fleet: str, vehicle: str, upto: int, also: Iterable[int] = ()) -> Iterator[Sent]:
         """Rows after `upto`, and those whose number is in `also`, in the order in which they came."""
-        waiting = sorted(also)
+        waiting = {*also}
         with self._lock:
-            marks = ",".join("?" * len(waiting))
             found = self._db.execute(
-                "SELECT seq, trip, time_s, body FROM rows "
-                f"WHERE fleet = ? AND vehicle = ? AND (seq > ? OR seq IN ({marks})) ORDER BY seq",
-                (fleet, vehicle, upto, *waiting),
+                "SELECT seq, trip, time_s, body FROM rows WHERE fleet = ? AND vehicle = ? AND seq >= ? ORDER BY seq",
+                (fleet, vehicle, min([*waiting, upto + 1])),
             ).fetchall()
+        found = [row for row in found if row[0] > upto or row[0] in waiting]
         return (Sent(seq, trip, time_s, json.loads(body)) for seq, trip, time_s, body in found)
 
     def keep(self, states: Sequence[tuple[str, str, Kept]]) -> None:

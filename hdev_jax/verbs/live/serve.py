@@ -10,7 +10,6 @@ from hdev_jax.online.service import Fleet, Journal, sheets_in
 __all__ = ["serve"]
 
 EXTRA = "hdev serve needs FastAPI and uvicorn: pip install 'hdev_jax[serve]'"
-HERE = ("127.0.0.1", "::1", "localhost")
 
 
 def serve(
@@ -30,7 +29,7 @@ def serve(
     try:
         import uvicorn
 
-        from hdev_jax.online.service.app import app_of
+        from hdev_jax.online.service.app import HERE, app_of
     except ImportError as e:
         raise InputError(EXTRA) from e
     if tokens is None and host not in HERE:
