@@ -122,7 +122,7 @@ def _loaded(folder: Path, rows: list[dict[str, Any]], a: argparse.Namespace) -> 
 def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
     """Kill it while a batch is on its way, start it, send the batch again; then compare with one that ran through."""
     from hdev_jax.online.service import Fleet, Journal, sheets_in
-    from hdev_jax.online.service.fleet import checked
+    from hdev_jax.online.service.given import checked
 
     size, rng = max(len(rows) // (kills + 1), 1), np.random.default_rng(0)
     for k in range(kills + 1):

@@ -16,7 +16,7 @@ import pytest
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import demo_log
 from hdev_jax.online.service import Fleet, Journal, RefusedError, sheets_in
-from hdev_jax.online.service.fleet import checked
+from hdev_jax.online.service.given import checked
 
 pytest.importorskip("fastapi", reason="fastapi is in the extra serve")
 from fastapi.testclient import TestClient

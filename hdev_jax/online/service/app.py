@@ -18,7 +18,8 @@ from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
 
 from hdev_jax import __version__
 from hdev_jax.errors import InputError
-from hdev_jax.online.service.fleet import Fleet, RefusedError, checked
+from hdev_jax.online.service.fleet import Fleet
+from hdev_jax.online.service.given import RefusedError, checked
 
 __all__ = ["HERE", "Limits", "app_of", "digest_of"]
 
