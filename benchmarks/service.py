@@ -12,19 +12,17 @@ import json
 import os
 import shutil
 import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx2 as httpx
 import numpy as np
 
+from experiments.live import running
 from hdev_jax.fleet import demo_log
 
 __all__ = ["main"]
@@ -54,33 +52,12 @@ def main() -> int:
     return 0
 
 
-@contextlib.contextmanager
-def _service(folder: Path, *options: str) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
-    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(folder / "sheets"), "--state",
-               str(folder / "state.sqlite"), "--port", str(port), *options]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    url = f"http://127.0.0.1:{port}"
-    try:
-        for _ in range(600):
-            with contextlib.suppress(httpx.TransportError):
-                httpx.get(f"{url}/healthz")
-                break
-            time.sleep(0.1)
-        yield url, process
-    finally:
-        process.terminate()
-        process.wait()
-
-
 def _loaded(folder: Path, rows: list[dict[str, Any]], a: argparse.Namespace) -> None:
     for watch in ((), ("--no-watch",)):
         shutil.rmtree(folder / "state", ignore_errors=True)
         for f in folder.glob("state.sqlite*"):
             f.unlink()
-        with _service(folder, *watch) as (url, _):
+        with running(folder, *watch) as (url, _):
             first = [{"vehicle_id": "warm", **r} for r in rows[:300]]
             httpx.post(f"{url}/v1/rows", json={"rows": first}, timeout=300).raise_for_status()
             times, sent, until = [], [0], time.monotonic() + a.seconds
@@ -127,7 +104,7 @@ def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
     size, rng = max(len(rows) // (kills + 1), 1), np.random.default_rng(0)
     for k in range(kills + 1):
         part = {"rows": [{"vehicle_id": "T", **r} for r in rows[k * size : (k + 1) * size]]}
-        with _service(folder, "--no-watch") as (url, process):
+        with running(folder, "--no-watch") as (url, process):
             if k < kills:
                 killer = threading.Timer(float(rng.uniform(0.0, 1.0)), lambda p=process: p.send_signal(signal.SIGKILL))
                 killer.start()
@@ -136,7 +113,7 @@ def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
                         body = {"rows": part["rows"][i : i + 10]}
                         httpx.post(f"{url}/v1/rows", json=body, timeout=60)
                 process.wait()
-        with _service(folder, "--no-watch") as (url, _):
+        with running(folder, "--no-watch") as (url, _):
             httpx.post(f"{url}/v1/rows", json=part, timeout=120).raise_for_status()
     import jax
 

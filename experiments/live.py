@@ -9,7 +9,6 @@ The page is at the address that is printed; Ctrl-C ends it.
 import argparse
 import contextlib
 import json
-import os
 import shutil
 import socket
 import subprocess
@@ -26,7 +25,7 @@ import pandas as pd
 
 from hdev_jax.fleet import synthetic_log
 
-__all__ = ["main"]
+__all__ = ["main", "running"]
 
 TRUCKS, LIMITED = 10, 3
 TRIPS, ROWS = 24, 150
@@ -48,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         old.unlink()
     (a.out / "sheets").mkdir(parents=True)
     rows = _vehicles(a.out)
-    with _service(a.out, a.port) as url, contextlib.suppress(KeyboardInterrupt):
+    with running(a.out, port=a.port) as (url, _), contextlib.suppress(KeyboardInterrupt):
         print(f"open {url}/ : {TRUCKS} synthetic trucks at {a.speed:g} times real time. Ctrl-C ends it.")
         print(f"truck_{LIMITED} regenerates no more than 60 kW, which its sheet does not know.", flush=True)
         named = _drive(url, rows, a.speed, a.seconds)
@@ -79,14 +78,15 @@ def _clocked(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 @contextlib.contextmanager
-def _service(out: Path, port: int) -> Iterator[str]:
+def running(folder: Path, *options: str, port: int = 0) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """`hdev serve` on the folder's `sheets` and `state.sqlite`, until the block ends: its address and process."""
     if not port:
         with socket.socket() as s:
             s.bind(("127.0.0.1", 0))
             port = s.getsockname()[1]
-    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(out / "sheets"), "--state",
-               str(out / "state.sqlite"), "--port", str(port)]  # fmt: skip
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ})
+    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(folder / "sheets"), "--state",
+               str(folder / "state.sqlite"), "--port", str(port), *options]  # fmt: skip
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
         url = f"http://127.0.0.1:{port}"
         for _ in range(600):
@@ -96,7 +96,7 @@ def _service(out: Path, port: int) -> Iterator[str]:
             if process.poll() is not None:
                 raise SystemExit("hdev serve did not start: pip install 'hdev_jax[serve]'")
             time.sleep(0.1)
-        yield url
+        yield url, process
     finally:
         process.terminate()
         process.wait()

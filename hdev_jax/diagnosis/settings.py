@@ -91,6 +91,11 @@ class Settings:
         "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
     )  # fmt: skip
 
+    correlated: float = _number(
+        0.5, "least correlation of two estimates for which a class among found effects is looked for", "1",
+        "time: of those that share 80 % of their gain it is 0.9",
+    )  # fmt: skip
+
     # terms without a name
     unnamed_stricter: float = _number(
         5.0, "times lower FDR level for a term without a name", "1", "a description is not a cause"

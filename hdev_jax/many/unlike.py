@@ -19,7 +19,7 @@ DAY_S, WEEK_S = 86_400.0, 604_800.0
 DRAWS = 999, 19_999  # permutations: for all, and for those that the first do not decide
 UNDECIDED = 0.02  # p-value of the first permutations below which more are drawn
 LEAST_OTHERS = 5  # vehicles of the type with trips in a week, for the type's own course there
-LEAST_TOLD = 1e-4  # of a coefficient's information: with less beside the others, no step of it is told
+LEAST_TOLD = 1e-4  # of a coefficient's information: with less beside the others, no step of it is reported
 CLOSE = 1.92  # log-likelihood of the best split less that of another which is as good: half of χ²₁ at 95 %
 
 

@@ -44,9 +44,6 @@ class Without:
         return [replace(c, columns=tuple(k + self.shift for k in c.columns)) for c in candidates]
 
 
-CORRELATED = 0.5  # two estimates that are less have no class: of those that share 80 % of their gain it is 0.9
-
-
 def model_without(evidence: Evidence, fit: Calibration, *out: Found) -> Without:
     """The model without found effects; their shapes are held where they are."""
     sizes: list[int] = []
@@ -176,7 +173,7 @@ def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Set
     in the vehicle, else the one that explains less by itself."""
     if not (can_be_asked(f) and can_be_asked(g)) or f.score.plain or g.score.plain:
         return False
-    if not _correlation(state.fit, f, g) > CORRELATED:
+    if not _correlation(state.fit, f, g) > settings.correlated:
         return False
     w = model_without(evidence, state.fit, f, g)
     totals, (own, other) = w.evidence.totals(), w.each

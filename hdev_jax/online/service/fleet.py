@@ -47,7 +47,7 @@ class _Vehicle:
     refused: str | None = None  # why its rows cannot be used at all
     last: dict[str, Any] = field(default_factory=dict)
     recent: list[dict[str, Any]] = field(default_factory=list)
-    shown: tuple[int, dict[str, Any]] | None = None  # what was told of it last, and after which row
+    shown: tuple[int, dict[str, Any]] | None = None  # the last answer about it, and the row that it is of
     since: int = 0
     kept_at: float = field(default_factory=time.monotonic)
 
