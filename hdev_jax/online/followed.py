@@ -75,17 +75,19 @@ class Followed:
             notes.append("the rows have no slope (grade_rad): the road is taken as level")
         return state, watch, notes
 
-    def take(self, records: Iterable[Mapping[str, Any] | None]) -> Iterator[tuple[Arrived, Now]]:
-        """Some rows by header, in order; None for one that does not read. Raises `InputError` where none reads."""
+    def take(self, records: Iterable[Mapping[str, Any] | None]) -> tuple[list[Arrived], Now | None]:
+        """Some rows by header, in order; None for one that does not read. Raises `InputError` where none reads.
+
+        **Returns:** the rows that were used, and what is known after each (first axis: the row), or None.
+        """
         records = list(records)
         self.stream.unreadable += sum(r is None for r in records)
-        yield from self._used(
-            self.stream.intervals(self._seen(self.stream.read([r for r in records if r is not None])))
-        )
+        read = self.stream.read([r for r in records if r is not None])
+        return self._used(self.stream.intervals(self._seen(read)))
 
-    def end(self) -> Iterator[tuple[Arrived, Now]]:
+    def end(self) -> tuple[list[Arrived], Now | None]:
         """The row that waits for the next one, where none follows."""
-        yield from self._used(self.stream.flush())
+        return self._used(self.stream.flush())
 
     def _seen(self, rows: list[tuple[str, dict[str, float]]]) -> Iterator[tuple[str, dict[str, float]]]:
         for trip, row in rows:
@@ -93,16 +95,13 @@ class Followed:
                 self.begin(row)
             yield trip, row
 
-    def _used(self, rows: Iterable[tuple[int, dict[str, float]]]) -> Iterator[tuple[Arrived, Now]]:
+    def _used(self, rows: Iterable[tuple[int, dict[str, float]]]) -> tuple[list[Arrived], Now | None]:
         found = list(rows)
         if self.live is None or not found:
-            return
+            return [], None
         arrived = [Arrived.of(self.form, self.stream.trips[n - 1], n, row) for n, row in found]
-        each: list[Any] = [None] * len(arrived)
-        if self.watch is not None:
-            each = list(self.watch.columns(np.stack([a.vector for a in arrived])))
-        for a, candidates in zip(arrived, each, strict=True):
-            yield a, self.live(a.vector, candidates)
+        vectors = np.stack([a.vector for a in arrived])
+        return arrived, self.live.rows(vectors, None if self.watch is None else self.watch.columns(vectors))
 
     def alarm(self) -> Alarm | None:
         """What the sheet lacks, once that is certain."""

@@ -1,4 +1,4 @@
-"""One vehicle fed from Python row by row: one compiled call a row, and a file that keeps what is known."""
+"""One vehicle fed from Python: one compiled call for the rows that are there, and a file that keeps what is known."""
 
 import json
 import zipfile
@@ -22,11 +22,15 @@ __all__ = ["Live", "keep", "kept"]
 
 SCHEMA = "hdev-follow/1"
 MOST_PROGRAMS = 32  # forms of which the compiled program is kept
+CHUNK = 64  # rows of a call, at most
 _PROGRAMS: dict[Any, "_Program"] = {}
 
 
 class _Program:
-    """One row, compiled: from all that changes as one vector to the same and what is known."""
+    """Up to `CHUNK` rows, compiled: from all that changes as one vector to the same and what is known after each.
+
+    A loop as long as there are rows: what a row does to the last digit does not depend on how many come with it.
+    """
 
     def __init__(self, state: State):
         changing, constant = eqx.partition(state, _changes(state))
@@ -38,16 +42,21 @@ class _Program:
         self.sizes = [(leaf.shape, int(leaf.size)) for leaf in jax.tree.leaves(now)]
         self.shape = jax.tree.structure(now)
 
-        def step(flat: Any, leaves: Any, row: Any, candidates: Any) -> tuple[Any, Any]:
-            new, now = update(self.restored(flat, leaves), row, candidates)
-            return ravel_pytree(eqx.filter(new, _changes(new)))[0], ravel_pytree(now)[0]
+        def step(flat: Any, leaves: Any, rows: Any, candidates: Any, count: Any) -> tuple[Any, Any]:
+            def one(i: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+                new, now = update(self.restored(carry[0], leaves), rows[i], candidates[i])
+                flat = ravel_pytree(eqx.filter(new, _changes(new)))[0]
+                return flat, carry[1].at[i].set(ravel_pytree(now)[0])
+
+            told = jnp.zeros((CHUNK, sum(size for _, size in self.sizes)), flat.dtype)
+            return jax.lax.fori_loop(0, count, one, (flat, told))
 
         self.step = jax.jit(step, donate_argnums=0)
 
 
 class Live:
-    """A state that each call takes one row further: all that changes is one vector, which the call gives away and gets
-    back, so that a row costs little beyond its arithmetic.
+    """A state that each call takes some rows further: all that changes is one vector, which the call gives away and
+    gets back, so that a row costs little beyond its arithmetic.
 
     `state` is what is known now; setting it begins anew from there.
     """
@@ -65,15 +74,25 @@ class Live:
                 _PROGRAMS.pop(next(iter(_PROGRAMS)))
             _PROGRAMS[key] = _Program(state)
         self._program = _PROGRAMS[key]
-        self._none = np.zeros(len(state.form.candidates))
 
     def __call__(self, row: Float[np.ndarray, " column"], candidates: Any = None) -> Now:
         """One row more, as `update`; what is known now, as NumPy arrays."""
-        each = self._none if candidates is None else candidates
-        self._flat, told = self._program.step(self._flat, self._constant, row, each)
-        told, at, leaves = np.asarray(told), 0, []
+        return self.rows(row[None], None if candidates is None else candidates[None]).row(0)
+
+    def rows(self, rows: Float[np.ndarray, "row column"], candidates: Any = None) -> Now:
+        """Rows in order, each as `update`; what is known after each, as NumPy arrays with the row as first axis."""
+        parts = []
+        for at in range(0, len(rows), CHUNK):
+            n = min(CHUNK, len(rows) - at)
+            part, each = np.zeros((CHUNK, rows.shape[1])), np.zeros((CHUNK, len(self.form.candidates)))
+            part[:n] = rows[at : at + n]
+            if candidates is not None:
+                each[:n] = candidates[at : at + n]
+            self._flat, told = self._program.step(self._flat, self._constant, part, each, n)
+            parts.append(np.asarray(told)[:n])
+        told, at, leaves = np.concatenate(parts), 0, []
         for shape, size in self._program.sizes:
-            leaves.append(told[at : at + size].reshape(shape))
+            leaves.append(told[:, at : at + size].reshape(-1, *shape))
             at += size
         return jax.tree.unflatten(self._program.shape, leaves)
 

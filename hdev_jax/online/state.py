@@ -178,6 +178,10 @@ class Now(eqx.Module):
     weight: Float[Array, "*row"]
     alarm: Float[Array, "*row"]
 
+    def row(self, i: int) -> "Now":
+        """Of rows, the i-th."""
+        return jax.tree.map(lambda x: x[i], self)
+
 
 def sample_row(channels: Iterable[str]) -> Segments:
     """One plausible row with these channels, which says what a log of them can be asked."""

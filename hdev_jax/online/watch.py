@@ -39,6 +39,7 @@ __all__ = ["WATCH_ROWS", "Alarm", "Watch", "evidence", "of_effects", "watched"]
 
 WATCH_ROWS = 400.0  # that show the noise and its correlation, which E takes as known; also these count in it
 
+TOGETHER = 256  # rows whose columns are computed at a time: one shape, so each program compiles once
 SHIFT_S = 9 * 3600.0  # what a vehicle drives in a day: daily driving time of Regulation (EC) 561/2006
 
 
@@ -161,6 +162,10 @@ class Watch:
     def columns(self, rows: Float[Any, "row column"]) -> Float[np.ndarray, "row candidate"]:
         """What a typical size of each candidate adds to each row [target's unit]; 0 where a channel is missing."""
         rows = np.asarray(rows, dtype=float)
+        parts = [self._columns(rows[k : k + TOGETHER]) for k in range(0, len(rows), TOGETHER)]
+        return np.concatenate(parts) if parts else np.zeros((0, len(self.chosen)))
+
+    def _columns(self, rows: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row candidate"]:
         by = {c: rows[:, i] for i, c in enumerate(self.form.columns)}
         usable = by["duration_s"] > 0
         n = len(rows)
@@ -170,7 +175,7 @@ class Watch:
             speed_start_mps=by["speed_start_mps"], speed_end_mps=by["speed_end_mps"],
             channels={c: by[c] for c in self.form.channels},
         )  # fmt: skip
-        fit = padded(segments, np.zeros(n))
+        fit = padded(segments, np.zeros(n), TOGETHER)
         out = np.zeros((len(fit.weight), len(self.chosen)))
         self.plan.write(out, fit.segments, self.chosen)
         return out[:n] * self.scales

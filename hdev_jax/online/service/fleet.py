@@ -19,6 +19,7 @@ from hdev_jax.online.followed import Followed, plain, plain_alarm
 from hdev_jax.online.forecast import forecast
 from hdev_jax.online.service.given import RefusedError
 from hdev_jax.online.service.journal import Journal, Kept, Sent
+from hdev_jax.online.state import Now
 from hdev_jax.online.stream import Arrived
 
 __all__ = ["Fleet"]
@@ -61,11 +62,12 @@ class _Vehicle:
         }  # fmt: skip
 
 
-def _alike(records: Sequence[dict[str, Any]], *, one_by_one: bool) -> list[list[dict[str, Any]]]:
-    """Runs of rows with the same fields: what a row is taken for depends on its own alone, not on its batch."""
-    if one_by_one:  # the first row says which columns there are
-        return [[r] for r in records]
-    return [list(run) for _, run in itertools.groupby(records, key=lambda r: tuple(sorted(r)))]
+def _alike(records: Sequence[dict[str, Any]], *, begun: bool) -> list[list[dict[str, Any]]]:
+    """Runs of rows with the same fields: what a row is taken for depends on its own alone, not on its batch. The first
+    row of all, which says which columns there are, is one by itself."""
+    first = 0 if begun else 1
+    runs = itertools.groupby(records[first:], key=lambda r: tuple(sorted(r)))
+    return [*([r] for r in records[:first]), *(list(run) for _, run in runs)]
 
 
 def _finite(x: float) -> float | None:
@@ -181,12 +183,14 @@ class Fleet:
 
     def _use(self, vehicle: _Vehicle, due: Sequence[Sent]) -> None:
         records = [{**s.body, **({"trip_id": s.trip} if s.trip else {})} for s in due]
-        for part in _alike(records, one_by_one=vehicle.followed.live is None):
+        for part in _alike(records, begun=vehicle.followed.live is not None):
             try:
-                for arrived, now in vehicle.followed.take(part):
-                    vehicle.last = self._told(vehicle.followed, arrived, now)
-                    shown = {k: vehicle.last[k] for k in ("time_s", "measured", "predicted", "lower", "upper")}
-                    vehicle.recent = [*vehicle.recent[-(SHOWN - 1) :], shown]
+                arrived, now = vehicle.followed.take(part)
+                if now is not None:
+                    shown = range(max(len(arrived) - SHOWN, 0), len(arrived))
+                    told = [self._told(vehicle.followed, arrived[i], now, i) for i in shown]
+                    vehicle.recent = [*vehicle.recent, *told][-SHOWN:]
+                    vehicle.last = vehicle.recent[-1] | self._known(vehicle.followed, arrived[-1], now.row(-1))
                 vehicle.refused = None
             except InputError as e:
                 sheet = str(vehicle.followed.sheet.path)  # no path of this machine goes to a client
@@ -197,13 +201,20 @@ class Fleet:
                 vehicle.unused += len(part)
 
     @staticmethod
-    def _told(followed: Followed, arrived: Arrived, now: Any) -> dict[str, Any]:
-        by = dict(zip(followed.form.columns, arrived.vector, strict=True))
+    def _told(followed: Followed, arrived: Arrived, now: Now, i: int) -> dict[str, Any]:
+        """A row as the page draws it."""
+        at = followed.form.columns.index
+        return {
+            "time_s": plain(arrived.vector[at("time_s")]), "measured": plain(arrived.vector[at("measured")]),
+            **{k: plain(getattr(now, k)[i]) for k in ("predicted", "lower", "upper")},
+        }  # fmt: skip
+
+    @staticmethod
+    def _known(followed: Followed, arrived: Arrived, now: Now) -> dict[str, Any]:
         each = zip(followed.form.names, now.values, now.sd, strict=True)
         return {
-            "trip_id": arrived.trip, "time_s": plain(by["time_s"]), "measured": plain(by["measured"]),
-            **{k: plain(getattr(now, k)) for k in ("predicted", "lower", "upper", "sigma")},
-            "unit": followed.form.unit, "values": {n: [plain(v), plain(s)] for n, v, s in each},
+            "trip_id": arrived.trip, "sigma": plain(now.sigma), "unit": followed.form.unit,
+            "values": {n: [plain(v), plain(s)] for n, v, s in each},
         }  # fmt: skip
 
     # --- kept --------------------------------------------------------------------------------------------------------

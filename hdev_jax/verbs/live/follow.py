@@ -5,7 +5,7 @@ import json as json_
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -111,8 +111,11 @@ class _Following:
         if self.file is not None and time.monotonic() - self.saved > SAVED_S:
             self._save()
 
-    def _use(self, rows: Iterable[tuple[Arrived, Now]]) -> None:
-        for a, now in rows:
+    def _use(self, rows: tuple[list[Arrived], Now | None]) -> None:
+        arrived, known = rows
+        for i, a in enumerate(arrived):
+            assert known is not None
+            now = known.row(i)
             self.tell(self._told(self.vehicle.form, a, now))
             if now.alarm and not self.alarmed and (found := self.vehicle.alarm()) is not None:
                 self.alarmed = True
