@@ -35,6 +35,7 @@ def main() -> int:
     """Run it."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--vehicles", type=int, default=100)
+    arguments.add_argument("--rate", type=float, default=5000.0, help="rows a second that are sent")
     arguments.add_argument("--seconds", type=float, default=20.0)
     arguments.add_argument("--batch", type=int, default=100, help="rows of a request, of one vehicle each")
     arguments.add_argument("--clients", type=int, default=4)
@@ -45,7 +46,7 @@ def main() -> int:
         files = log.write(folder / "log", truth=False)
         (folder / "sheets").mkdir()
         shutil.copy(files["sheet"], folder / "sheets" / "default.toml")
-        rows = json.loads(log.frame[COLUMNS].to_json(orient="records"))
+        rows = json.loads(str(log.frame[COLUMNS].to_json(orient="records")))
         if a.kills:
             return _killed(folder, rows, a.kills)
         _loaded(folder, rows, a)
@@ -53,45 +54,45 @@ def main() -> int:
 
 
 def _loaded(folder: Path, rows: list[dict[str, Any]], a: argparse.Namespace) -> None:
+    """Rows come at a fixed rate, whatever the answers take: an answer's time counts from when its rows were due."""
     for watch in ((), ("--no-watch",)):
-        shutil.rmtree(folder / "state", ignore_errors=True)
         for f in folder.glob("state.sqlite*"):
             f.unlink()
         with running(folder, *watch) as (url, _):
-            first = [{"vehicle_id": "warm", **r} for r in rows[:300]]
-            httpx.post(f"{url}/v1/rows", json={"rows": first}, timeout=300).raise_for_status()
-            times, sent, until = [], [0], time.monotonic() + a.seconds
-            lock = threading.Lock()
+            with httpx.Client(timeout=300) as http:  # what compiles, compiles first
+                for part in (rows[:300], rows[300:600]):
+                    body = {"rows": [{"vehicle_id": "warm", **r} for r in part]}
+                    http.post(f"{url}/v1/rows", json=body).raise_for_status()
+                    http.get(f"{url}/v1/vehicles/warm").raise_for_status()
+            parts = [(v, at) for at in range(0, len(rows) - a.batch, a.batch) for v in range(a.vehicles)]
+            parts = parts[: int(a.rate * a.seconds / a.batch)]
+            every = [json.dumps({"rows": [{"vehicle_id": f"V{v}", **r} for r in rows[at : at + a.batch]]}).encode()
+                     for v, at in parts]  # fmt: skip
+            begun, times = time.monotonic() + 0.1, []
 
-            def client(k: int, url: str = url, times: list[float] = times, sent: list[int] = sent,
-                       until: float = until, lock: Any = lock) -> None:  # fmt: skip
+            def client(k: int, url: str = url, every: list[bytes] = every, begun: float = begun,
+                       times: list[float] = times) -> None:  # fmt: skip
                 with httpx.Client(timeout=60) as http:
-                    at = dict.fromkeys(range(k, a.vehicles, a.clients), 0)
-                    while time.monotonic() < until:
-                        for v in at:
-                            part = rows[at[v] : at[v] + a.batch]
-                            if not part or time.monotonic() > until:
-                                continue
-                            body = {"rows": [{"vehicle_id": f"V{v}", **r} for r in part]}
-                            begun = time.monotonic()
-                            http.post(f"{url}/v1/rows", json=body).raise_for_status()
-                            with lock:
-                                times.append(time.monotonic() - begun)
-                                sent[0] += len(part)
-                            at[v] += len(part)
+                    for i in range(k, len(every), a.clients):
+                        due = begun + i * a.batch / a.rate
+                        time.sleep(max(due - time.monotonic(), 0.0))
+                        http.post(f"{url}/v1/rows", content=every[i]).raise_for_status()
+                        times.append(time.monotonic() - due)
 
-            begun = time.monotonic()
             threads = [threading.Thread(target=client, args=(k,)) for k in range(a.clients)]
             for t in threads:
                 t.start()
             for t in threads:
                 t.join()
-            ms = 1e3 * np.quantile(times, [0.5, 0.99])
+            sent_s = time.monotonic() - begun
+            httpx.get(f"{url}/v1/vehicles", timeout=600).raise_for_status()  # every row is used then
+            used_s, ms = time.monotonic() - begun, 1e3 * np.quantile(times, [0.5, 0.99])
+            count = a.batch * len(every)
             print(
-                f"{'not watched' if watch else 'effects watched'}: {sent[0] / (time.monotonic() - begun):,.0f} rows a "
-                f"second in requests of {a.batch}; answers after {ms[0]:.0f} ms in the median, 99 % by {ms[1]:.0f} "
-                f"ms; "
-                f"{a.clients} clients, {a.vehicles} vehicles, load of the machine {os.getloadavg()[0]:.1f}",
+                f"{'not watched' if watch else 'effects watched'}: {count:,} rows at {a.rate:,.0f} a second: "
+                f"acknowledged {count / sent_s:,.0f} a second, used {count / used_s:,.0f} a second; answers after "
+                f"{ms[0]:.0f} ms in the median, 99 % by {ms[1]:.0f} ms; requests of {a.batch} rows, {a.clients} "
+                f"clients, {len({v for v, _ in parts})} vehicles, load of the machine {os.getloadavg()[0]:.1f}",
                 flush=True,
             )
 

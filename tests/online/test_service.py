@@ -60,7 +60,7 @@ def client(fleet):
 
 
 def numbers(fleet, vehicle="T1"):
-    return fleet._vehicle("a", vehicle).followed.live.numbers
+    return fleet._current(("a", vehicle)).followed.live.numbers
 
 
 def test_the_service_knows_what_rows_one_by_one_tell(fleet, rows, sheets):
@@ -160,6 +160,19 @@ def test_bodies_that_are_none_and_limits(client, rows):
     answer = slow.post("/v1/rows", json={"rows": named(rows, "T1")}, headers=A)
     assert answer.status_code == 429
     assert int(answer.headers["Retry-After"]) > 100
+
+
+def test_rows_that_come_faster_than_they_are_used_are_to_wait(fleet, rows):
+    busy = TestClient(app_of(fleet, TOKENS, Limits(behind=50)))
+    with fleet._lock:  # as if a form of rows were being compiled: what is acknowledged is kept all the same
+        first = busy.post("/v1/rows", json={"rows": named(rows[:60], "T1")}, headers=A)
+        then = busy.post("/v1/rows", json={"rows": named(rows[60:70], "T1")}, headers=A)
+    assert first.json()["accepted"] == 60
+    assert then.status_code == 503
+    assert int(then.headers["Retry-After"]) > 0
+    assert fleet.known("a", "T1")["rows"]["waiting"] > 0
+    assert fleet.behind == 0
+    assert busy.post("/v1/rows", json={"rows": named(rows[60:70], "T1")}, headers=A).json()["accepted"] == 10
 
 
 def test_a_vehicle_without_a_sheet_is_refused_in_one_line(tmp_path, sheets, rows):
@@ -280,5 +293,5 @@ def test_killed_while_rows_come_it_loses_and_repeats_none(tmp_path, fleet, rows,
     fleet.put("fleet", checked(named(rows, "T1")))
     again = Fleet(Journal(tmp_path / "killed.sqlite"), sheets_in(sheets), watch=False)
     assert again.known("fleet", "T1")["rows"] == fleet.known("fleet", "T1")["rows"]
-    live = [f._vehicle("fleet", "T1").followed.live.numbers for f in (again, fleet)]
+    live = [f._current(("fleet", "T1")).followed.live.numbers for f in (again, fleet)]
     np.testing.assert_array_equal(*live)

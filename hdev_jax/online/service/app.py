@@ -31,11 +31,13 @@ ALONE = "fleet"  # the one fleet where no tokens are given
 
 @dataclass(frozen=True)
 class Limits:
-    """What a request may have: `body` bytes, `rows`; and a fleet `rows_per_s`, with a reserve of ten seconds."""
+    """What a request may have: `body` bytes, `rows`; and a fleet `rows_per_s`, with a reserve of ten seconds. Beyond
+    `behind` rows that are kept and not used yet, more have to wait."""
 
     body: int = 4_000_000
     rows: int = 10_000
     rows_per_s: float = 20_000.0
+    behind: int = 200_000
 
 
 @dataclass
@@ -127,6 +129,8 @@ def app_of(fleet: Fleet, tokens: Mapping[str, str] | None = None, limits: Limits
         found = checked((await body_of(request)).get("rows"))
         if wait := rate.wait_s(own, len(found)):
             raise HTTPException(429, "more rows a second than this fleet may send", {"Retry-After": f"{wait:.0f}"})
+        if fleet.behind >= limits.behind:
+            raise HTTPException(503, f"{fleet.behind} rows are still to be used", {"Retry-After": "10"})
         return await run_in_threadpool(fleet.put, own, found)
 
     @app.get("/v1/vehicles")
