@@ -38,7 +38,8 @@ def serve(
     fleet = Fleet(Journal(state), sheets_in(sheets), watch=watch)
     progress.step(f"http://{host}:{port}/ shows the vehicles; rows go to /v1/rows")
     try:
-        uvicorn.run(app_of(fleet, digests), host=host, port=port, log_level="warning")
+        app = app_of(fleet, digests)  # a page that is open listens for ever: it is cut off
+        uvicorn.run(app, host=host, port=port, log_level="warning", timeout_graceful_shutdown=2)
     finally:
         fleet.close()
 
