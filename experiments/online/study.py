@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from pydantic import Field
 from scipy import stats
 
@@ -20,6 +21,7 @@ from experiments.runner.tables import wilson, write_tables
 from hdev_jax.fleet import SyntheticLog, simulate, synthetic_log
 from hdev_jax.inference.sheet import Sheet, read_sheet
 from hdev_jax.online import State, Watch, forecast, scan, start
+from hdev_jax.online.running import Running, running_channels
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
 from hdev_jax.rundir import Run
 
@@ -92,6 +94,8 @@ def _fed(state: State, rows: np.ndarray, watch: Watch | None = None) -> tuple[St
 def _rows(state: State, made: SyntheticLog) -> np.ndarray:
     frame = made.frame
     named = {"measured": frame["energy_wh"], "trip": frame["trip_id"].astype("category").cat.codes + 1.0}
+    each = pd.DataFrame(Running.over(zip(frame["trip_id"], frame.to_dict("records"), strict=True)), index=frame.index)
+    named |= {c: each[c] for c in each}
     missing = np.full(len(frame), np.nan)
     return np.stack([np.asarray(named.get(c, frame.get(c, missing)), float) for c in state.form.columns], axis=1)
 
@@ -158,6 +162,7 @@ def _alarms(task: dict[str, Any]) -> dict[str, Any]:
     made = _log(task)
     sheet = Sheet(mass_kg=29e3, road=ROAD, driveline={"efficiency": 0.91})
     here = [c for c in CHANNELS if c in made.frame]
+    here += running_channels(here)
     watch = Watch.of(start(sheet, here)[0])
     state, _ = start(sheet, here, candidates=watch.candidates)
     rows = _rows(state, made)

@@ -223,7 +223,7 @@ def start(
     """
     sample = sample_row(channels).without(*TARGETS[target].follows)
     built = build(sheet, sample, choose_entry(sample, target, sheet), target)
-    across = [e.id for e in built.vehicle.effects if e.acts_across_rows()]
+    across = [e.id for e in built.vehicle.effects if e.acts_across_rows(sample.channels)]
     table, vehicle = built.table, built.vehicle
     notes = [n for n in built.notes if "efficiency map" not in n or "gear" in n]
     if not untold(sheet, sample, vehicle):

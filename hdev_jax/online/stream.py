@@ -14,13 +14,15 @@ from hdev_jax.logs.limits import GAP_SAMPLES, REVERSE_MPS
 from hdev_jax.logs.log import KINEMATICS, MEASURED
 from hdev_jax.logs.readers.raw import Raw
 from hdev_jax.online.form import NEEDED, Form
+from hdev_jax.online.running import Running, running_channels
 from hdev_jax.physics import LIBRARY
 from hdev_jax.targets import TARGETS, target_of
 from hdev_jax.units import J_PER_WH
 
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
-KEPT = ("trips", "origin_s", "held", "before", "last_s", "repeated", "unreadable")  # in the file of the state
+# in the file of the state
+KEPT = ("trips", "origin_s", "held", "before", "last_s", "so_far", "running", "repeated", "unreadable")
 Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")
 READ = ("mass_kg", "grade_rad", "air_density_kgpm3", "gear", "motor_torque_nm", "motor_speed_radps", "traction_force_n",
@@ -33,6 +35,7 @@ class Stream:
 
     `held`, rows that wait for the next one, and `before`, the row before them: a sample stands for half of the way to
     each neighbour. `continued`: it began again, and may send what it had sent; `understood`: some row has been read.
+    `so_far` is of the trip that is the `running`-th.
     `repeated` counts rows that were there already when a stream began again, `unreadable` those that do
     not read.
     """
@@ -43,6 +46,8 @@ class Stream:
     held: dict[str, float] | None = None
     before: dict[str, float] | None = None
     last_s: float = float("nan")
+    so_far: Running = field(default_factory=Running)
+    running: int = 0
     continued: bool = False
     understood: bool = False
     repeated: int = 0
@@ -71,7 +76,9 @@ class Stream:
     @staticmethod
     def again(about: Mapping[str, Any], rules: Adapter) -> "Stream":
         """The stream that goes on from there. Raises `KeyError` or `TypeError` for what `about` did not give."""
-        return Stream(rules, **{k: about[k] for k in KEPT}, continued=True, understood=True)
+        known = {k: about[k] for k in KEPT}
+        known["so_far"] = Running(*known["so_far"])
+        return Stream(rules, **known, continued=True, understood=True)
 
     # --- rows in the contract's columns ------------------------------------------------------------------------------
 
@@ -105,7 +112,21 @@ class Stream:
     # --- intervals ---------------------------------------------------------------------------------------------------
 
     def intervals(self, rows: Iterable[tuple[str, dict[str, float]]]) -> Iterator[tuple[int, dict[str, float]]]:
-        """Rows that are complete: the number of their trip, and the row with its interval."""
+        """Rows that are complete: the number of their trip, and the row with its interval and running channels."""
+        yield from map(self._ran, self._intervals(rows))
+
+    def flush(self) -> Iterator[tuple[int, dict[str, float]]]:
+        """The row that waits, as the last of its stretch."""
+        yield from map(self._ran, self._flushed())
+
+    def _ran(self, at: tuple[int, dict[str, float]]) -> tuple[int, dict[str, float]]:
+        number, row = at
+        if number != self.running:
+            self.so_far, self.running = Running(), number
+        self.so_far, channels = self.so_far.after(row)
+        return number, row | channels
+
+    def _intervals(self, rows: Iterable[tuple[str, dict[str, float]]]) -> Iterator[tuple[int, dict[str, float]]]:
         for trip, row in rows:
             if self._was_there(trip, row):
                 self.repeated += 1
@@ -113,9 +134,9 @@ class Stream:
             opens = not self.trips or trip != self.trips[-1]
             time = row.get("time_s", np.nan)
             if not opens and self._breaks(row):
-                yield from self.flush()
+                yield from self._flushed()
             if opens:
-                yield from self.flush()
+                yield from self._flushed()
                 self.trips.append(trip)
                 self.origin_s = time
             self.last_s = time if np.isfinite(time) else self.last_s
@@ -131,8 +152,7 @@ class Stream:
                 yield len(self.trips), _interval(self.before, self.held, row)
                 self.before, self.held = self.held, row
 
-    def flush(self) -> Iterator[tuple[int, dict[str, float]]]:
-        """The row that waits, as the last of its stretch."""
+    def _flushed(self) -> Iterator[tuple[int, dict[str, float]]]:
         if self.held is not None and self.before is not None:
             yield len(self.trips), _interval(self.before, self.held, None)
         self.held = self.before = None
@@ -204,7 +224,7 @@ class Arrived:
 def channels_of(names: Iterable[str]) -> tuple[str, ...]:
     """The columns of rows that the kernel or any effect of the library reads."""
     known = {*READ, *(c for e in LIBRARY.values() for c in e.reads())}
-    return tuple(sorted({*names} & known - {*NEEDED, *KINEMATICS, *MEASURED}))
+    return tuple(sorted({*names} & known - {*NEEDED, *KINEMATICS, *MEASURED} | {*running_channels(names)}))
 
 
 def target_in(names: Iterable[str], asked: str | None) -> str:

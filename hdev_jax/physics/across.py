@@ -25,6 +25,7 @@ __all__ = [
 FIRST, LAST = "derived:first_row_of_trip", "derived:last_row_of_trip"
 DISTANCE_SINCE_START = "derived:distance_since_start_m"
 TIME_SINCE_BRAKING = "derived:time_since_braking_s"
+BRAKING_PA = 2e3  # pressure from which on a brake is on
 STANDS = 0.05  # m: a way that says nothing of a slope
 
 
@@ -174,7 +175,7 @@ def distance_since_start(segments: Segments) -> Float[Array, " row"]:
     return before - before[first] + 0.5 * d
 
 
-def time_since_braking(segments: Segments, threshold_pa: float = 2e3) -> Float[Array, " row"]:
+def time_since_braking(segments: Segments, threshold_pa: float = BRAKING_PA) -> Float[Array, " row"]:
     """Seconds from the end of the trip's last braked row to the middle of this one; 0 while braking and before."""
     first, _ = trip_bounds(segments)
     start, duration = jnp.asarray(segments.time_s), jnp.asarray(segments.duration_s)

@@ -29,6 +29,7 @@ class BrakeDrag(Effect):
         Size("force_n", "N", 0.0, 300.0, 0.0, 1e4, least=5.0),
         Shape("tau_s", "s", 30.0, 20.0, 2.0, 600.0, grid=(10.0, 30.0, 90.0), label="time constant"),
     )
+    derives: ClassVar[Names] = (TIME_SINCE_BRAKING,)
     mistaken_for: ClassVar[Names] = ("tyre_warmup",)
     separated_by: ClassVar[str] = "cruising just after braking and long after"
     force_n: Any

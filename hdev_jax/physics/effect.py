@@ -1,7 +1,7 @@
 """What an effect is: one small class at one stage of the vehicle, its equation for one row, and its parameters."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, Field
 from typing import Any, ClassVar, Literal, Protocol, get_origin, runtime_checkable
 
@@ -152,6 +152,7 @@ class Effect(eqx.Module):
     parameters: ClassVar[Parameters] = ()
     ordered: ClassVar[tuple[tuple[str, str], ...]] = ()  # pairs of parameters of which the first is the lower
     variants: ClassVar[tuple[Names, ...]] = ()  # sets of sizes tried together; default: all of them
+    derives: ClassVar[Names] = ()  # the channels that `derive` adds where rows do not have them
     mistaken_for: ClassVar[Names] = ()
     separated_by: ClassVar[str] = ""
     order: ClassVar[int] = 0  # limits come after what they limit
@@ -234,9 +235,10 @@ class Effect(eqx.Module):
         return column
 
     @classmethod
-    def acts_across_rows(cls) -> bool:
-        """Whether it needs more of a trip than one row."""
-        return any(cls.overrides(hook) for hook in ("derive", "across", "observe"))
+    def acts_across_rows(cls, known: Iterable[str] = ()) -> bool:
+        """Whether it needs more of a trip than one row in which the channels `known` are there."""
+        derives = cls.overrides("derive") and not (cls.derives and {*cls.derives} <= {*known})
+        return derives or cls.overrides("across") or cls.overrides("observe")
 
     @classmethod
     def overrides(cls, hook: str) -> bool:

@@ -99,6 +99,7 @@ class TyreWarmup(Effect):
         Size("excess", "1", 0.0, 0.3, 0.0, 2.0, least=0.01),
         Shape("distance_m", "m", 1e4, 5e3, 500.0, 6e4, grid=(2e3, 5e3, 1e4, 2e4)),
     )
+    derives: ClassVar[Names] = (DISTANCE_SINCE_START,)
     mistaken_for: ClassVar[Names] = ("cabin_warmup",)
     separated_by: ClassVar[str] = "a restart after a short stop"
     excess: Any

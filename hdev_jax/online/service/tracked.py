@@ -175,14 +175,15 @@ class Tracked:
         if self.followed.live is None:
             raise RefusedError(["rows"], "no row of this vehicle has been used yet; send its trip first")
         state, trips = self.followed.live.state, self.followed.stream.trips
-        vectors = []
+        vectors, so_far = [], self.followed.stream.so_far
         for i, row in enumerate(rows):
             for key in ("duration_s", "speed_start_mps", "speed_end_mps"):
                 value = row.get(key)
                 if value is None or value < 0 or (key == "duration_s" and value == 0):
                     raise RefusedError(["rows", i, key], "a number above 0 is expected: rows to come are intervals")
             known = {k: float(x) for k, x in row.items() if isinstance(x, int | float)}
-            vectors.append(Arrived.of(state.form, trips[-1], len(trips), known).vector)
+            so_far, running = so_far.after(known)
+            vectors.append(Arrived.of(state.form, trips[-1], len(trips), known | running).vector)
         reserve = battery.pop("reserve", 0.0)
         if battery.get("capacity_wh") is None:
             battery["capacity_wh"] = self.followed.sheet.capacity_wh
