@@ -2,7 +2,8 @@
 
     python -m experiments.live --out out/live --speed 60
 
-Ten synthetic trucks; one of them regenerates no more than 60 kW, which its sheet does not know.
+Ten synthetic trucks; one of them regenerates no more than 60 kW, and the brakes of another drag, which their sheets do
+not know.
 The page is at the address that is printed; Ctrl-C ends it.
 """
 
@@ -27,9 +28,11 @@ from hdev_jax.fleet import synthetic_log
 
 __all__ = ["main", "running"]
 
-TRUCKS, LIMITED = 10, 3
+TRUCKS = 10
 TRIPS, ROWS = 24, 150
-EFFECT = {"regen_limit": {"power_w": 60e3}}
+EFFECTS: dict[int, dict[str, Any]] = {
+    3: {"regen_limit": {"power_w": 60e3}}, 7: {"brake_drag": {"force_n": 600.0, "tau_s": 60.0}}
+}  # fmt: skip
 TICK_S = 1.0
 
 
@@ -49,7 +52,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows = _vehicles(a.out)
     with running(a.out, port=a.port) as (url, _), contextlib.suppress(KeyboardInterrupt):
         print(f"open {url}/ : {TRUCKS} synthetic trucks at {a.speed:g} times real time. Ctrl-C ends it.")
-        print(f"truck_{LIMITED} regenerates no more than 60 kW, which its sheet does not know.", flush=True)
+        told = "truck_3 regenerates no more than 60 kW, and truck_7's brakes drag: their sheets do not know it."
+        print(told, flush=True)
         named = _drive(url, rows, a.speed, a.seconds)
         print(f"alarms: {', '.join(f'{k}: {v}' for k, v in named.items()) or 'none'}")
     return 0
@@ -59,8 +63,7 @@ def _vehicles(out: Path) -> pd.DataFrame:
     """Rows of all vehicles in the order of their clock, each with a trip after the other."""
     parts = []
     for k in range(1, TRUCKS + 1):
-        effects: dict[str, Any] = EFFECT if k == LIMITED else {}
-        made = synthetic_log(seed=40 + k, trips=TRIPS, rows_per_trip=ROWS, effects=effects, noise="ar1",
+        made = synthetic_log(seed=40 + k, trips=TRIPS, rows_per_trip=ROWS, effects=EFFECTS.get(k, {}), noise="ar1",
                              ar_coefficient=0.8)  # fmt: skip
         files = made.write(out / "logs" / f"truck_{k}", truth=False)
         shutil.copy(files["sheet"], out / "sheets" / f"truck_{k}.toml")
