@@ -12,14 +12,16 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.candidates.candidate import Candidate, plan_of
 from hdev_jax.diagnosis.competition.cycle import barred
+from hdev_jax.diagnosis.competition.grid import LEADERS
 from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, Tested, besides, level_test
 from hdev_jax.diagnosis.competition.refit import fitted, joined, without
 from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
 from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import predict
@@ -120,7 +122,37 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         stability = _stability(rows, model, decoded, k, rng, settings)
         found = Found(c.id, replace(score, gain=gain, left_out_gain=gain), q, stability, (), gain)
         new = replace(new, fit=fit, found=(*new.found, found))
-    return new, None
+    return (_without_last(training, new) if len(kept) > 1 else None) or new, None
+
+
+def _without_last(training: Training, state: State) -> State | None:
+    """The state without its last load, where an effect that loads look like explains more beside the others.
+
+    A model of two loads also follows one load and what begins or fades within a trip. None where two loads explain
+    more: by the likelihood of all courses of the states, and by what is left beside the most likely one.
+    """
+    assert state.hidden is not None
+    last = state.hidden.ids[-1]
+    less = decoded_again(training, without(with_states(training, state), state, last))
+    there = with_states(training, less)
+    like = [c for k, c in training.library.items() if k in SwitchingLoad.mistaken_for and not less.fit.vehicle.has(k)]
+    scores = score_all(there, less.fit, plan_of(less.fit.vehicle, like, training.facts, training.target))
+    leaders = sorted(scores.best.values(), key=scores.worth, reverse=True)[:LEADERS]
+    fit = next((fit for s in leaders if (fit := joined(there, less, s)) is not None), None)
+    if fit is None:
+        return None
+    one = _likelihoods(training, decoded_again(training, replace(less, fit=fit)))
+    return None if np.all(_likelihoods(training, state) > one) else less
+
+
+def _likelihoods(training: Training, state: State) -> Float[np.ndarray, "2"]:
+    """Of the rows beside all but the loads, over all courses of their states; and of what is left, beside the most
+    likely course."""
+    assert state.hidden is not None
+    at = with_states(training, state)
+    left = _rows(at, at.residual(state.fit))
+    rows = replace(left, residual_w=left.residual_w + _loads_w(at, state))
+    return np.array([decode(state.hidden.model, rows).log_likelihood, at.noise(state.fit).log_likelihood])
 
 
 def _sought(
