@@ -31,6 +31,11 @@ class Clusters:
     count: int
     kind: str
 
+    @property
+    def pieces(self) -> str:
+        """What they are, in words."""
+        return "trips" if self.kind == "trip" else "stretches of driving"
+
     def sums(self, rows: Float[np.ndarray, "row *k"]) -> Float[np.ndarray, "cluster *k"]:
         """Sums over each cluster."""
         starts = np.flatnonzero(np.r_[True, np.diff(self.ids) != 0])

@@ -19,6 +19,7 @@ MOST_ROWS = 30_000  # that the test looks at: time
 LEAST_ROWS = 100
 LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
+LEAST_SPREAD = 2.0  # sd of a load's gain on noise: of half a χ² of its 8 free numbers
 EARLY = 3  # surrogates, after which one that gains as much ends the test: p is 0.25 at least, and the rest saves time
 
 
@@ -43,7 +44,7 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
         if len(others) == EARLY and gain <= max(others):
             return Tested(model, gain, 1.0)
-    spread = max(float(np.std(others, ddof=1)), training.settings.load_spread) * np.sqrt(1.0 + 1.0 / len(others))
+    spread = max(float(np.std(others, ddof=1)), LEAST_SPREAD) * np.sqrt(1.0 + 1.0 / len(others))
     p = float(stats.t.sf((gain - np.mean(others)) / spread, len(others) - 1))
     return Tested(model, gain, p)
 

@@ -25,6 +25,7 @@ from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import predict
+from hdev_jax.inference.clusters import Clusters
 from hdev_jax.inference.states import (
     Decoded,
     StateRows,
@@ -97,7 +98,7 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         return no(Kind.NOT_SIGNIFICANT, f"no more levels than noise of this colour has (FDR-adjusted p = {q:.2g})", q)
     decoded = decode(model, rows)
     places = range(len(held), len(model.power_w))
-    why = {k: x for k in places if (x := _unlike(rows, model, decoded, k, settings))}
+    why = {k: x for k in places if (x := _unlike(rows, model, decoded, k, training.clusters, settings))}
     kept = [*range(len(held)), *(k for k in places if k not in why)]
     if len(kept) == len(held):
         k = next(iter(why))
@@ -263,23 +264,34 @@ def _power(rows: StateRows, on: np.ndarray, least_s: float) -> tuple[float, floa
     return float(np.median(rows.residual_w[on > 0.9]) - np.median(rows.residual_w[on < 0.1])), min(seconds)
 
 
-def _unlike(rows: StateRows, model: Switching, decoded: Decoded, k: int, settings: Settings) -> str | None:
+def _sure(seconds: np.ndarray, on: np.ndarray) -> float:
+    """Probability of the decoded state over the time on, and over the time off: the mean of the two."""
+    each = [float(np.sum(seconds * p**2) / max(np.sum(seconds * p), 1e-9)) for p in (on, 1.0 - on)]
+    return 0.5 * sum(each)
+
+
+def _unlike(
+    rows: StateRows, model: Switching, decoded: Decoded, k: int, clusters: Clusters, settings: Settings
+) -> str | None:
     """Why a decoded load is not one consumer that is switched on and off, or None."""
     power, on, alone = float(model.power_w[k]), decoded.on[:, k], _alone(rows, model, decoded, k)
     size = next(p for p in SwitchingLoad.parameters if p.name == "power_w")
     if not size.least <= power <= size.upper:
         return "its power is out of range"
+    if (sure := _sure(rows.duration_s, on)) < settings.load_sure:
+        return f"its states are decoded with a probability of {sure:.2f} only"
     # once in a trip is what begins or fades in it: a change that stays, a cabin that is warm by then
     switches = [float(np.sum(np.abs(np.diff(on[s])))) for _, s in trip_slices(rows.trip)]
     if np.sum(np.maximum(np.array(switches) - 1.0, 0.0)) < settings.least_count:
         return "it switches too seldom to be distinguished from what changes once in a trip"
-    each = [p for _, s in trip_slices(rows.trip) if (p := _power(alone.take(s), on[s], settings.load_s)) is not None]
-    if len(each) < min(2, len(np.unique(rows.trip))):
-        return "it switches in one trip alone"
-    by_trip, weight = np.array(each).T
-    mean = float(np.average(by_trip, weights=weight))
-    if np.sqrt(np.average((by_trip - mean) ** 2, weights=weight)) > settings.load_alike * power:
-        return "its power is not the same in every trip"
+    parts = [clusters.ids == c for c in np.unique(clusters.ids)]
+    each = [p for x in parts if (p := _power(alone.take(x), on[x], settings.load_s)) is not None]
+    if len(each) < min(2, len(parts)):
+        return f"it is both on and off for long enough in {len(each)} of {len(parts)} {clusters.pieces} only"
+    by_part, weight = np.array(each).T
+    mean = float(np.average(by_part, weights=weight))
+    if np.sqrt(np.average((by_part - mean) ** 2, weights=weight)) > settings.load_alike * power:
+        return f"its power is not the same in all {clusters.pieces}"
     if np.sum(rows.duration_s[rows.standing == 1]) > 4.0 * settings.load_s:
         standing, moving = (
             _power(alone.take(x), on[x], settings.load_s) for x in (rows.standing == 1, rows.standing == 0)

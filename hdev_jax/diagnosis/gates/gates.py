@@ -37,7 +37,7 @@ class Asked:
     @property
     def unit(self) -> str:
         """What a cluster is, in words."""
-        return "trips" if self.scores.baseline.clusters.kind == "trip" else "stretches of driving"
+        return self.scores.baseline.clusters.pieces
 
 
 Gate = Callable[[Asked], Rejection | None]
