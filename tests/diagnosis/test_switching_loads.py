@@ -15,6 +15,7 @@ from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.switching import Load, with_loads
+from hdev_jax.inference.clusters import clusters_of
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.inference.states import StateRows, Switching, decode, rows_of
 from hdev_jax.logs import Log, read_log
@@ -172,9 +173,26 @@ def test_what_is_on_once_at_the_start_of_each_trip_is_no_load_that_switches():
             6e3 * on + rng.normal(0, 1e3, trips * n), np.repeat(np.arange(trips), n), np.ones(trips * n),
             np.full(trips * n, 15.0), np.zeros(trips * n, int), 0.1,
         )  # fmt: skip
-        said.append(_unlike(rows, model, decode(model, rows), 0, SETTINGS))
+        said.append(_unlike(rows, model, decode(model, rows), 0, clusters_of(rows.trip, rows.duration_s), SETTINGS))
     assert "once in a trip" in str(said[0])
     assert said[1] is None
+
+
+def test_a_load_whose_states_drown_in_noise_is_not_named():
+    rng, trips, n = np.random.default_rng(0), 10, 1200
+    on = np.tile(np.arange(n) % 300 < 120, trips)
+    said = []
+    for noise in (0.5, 2.0, 12.0):  # times the power
+        rows = StateRows(
+            1e3 * on + rng.normal(0, noise * 1e3, trips * n), np.repeat(np.arange(trips), n), np.ones(trips * n),
+            np.full(trips * n, 15.0), np.zeros(trips * n, int), 0.1,
+        )  # fmt: skip
+        model = Switching(np.array([1e3]), 0.0, np.full(2, 800.0 * noise), np.full((1, 4), 0.4), np.full(1, 120.0))
+        clusters = clusters_of(rows.trip, rows.duration_s)
+        said.append(_unlike(rows, model, decode(model, rows), 0, clusters, SETTINGS))
+    assert said[0] is None
+    assert said[1] is None, "white noise averages out while it is on"
+    assert "decoded with a probability of 0." in str(said[2])
 
 
 def test_a_saw_tooth_is_no_load_that_switches():
@@ -187,7 +205,7 @@ def test_a_saw_tooth_is_no_load_that_switches():
             np.full(trips * n, 15.0), np.zeros(trips * n, int), 0.1,
         )  # fmt: skip
         model = Switching(np.array([5e3]), 2.5e3, np.full(2, 1e3), np.full((1, 4), 0.5), np.full(1, 75.0))
-        said.append(_unlike(rows, model, decode(model, rows), 0, SETTINGS))
+        said.append(_unlike(rows, model, decode(model, rows), 0, clusters_of(rows.trip, rows.duration_s), SETTINGS))
     assert "rises by 9" in str(said[0])  # 5 kW of 5 kW, less what the states at its ends make of the noise
     assert said[1] is None
 
