@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import shtab
+
 from hdev_jax.options.common import effects_option, file_argument, target_option
 
 __all__ = ["LIVE_VERBS", "live_parsers"]
@@ -37,12 +39,17 @@ def live_parsers(verbs: Any) -> None:
         help="follow many vehicles behind HTTP: rows in, estimates, alarms and forecasts out, a live page",
         description="Take rows of many vehicles over HTTP, keep each before it is acknowledged, follow every vehicle, "
         "and show estimates, alarms and forecasts as JSON and on a page that lives. Needs the extra serve.",
-        epilog="example:\n  hdev serve --sheets sheets --state fleet.sqlite --tokens tokens.toml",
+        epilog="examples:\n  hdev serve --sheets sheets --state fleet.sqlite --tokens tokens.toml\n"
+        "  hdev serve --sheets sheets --state postgresql://hdev@db.example/fleet --tokens tokens.toml\n\n"
+        "The password of PostgreSQL is read from PGPASSWORD or ~/.pgpass, as by its own programs.",
     )
     serve.add_argument(
         "--sheets", type=Path, required=True, metavar="DIR", help="VEHICLE.toml or FLEET/VEHICLE.toml; default.toml"
     )
-    file_argument(serve, "--state", "DB", "the database that keeps rows and states (SQLite)", required=True)
+    state = serve.add_argument(
+        "--state", required=True, metavar="DB", help="what keeps rows and states: a file (SQLite), or postgresql://…"
+    )
+    state.complete = shtab.FILE  # type: ignore[attr-defined]
     file_argument(serve, "--tokens", "TOKENS.toml", 'fleet = "SHA-256 of its token"; without: one fleet, here')
     serve.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, metavar="P", help="port to listen at (default: 8000)")
