@@ -21,12 +21,17 @@ def live_parsers(verbs: Any) -> None:
         "is predicted from those before it, and tells more of the sheet's coefficients.",
         epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
         "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
-        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
+        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl\n"
+        "  hdev follow --mqtt mqtt://broker.example/trucks/17 --vehicle truck.toml --state truck.state\n\n"
+        "The password of a broker is read from HDEV_MQTT_PASSWORD, its user from the address: mqtt://USER@HOST/TOPIC.",
     )
     file_argument(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
     file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
     file_argument(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
     file_argument(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
+    follow.add_argument(
+        "--mqtt", metavar="URL", help="mqtt://HOST:PORT/TOPIC instead of ROWS: messages of JSON (extra mqtt)"
+    )
     target_option(follow)
     effects_option(follow)
     follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
