@@ -2,6 +2,7 @@
 
     python benchmarks/service.py --vehicles 100 --seconds 20
     python benchmarks/service.py --kills 20
+    python benchmarks/service.py --kills 20 --state postgresql://hdev@127.0.0.1/empty
 
 Needs the extras `serve` and `test`. Rows are the demo's, sent by a few clients, each row once.
 """
@@ -40,6 +41,7 @@ def main() -> int:
     arguments.add_argument("--batch", type=int, default=100, help="rows of a request, of one vehicle each")
     arguments.add_argument("--clients", type=int, default=4)
     arguments.add_argument("--kills", type=int, default=0, help="instead: kill -9 it so many times while rows come")
+    arguments.add_argument("--state", help="an empty database of PostgreSQL (default: a file of SQLite)")
     a = arguments.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder, log = Path(name), demo_log(3, trips=12)
@@ -48,7 +50,7 @@ def main() -> int:
         shutil.copy(files["sheet"], folder / "sheets" / "default.toml")
         rows = json.loads(str(log.frame[COLUMNS].to_json(orient="records")))
         if a.kills:
-            return _killed(folder, rows, a.kills)
+            return _killed(folder, rows, a.kills, a.state or str(folder / "state.sqlite"))
         _loaded(folder, rows, a)
     return 0
 
@@ -58,15 +60,16 @@ def _loaded(folder: Path, rows: list[dict[str, Any]], a: argparse.Namespace) -> 
     for watch in ((), ("--no-watch",)):
         for f in folder.glob("state.sqlite*"):
             f.unlink()
-        with running(folder, *watch) as (url, _):
+        name = "unwatched" if watch else "V"  # a server keeps the rows of the round before
+        with running(folder, *watch, *(("--state", a.state) if a.state else ())) as (url, _):
             with httpx.Client(timeout=300) as http:  # what compiles, compiles first
                 for part in (rows[:300], rows[300:600]):
-                    body = {"rows": [{"vehicle_id": "warm", **r} for r in part]}
+                    body = {"rows": [{"vehicle_id": f"{name} warm", **r} for r in part]}
                     http.post(f"{url}/v1/rows", json=body).raise_for_status()
-                    http.get(f"{url}/v1/vehicles/warm").raise_for_status()
+                    http.get(f"{url}/v1/vehicles/{name} warm").raise_for_status()
             parts = [(v, at) for at in range(0, len(rows) - a.batch, a.batch) for v in range(a.vehicles)]
             parts = parts[: int(a.rate * a.seconds / a.batch)]
-            every = [json.dumps({"rows": [{"vehicle_id": f"V{v}", **r} for r in rows[at : at + a.batch]]}).encode()
+            every = [json.dumps({"rows": [{"vehicle_id": f"{name}{v}", **r} for r in rows[at : at + a.batch]]}).encode()
                      for v, at in parts]  # fmt: skip
             begun, times = time.monotonic() + 0.1, []
 
@@ -97,7 +100,7 @@ def _loaded(folder: Path, rows: list[dict[str, Any]], a: argparse.Namespace) -> 
             )
 
 
-def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
+def _killed(folder: Path, rows: list[dict[str, Any]], kills: int, state: str) -> int:
     """Kill it while a batch is on its way, start it, send the batch again; then compare with one that ran through."""
     from hdev_jax.online.service import Fleet, Journal, sheets_in
     from hdev_jax.online.service.given import checked
@@ -105,7 +108,7 @@ def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
     size, rng = max(len(rows) // (kills + 1), 1), np.random.default_rng(0)
     for k in range(kills + 1):
         part = {"rows": [{"vehicle_id": "T", **r} for r in rows[k * size : (k + 1) * size]]}
-        with running(folder, "--no-watch") as (url, process):
+        with running(folder, "--no-watch", "--state", state) as (url, process):
             if k < kills:
                 killer = threading.Timer(float(rng.uniform(0.0, 1.0)), lambda p=process: p.send_signal(signal.SIGKILL))
                 killer.start()
@@ -114,14 +117,14 @@ def _killed(folder: Path, rows: list[dict[str, Any]], kills: int) -> int:
                         body = {"rows": part["rows"][i : i + 10]}
                         httpx.post(f"{url}/v1/rows", json=body, timeout=60)
                 process.wait()
-        with running(folder, "--no-watch") as (url, _):
+        with running(folder, "--no-watch", "--state", state) as (url, _):
             httpx.post(f"{url}/v1/rows", json=part, timeout=120).raise_for_status()
     import jax
 
     jax.config.update("jax_enable_x64", True)
     through = Fleet(Journal(":memory:"), sheets_in(folder / "sheets"), watch=False)
     through.put("fleet", checked([{"vehicle_id": "T", **r} for r in rows[: (kills + 1) * size]]))
-    again = Fleet(Journal(folder / "state.sqlite"), sheets_in(folder / "sheets"), watch=False)
+    again = Fleet(Journal(state), sheets_in(folder / "sheets"), watch=False)
     own, other = (f.known("fleet", "T") for f in (again, through))
     same = own == other
     print(f"{kills} kills: {'the same' if same else 'ANOTHER'} state and counts as without: {own and own['rows']}")

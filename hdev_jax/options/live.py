@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import shtab
+
 from hdev_jax.options.common import effects_option, file_argument, target_option
 
 __all__ = ["LIVE_VERBS", "live_parsers"]
@@ -19,12 +21,17 @@ def live_parsers(verbs: Any) -> None:
         "is predicted from those before it, and tells more of the sheet's coefficients.",
         epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
         "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
-        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
+        "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl\n"
+        "  hdev follow --mqtt mqtt://broker.example/trucks/17 --vehicle truck.toml --state truck.state\n\n"
+        "The password of a broker is read from HDEV_MQTT_PASSWORD, its user from the address: mqtt://USER@HOST/TOPIC.",
     )
     file_argument(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
     file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
     file_argument(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
     file_argument(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
+    follow.add_argument(
+        "--mqtt", metavar="URL", help="mqtt://HOST:PORT/TOPIC instead of ROWS: messages of JSON (extra mqtt)"
+    )
     target_option(follow)
     effects_option(follow)
     follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
@@ -37,12 +44,17 @@ def live_parsers(verbs: Any) -> None:
         help="follow many vehicles behind HTTP: rows in, estimates, alarms and forecasts out, a live page",
         description="Take rows of many vehicles over HTTP, keep each before it is acknowledged, follow every vehicle, "
         "and show estimates, alarms and forecasts as JSON and on a page that lives. Needs the extra serve.",
-        epilog="example:\n  hdev serve --sheets sheets --state fleet.sqlite --tokens tokens.toml",
+        epilog="examples:\n  hdev serve --sheets sheets --state fleet.sqlite --tokens tokens.toml\n"
+        "  hdev serve --sheets sheets --state postgresql://hdev@db.example/fleet --tokens tokens.toml\n\n"
+        "The password of PostgreSQL is read from PGPASSWORD or ~/.pgpass, as by its own programs.",
     )
     serve.add_argument(
         "--sheets", type=Path, required=True, metavar="DIR", help="VEHICLE.toml or FLEET/VEHICLE.toml; default.toml"
     )
-    file_argument(serve, "--state", "DB", "the database that keeps rows and states (SQLite)", required=True)
+    state = serve.add_argument(
+        "--state", required=True, metavar="DB", help="what keeps rows and states: a file (SQLite), or postgresql://…"
+    )
+    state.complete = shtab.FILE  # type: ignore[attr-defined]
     file_argument(serve, "--tokens", "TOKENS.toml", 'fleet = "SHA-256 of its token"; without: one fleet, here')
     serve.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, metavar="P", help="port to listen at (default: 8000)")

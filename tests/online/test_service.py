@@ -1,5 +1,6 @@
 """The service: rows of many vehicles in, estimates out; nothing that was acknowledged is lost or counted twice."""
 
+import contextlib
 import json
 import os
 import re
@@ -12,11 +13,13 @@ import time
 
 import numpy as np
 import pytest
+from servers import free_port
 
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import demo_log
-from hdev_jax.online.service import Fleet, Journal, RefusedError, sheets_in
+from hdev_jax.online.service import Fleet, Journal, RefusedError, UnavailableError, sheets_in
 from hdev_jax.online.service.given import checked
+from hdev_jax.online.service.journal import postgresql
 
 pytest.importorskip("fastapi", reason="fastapi is in the extra serve")
 from fastapi.testclient import TestClient
@@ -59,6 +62,34 @@ def client(fleet):
     return TestClient(app_of(fleet, TOKENS, Limits(body=200_000, rows=300)))
 
 
+@pytest.fixture(params=["sqlite", "postgresql"])
+def journals(request, tmp_path):
+    """What `--state` says: a database that is new, by its name."""
+    urls: dict[str, str] = {}
+
+    def place(name):
+        if request.param == "sqlite":
+            return str(tmp_path / f"{name}.sqlite")
+        if name not in urls:
+            urls[name] = request.getfixturevalue("postgres").database()
+        return urls[name]
+
+    return place
+
+
+@pytest.fixture
+def opened(sheets):
+    """Fleets at a database, closed at the end."""
+    with contextlib.ExitStack() as stack:
+
+        def fleet(place):
+            made = Fleet(Journal(place), sheets_in(sheets), watch=False)
+            stack.callback(made.close)
+            return made
+
+        yield fleet
+
+
 def numbers(fleet, vehicle="T1"):
     return fleet._current(("a", vehicle)).followed.live.numbers
 
@@ -76,9 +107,9 @@ def test_the_service_knows_what_rows_one_by_one_tell(fleet, rows, sheets):
     np.testing.assert_allclose(numbers(fleet), alone.live.numbers, rtol=1e-9, atol=1e-9)
 
 
-def test_rows_twice_late_and_out_of_order(tmp_path, fleet, rows, sheets):
+def test_rows_twice_late_and_out_of_order(fleet, rows, journals, opened):
     fleet.put("a", checked(named(rows, "T1")))
-    other = Fleet(Journal(tmp_path / "other.sqlite"), sheets_in(sheets), watch=False)
+    other = opened(journals("other"))
     shuffled = [*rows]
     for k in range(0, len(rows) - 1, 7):  # neighbours, a few seconds apart; trips stay in order
         if rows[k]["trip_id"] == rows[k + 1]["trip_id"]:
@@ -95,19 +126,66 @@ def test_rows_twice_late_and_out_of_order(tmp_path, fleet, rows, sheets):
     np.testing.assert_array_equal(numbers(other), numbers(fleet))
 
 
-def test_a_start_from_the_journal_is_as_if_it_had_never_stopped(tmp_path, fleet, rows, sheets):
+def test_a_start_from_the_journal_is_as_if_it_had_never_stopped(fleet, rows, journals, opened):
     for part in (rows[:60], rows[60:100], rows[100:]):
         fleet.put("a", checked(named(part, "T1")))
-    path = tmp_path / "again.sqlite"
-    first = Fleet(Journal(path), sheets_in(sheets), watch=False)
+    first = opened(journals("again"))
     first.put("a", checked(named(rows[:60], "T1")))
     first.close()  # its state is written
-    second = Fleet(Journal(path), sheets_in(sheets), watch=False)
+    second = opened(journals("again"))
     second.put("a", checked(named(rows[60:100], "T1")))  # in the journal alone
-    third = Fleet(Journal(path), sheets_in(sheets), watch=False)
+    third = opened(journals("again"))
     third.put("a", checked(named(rows[100:], "T1")))
+    with pytest.raises(UnavailableError, match="another hdev serve uses this database"):
+        second.put("a", checked(named(rows[:1], "T2")))  # it has not noticed, and must not lead the rows astray
     np.testing.assert_array_equal(numbers(third), numbers(fleet))
     assert third.known("a", "T1")["rows"] == fleet.known("a", "T1")["rows"]
+
+
+def test_rows_whose_answer_was_lost_count_once(fleet, rows, journals, opened, monkeypatch):
+    """They were kept, and nobody was told: sent again they are repeated, and used all the same."""
+    fleet.put("a", checked(named(rows, "T1")))
+    other = opened(journals("lost"))
+    client = TestClient(app_of(other, TOKENS))
+    post = lambda part: client.post("/v1/rows", json={"rows": named(part, "T1")}, headers=A)  # noqa: E731
+    put, used = other.journal.put, other.put("a", checked(named(rows[:60], "T1")))
+    assert other.known("a", "T1")["rows"]["used"] > 0, "it is in memory"
+
+    def cut_off(*arguments):
+        put(*arguments)
+        raise UnavailableError("connection lost with s3cret")
+
+    monkeypatch.setattr(other.journal, "put", cut_off)
+    answer = post(rows[60:100])
+    assert (answer.status_code, answer.headers["Retry-After"]) == (503, "5")
+    assert "s3cret" not in answer.text
+    monkeypatch.setattr(other.journal, "put", put)
+    assert post(rows[60:100]).json() == {"accepted": 0, "repeated": 40}
+    assert post(rows[100:]).json()["accepted"] + used["accepted"] == len(rows) - 40
+    np.testing.assert_array_equal(numbers(other), numbers(fleet))
+    assert other.known("a", "T1")["rows"] == fleet.known("a", "T1")["rows"]
+
+
+def test_a_database_that_goes_away_while_rows_come(fleet, rows, postgres, opened, monkeypatch):
+    monkeypatch.setattr(postgresql, "RETRY_S", 0.0)
+    fleet.put("a", checked(named(rows, "T1")))
+    other = opened(postgres.database())
+    client = TestClient(app_of(other, TOKENS))
+    post = lambda part, name="T1": client.post("/v1/rows", json={"rows": named(part, name)}, headers=A)  # noqa: E731
+    assert post(rows[:60]).status_code == 200
+    assert client.get("/v1/vehicles/T1", headers=A).status_code == 200
+    postgres.stop()
+    try:
+        for _ in range(3):
+            assert post(rows[60:100]).status_code == 503
+        assert post(rows[:9], "T2").status_code == 503
+        assert client.get("/v1/vehicles/T1", headers=A).status_code == 503, "it may have rows that nobody was told of"
+        assert client.get("/healthz").status_code == 200
+    finally:
+        postgres.start()
+    assert post(rows[50:]).json() == {"accepted": len(rows) - 60, "repeated": 10}
+    assert [v["vehicle_id"] for v in client.get("/v1/vehicles", headers=A).json()] == ["T1"]
+    np.testing.assert_array_equal(numbers(other), numbers(fleet))
 
 
 def test_one_fleet_never_sees_another(client, rows):
@@ -257,15 +335,22 @@ def test_a_database_of_something_else_is_refused(tmp_path):
         serve(tmp_path, tmp_path / "s", host="0.0.0.0")
 
 
-@pytest.mark.slow
-def test_killed_while_rows_come_it_loses_and_repeats_none(tmp_path, fleet, rows, sheets):
-    import httpx2 as httpx
-
+def test_where_another_program_listens_the_database_stays_as_it_is(tmp_path, sheets, fleet, rows):
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
-    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(sheets), "--state",
-               str(tmp_path / "killed.sqlite"), "--port", str(port), "--no-watch"]  # fmt: skip
+        s.listen()
+        with pytest.raises(InputError, match=r"--host 127.0.0.1 --port \d+: cannot listen there"):
+            serve(sheets, tmp_path / "state.sqlite", port=s.getsockname()[1])
+    assert fleet.put("a", checked(named(rows[:3], "T1")))["accepted"] == 3
+
+
+@pytest.mark.slow
+def test_killed_while_rows_come_it_loses_and_repeats_none(fleet, rows, sheets, journals, opened):
+    import httpx2 as httpx
+
+    port = free_port()
+    command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(sheets), "--state", journals("killed"),
+               "--port", str(port), "--no-watch"]  # fmt: skip
 
     def started():
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
@@ -281,7 +366,7 @@ def test_killed_while_rows_come_it_loses_and_repeats_none(tmp_path, fleet, rows,
     process, at, kills = started(), 0, 0
     while at < len(rows):
         batch = named(rows[at : at + 45], "T1")
-        if kills < 2 and at >= 45 * (1 + kills):
+        if kills < 1 and at >= 45:
             os.kill(process.pid, signal.SIGKILL)  # whatever it was at
             process.wait()
             kills, process = kills + 1, started()
@@ -291,7 +376,7 @@ def test_killed_while_rows_come_it_loses_and_repeats_none(tmp_path, fleet, rows,
     process.terminate()
     process.wait()
     fleet.put("fleet", checked(named(rows, "T1")))
-    again = Fleet(Journal(tmp_path / "killed.sqlite"), sheets_in(sheets), watch=False)
+    again = opened(journals("killed"))
     assert again.known("fleet", "T1")["rows"] == fleet.known("fleet", "T1")["rows"]
     live = [f._current(("fleet", "T1")).followed.live.numbers for f in (again, fleet)]
     np.testing.assert_array_equal(*live)

@@ -2,6 +2,6 @@
 
 from hdev_jax.online.service.fleet import Fleet
 from hdev_jax.online.service.given import RefusedError, sheets_in
-from hdev_jax.online.service.journal import Journal
+from hdev_jax.online.service.journal import Journal, UnavailableError
 
-__all__ = ["Fleet", "Journal", "RefusedError", "sheets_in"]
+__all__ = ["Fleet", "Journal", "RefusedError", "UnavailableError", "sheets_in"]

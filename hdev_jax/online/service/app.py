@@ -20,6 +20,7 @@ from hdev_jax import __version__
 from hdev_jax.errors import InputError
 from hdev_jax.online.service.fleet import Fleet
 from hdev_jax.online.service.given import RefusedError, checked
+from hdev_jax.online.service.journal import UnavailableError
 
 __all__ = ["HERE", "Limits", "app_of", "digest_of"]
 
@@ -121,6 +122,10 @@ def app_of(fleet: Fleet, tokens: Mapping[str, str] | None = None, limits: Limits
     async def faulty(_: Request, e: InputError) -> JSONResponse:
         return JSONResponse({"detail": [{"loc": ["rows"], "msg": str(e)}]}, 422)
 
+    @app.exception_handler(UnavailableError)
+    async def away(_: Request, e: UnavailableError) -> JSONResponse:  # what it says is for who runs the service
+        return JSONResponse({"detail": "the database cannot be reached; send again"}, 503, {"Retry-After": "5"})
+
     app.state.fleet_of = of_token
 
     @app.post("/v1/rows")
@@ -180,8 +185,12 @@ def app_of(fleet: Fleet, tokens: Mapping[str, str] | None = None, limits: Limits
             seen, said = -1, dict[str, str]()
             while not await request.is_disconnected():
                 if fleet.version != seen:
-                    seen = fleet.version
-                    for k in await run_in_threadpool(vehicles, own):
+                    seen, every = fleet.version, []
+                    try:
+                        every = await run_in_threadpool(vehicles, own)
+                    except UnavailableError:
+                        seen = -1
+                    for k in every:
                         line = json.dumps(k | {"recent": await run_in_threadpool(fleet.recent, own, k["vehicle_id"])})
                         if said.get(k["vehicle_id"]) != line:
                             said[k["vehicle_id"]] = line

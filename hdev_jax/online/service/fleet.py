@@ -1,5 +1,6 @@
 """The vehicles of all fleets in one process: rows are kept, acknowledged, and then used one vehicle after the other."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,7 @@ from hdev_jax import __version__
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.online.followed import Followed
-from hdev_jax.online.service.journal import Journal, Kept, Sent
+from hdev_jax.online.service.journal import Journal, Kept, Sent, UnavailableError
 from hdev_jax.online.service.tracked import Tracked
 
 __all__ = ["Fleet"]
@@ -40,6 +41,7 @@ class Fleet:
         self._lock = threading.RLock()  # of what is known of vehicles
         self._entry = threading.Lock()  # of what comes in; where both are held, this one is the inner
         self._pending: dict[Key, list[Sent]] = {}
+        self._doubtful: set[Key] = set()  # of whose rows the journal may have more than was answered
         self._sheeted: set[Key] = set()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="vehicles")
         self.behind: int = 0  # rows that are acknowledged and not used yet
@@ -49,34 +51,42 @@ class Fleet:
 
     def put(self, fleet: str, rows: Sequence[tuple[str, str, float, dict[str, Any]]]) -> dict[str, int]:
         """Keep rows, to be used in turn. **Returns:** how many were `accepted`, and `repeated` before. Raises
-        `InputError` for a vehicle without a sheet: then none is kept."""
+        `InputError` for a vehicle without a sheet: then none is kept; `UnavailableError` where none can be."""
         for key in {(fleet, r[0]) for r in rows} - self._sheeted:
             self._sheet_for(*key)
             self._sheeted.add(key)
         with self._entry:
-            new = self.journal.put(fleet, rows)
+            try:
+                new = self.journal.put(fleet, rows)
+            except UnavailableError:
+                self._doubtful.update((fleet, r[0]) for r in rows)
+                raise
             for vehicle, sent in new:
                 key = fleet, vehicle
                 if key not in self._pending:
                     self._pending[key] = []
                     self._worker.submit(self._used, key)
                 self._pending[key].append(sent)
-            self._names.setdefault(fleet, set()).update(vehicle for vehicle, _ in new)
+            self._names.setdefault(fleet, set()).update(r[0] for r in rows)
             self.behind += len(new)
         return {"accepted": len(new), "repeated": len(rows) - len(new)}
 
     def _used(self, key: Key) -> None:
         try:
             self._current(key)
-        except InputError:  # its sheet was taken away: whoever asks is told, and its rows stay in the journal
-            return
+        except (InputError, UnavailableError):  # its sheet was taken away, or the database: whoever asks is told
+            return  # its rows stay in the journal
 
     def _current(self, key: Key) -> Tracked:
-        """The vehicle with all its rows so far used. Raises `InputError` where it has no sheet."""
+        """The vehicle with all its rows so far used. Raises `InputError` where it has no sheet, `UnavailableError`
+        where the journal is to be read and cannot be."""
         with self._lock:
             with self._entry:
                 sents = self._pending.pop(key, [])
                 self.behind -= len(sents)
+                if key in self._doubtful:
+                    self._doubtful.remove(key)
+                    self._vehicles.pop(key, None)  # again from the journal, with rows that nobody was told of
             vehicle = self._vehicles.get(key)
             if vehicle is None:
                 vehicle = self._vehicles[key] = self._again(key)
@@ -116,9 +126,11 @@ class Fleet:
                 numbers = None if v.followed.live is None else np.array(v.followed.live.numbers)
                 about = {"of": self._of(v.followed.sheet), **v.about()}
                 states.append((*key, Kept(v.upto, about, numbers)))
-                v.since, v.kept_at = 0, now
-        if states:
-            self.journal.keep(states)
+        with contextlib.suppress(UnavailableError):  # the rows are in the journal: a state only spares a start time
+            if states:
+                self.journal.keep(states)
+            for fleet, name, _ in states:
+                self._vehicles[fleet, name].since, self._vehicles[fleet, name].kept_at = 0, now
 
     def close(self) -> None:
         """Use the rows that are there and write every state; the journal is closed."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.logs.adapter import Adapter
@@ -17,7 +18,8 @@ from hdev_jax.online import Now
 from hdev_jax.online.followed import Followed, plain, plain_alarm
 from hdev_jax.online.live import keep, kept
 from hdev_jax.online.stream import Arrived
-from hdev_jax.verbs.live.lines import Records, batches, opened
+from hdev_jax.verbs.live.lines import Batch, Records, batches, opened
+from hdev_jax.verbs.live.mqtt import Topic, subscribed
 from hdev_jax.verbs.opening import Effects, Vehicles, known_effects, sheet_of
 from hdev_jax.verbs.predict import sheet_digest
 
@@ -36,6 +38,7 @@ def follow(
     effects: Effects = None,
     json: bool = False,
     watch: bool = True,
+    mqtt: str | None = None,
 ) -> str | None:
     """Follow one vehicle row by row: energy of each row before it is measured, coefficients after it, alarms.
 
@@ -46,23 +49,34 @@ def follow(
     **Arguments:** `vehicle`: a sheet's path or a `Sheet`; `rows`: a file, mappings, or a stream of bytes (standard
     input by default); `state`: a file that keeps what is known, every few seconds and at the end: the same command goes
     on from it as if it had never stopped, and rows that it has had are left out. `json`: a line of JSON for each row.
-    `watch`: name effects of the library that the sheet lacks.
+    `watch`: name effects of the library that the sheet lacks. `mqtt`: `mqtt://HOST:PORT/TOPIC` instead of `rows`, each
+    message a row as JSON, or a list of rows; it goes on until it is stopped.
 
     **Returns:** the estimates and what became of the rows, as text; None where each row was written as JSON.
     **Raises:** `InputError`.
     """
     sheet, rules = sheet_of(vehicle, known_effects(effects)), adapter_of(adapter)
-    with opened(rows) as source, _terminal(live=not json) as tell, _stopped_by_signal():
+    if mqtt is not None and rows is not None:
+        raise InputError("--mqtt: rows come from a topic or from a file; leave one of them out")
+    with contextlib.ExitStack() as stack:
+        stop, tell = stack.enter_context(_stopped_by_signal()), stack.enter_context(_terminal(live=not json))
         following = _Following(sheet, rules, target, state, tell, json, watch)
+        if mqtt is None:
+            named = str(rows) if isinstance(rows, str | Path) else INPUT
+            source = batches(stack.enter_context(opened(rows)), again=state is not None, waiting=stop.waiting)
+        else:
+            following.topic = topic = stack.enter_context(subscribed(mqtt, state))
+            topic.again = following.began_again
+            named, source = topic.place.shown, topic.batches(stop.waiting)
         try:
             with contextlib.suppress(KeyboardInterrupt):
-                for batch in batches(source, again=state is not None):
+                for batch in source:
                     following.take(batch)
             following.end()
             return None if json else following.summary()
         except InputError as e:
-            if isinstance(rows, str | Path) and str(e).startswith(INPUT):
-                raise InputError(f"{rows}{str(e).removeprefix(INPUT)}") from None
+            if str(e).startswith(INPUT):
+                raise InputError(f"{named}{str(e).removeprefix(INPUT)}") from None
             raise
 
 
@@ -74,7 +88,8 @@ class _Following:
         as_json: bool, watch: bool,
     ):  # fmt: skip
         self.file, self.tell, self.as_json, self.asked = file, tell, as_json, target
-        self.alarmed = False
+        self.alarmed = self.refused = False
+        self.topic: Topic | None = None  # that rows come from, if not from a stream
         self.saved = time.monotonic()
         self.digest = sheet_digest(augmented_sheet(sheet, {}, {}))
         self.vehicle = Followed(sheet, rules, target, watch=watch)
@@ -105,11 +120,26 @@ class _Following:
             for note in self.vehicle.notes:
                 self.tell(f"note: {note}")
 
-    def take(self, records: list[Mapping[str, Any] | None]) -> None:
+    def take(self, records: Batch) -> None:
         """Some rows by header, in order; None for one that does not read."""
-        self._use(self.vehicle.take(records))
-        if self.file is not None and time.monotonic() - self.saved > SAVED_S:
+        first = 0
+        while self.topic is not None and self.vehicle.live is None and first < len(records):
+            self._first(records[first], self.topic)
+            first += 1
+        self._use(self.vehicle.take(records[first:]))
+        full = self.topic is not None and self.topic.full
+        if self.file is None or full or time.monotonic() - self.saved > SAVED_S:
             self._save()
+
+    def _first(self, record: Mapping[str, Any] | None, topic: Topic) -> None:
+        """What may be the first row of a topic: whatever else was sent there before must not end the run, each time."""
+        try:
+            self._use(self.vehicle.take([record]))
+        except InputError as e:
+            self.vehicle.stream.unreadable += 1
+            if not self.refused:
+                self.refused = True
+                progress.step(f"{topic.place.shown}{str(e).removeprefix(INPUT)}; waiting for other rows")
 
     def _use(self, rows: tuple[list[Arrived], Now | None]) -> None:
         arrived, known = rows
@@ -141,7 +171,13 @@ class _Following:
     def _save(self) -> None:
         if self.vehicle.live is not None and self.file is not None:
             keep(self.file, self.vehicle.live, {"sheet_sha256": self.digest, **self.vehicle.about()})
-            self.saved = time.monotonic()
+        if self.topic is not None:
+            self.topic.kept()
+        self.saved = time.monotonic()
+
+    def began_again(self) -> None:
+        """What comes next may have been there."""
+        self.vehicle.stream.continued = True
 
     def end(self) -> None:
         """The last row, where nothing goes on from here; else the file."""
@@ -152,7 +188,10 @@ class _Following:
     def summary(self) -> str:
         """What is known at the end."""
         if self.vehicle.live is None:
-            raise InputError("standard input: no rows; a header and rows of CSV, or JSON lines, are expected")
+            expected = "a header and rows of CSV, or JSON lines, are expected"
+            if self.topic is not None:
+                expected = "messages of JSON, a row or a list of rows each, are expected"
+            raise InputError(f"{INPUT}: no rows; {expected}")
         state = self.vehicle.live.state
         lines = [
             f"{name:32s} {float(v):12.6g} ± {float(s):.3g}"
@@ -193,19 +232,40 @@ def _terminal(*, live: bool) -> Iterator[Callable[[str], None]]:
         yield write
 
 
+class _Stop:
+    """Ctrl-C, or to be asked to end: at once while rows are waited for, else when those that are there have been used,
+    so that what is saved is whole. Asked twice: at once."""
+
+    def __init__(self) -> None:
+        self.now, self.asked = False, False
+
+    def __call__(self, *_: Any) -> None:
+        if self.now or self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Around what waits for rows."""
+        self.now = True
+        try:
+            if self.asked:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self.now = False
+
+
 @contextlib.contextmanager
-def _stopped_by_signal() -> Iterator[None]:
+def _stopped_by_signal() -> Iterator[_Stop]:
     """A process that is asked to end saves first."""
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
+    stop, before = _Stop(), {}
+    with contextlib.suppress(ValueError):  # not in the main thread
+        before[signal.SIGTERM] = signal.signal(signal.SIGTERM, stop)
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is to be left alone
+            before[signal.SIGINT] = signal.signal(signal.SIGINT, stop)
     try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not in the main thread
-        yield
-        return
-    try:
-        yield
+        yield stop
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

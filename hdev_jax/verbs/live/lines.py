@@ -4,15 +4,17 @@ import contextlib
 import csv
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from hdev_jax.errors import InputError
 
-__all__ = ["Records", "batches", "opened"]
+__all__ = ["Batch", "Records", "Waiting", "batches", "opened", "rows_of_json"]
 
 Records = Iterable[Mapping[str, Any]]
+Batch = list[Mapping[str, Any] | None]  # rows by header; None for one that does not read
+Waiting = Callable[[], contextlib.AbstractContextManager[None]]  # around what waits for rows: there it may be stopped
 
 
 @contextlib.contextmanager
@@ -31,21 +33,21 @@ def opened(rows: str | Path | Records | BinaryIO | None) -> Iterator[Records | B
         yield rows
 
 
-def batches(rows: Records | BinaryIO, *, again: bool) -> Iterator[list[Mapping[str, Any] | None]]:
+def batches(rows: Records | BinaryIO, *, again: bool, waiting: Waiting = contextlib.nullcontext) -> Iterator[Batch]:
     """Rows by header as they come, all that are there at a time. What is sent `again` need not be read half."""
     if not hasattr(rows, "read1"):
         yield [*rows]  # type: ignore[misc]
         return
     header: list[str] | None = None
     mark = ","
-    for lines, whole in _lines(rows):  # type: ignore[arg-type]
-        found: list[Mapping[str, Any] | None] = []
+    for lines, whole in _lines(rows, waiting):  # type: ignore[arg-type]
+        found: Batch = []
         for line in lines:
             text = line.decode("utf-8", errors="replace").strip("\ufeff\r\n \0")
             if not text:
                 continue
             if text.startswith("{"):
-                found.append(_of_json(text))
+                found += rows_of_json(line)
             elif header is None:
                 mark = ";" if text.count(";") > text.count(",") else ","
                 header = _cells(text, mark)
@@ -66,21 +68,28 @@ def _cells(text: str, mark: str) -> list[str] | None:
         return None
 
 
-def _of_json(text: str) -> Mapping[str, Any] | None:
+def rows_of_json(text: bytes) -> Batch:
+    """The rows of a message: one, or a list of them; none of an empty one."""
+    if not text.strip():
+        return []
     try:
         found = json.loads(text)
     except (ValueError, RecursionError):
-        return None
-    return found if isinstance(found, dict) else None
+        return [None]
+    return [row if isinstance(row, dict) else None for row in (found if isinstance(found, list) else [found])]
 
 
-def _lines(stream: BinaryIO) -> Iterator[tuple[list[bytes], bool]]:
+def _lines(stream: BinaryIO, waiting: Waiting) -> Iterator[tuple[list[bytes], bool]]:
     """Lines, all that have come since the last ones, and whether they are whole: the last one may end half-way.
 
     **Raises:** `InputError` for what is compressed.
     """
     rest, first = b"", True
-    while piece := stream.read1(1 << 16):  # type: ignore[attr-defined]
+    while True:
+        with waiting():
+            piece = stream.read1(1 << 16)  # type: ignore[attr-defined]
+        if not piece:
+            break
         if first and piece.startswith(b"\x1f\x8b"):
             raise InputError("standard input: compressed by gzip; text is expected: zcat FILE | hdev follow …")
         first = False

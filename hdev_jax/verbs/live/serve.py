@@ -1,5 +1,6 @@
 """The verb `serve`: many vehicles followed behind HTTP."""
 
+import socket
 import tomllib
 from pathlib import Path
 
@@ -23,8 +24,8 @@ def serve(
     """Take rows of many vehicles over HTTP and give estimates, alarms and forecasts, until it is stopped.
 
     **Arguments:** `sheets`: a folder with VEHICLE.toml or FLEET/VEHICLE.toml, `default.toml` for the others; `state`:
-    the database that keeps rows and states; `tokens`: a TOML file, `fleet = "SHA-256 of its token"`; without it there
-    is one fleet, and only this machine may call. **Raises:** `InputError`.
+    a file of SQLite or `postgresql://…`, which keeps rows and states; `tokens`: a TOML file, `fleet = "SHA-256 of its
+    token"`; without it there is one fleet, and only this machine may call. **Raises:** `InputError`.
     """
     try:
         import uvicorn
@@ -35,13 +36,29 @@ def serve(
     if tokens is None and host not in HERE:
         raise InputError(f"--host {host}: other machines may call only where --tokens says which fleets there are")
     digests = None if tokens is None else _tokens(Path(tokens))
-    fleet = Fleet(Journal(state), sheets_in(sheets), watch=watch)
-    progress.step(f"http://{host}:{port}/ shows the vehicles; rows go to /v1/rows")
+    sheet_for = sheets_in(sheets)
+    with _bound(host, port) as at:  # before the journal: a second start by mistake must not take it from the first
+        fleet = Fleet(Journal(state), sheet_for, watch=watch)
+        progress.step(f"http://{host}:{port}/ shows the vehicles; rows go to /v1/rows")
+        try:
+            app = app_of(fleet, digests)  # a page that is open listens for ever: it is cut off
+            uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2)).run([at])
+        finally:
+            fleet.close()
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """The address to listen at. Raises `InputError` where another program has it."""
+    at = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
-        app = app_of(fleet, digests)  # a page that is open listens for ever: it is cut off
-        uvicorn.run(app, host=host, port=port, log_level="warning", timeout_graceful_shutdown=2)
-    finally:
-        fleet.close()
+        at.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        at.bind((host, port))
+    except (OSError, OverflowError) as e:
+        at.close()
+        raise InputError(
+            f"--host {host} --port {port}: cannot listen there ({getattr(e, 'strerror', None) or e})"
+        ) from e
+    return at
 
 
 def _tokens(path: Path) -> dict[str, str]:
