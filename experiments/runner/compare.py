@@ -6,7 +6,7 @@ from typing import Any
 
 __all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "notes", "numbers"]
 
-DECIDES = "Deciding number of each row; median, least and most over all starts of its fit"
+DECIDES = "The number that decides for each model; median and range are over all random starts of its fit"
 MOST_MISSED = 4  # targets that lead a page one by one
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
