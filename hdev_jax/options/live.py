@@ -16,15 +16,15 @@ def live_parsers(verbs: Any) -> None:
         "follow",
         help="rows of a vehicle as they arrive: its energy, its coefficients, what its sheet lacks",
         description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
-        "is predicted from those before it, and tells more of the sheet's coefficients.",
+        "is predicted from the rows before it, and then updates the sheet's coefficients.",
         epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
         "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
         "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl",
     )
     file_argument(follow, "rows", "ROWS", "a file of rows (default: standard input)", nargs="?")
-    file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=True)
+    file_argument(follow, "--vehicle", "V.toml", "the vehicle sheet: what you know about the vehicle", required=True)
     file_argument(follow, "--adapter", "A.toml", "how to read rows whose columns have other names or units")
-    file_argument(follow, "--state", "FILE", "keeps what is known: the same command goes on from there")
+    file_argument(follow, "--state", "FILE", "keeps the estimates: the same command resumes from there")
     target_option(follow)
     effects_option(follow)
     follow.add_argument("--json", action="store_true", help="a line of JSON for each row")
@@ -34,16 +34,18 @@ def live_parsers(verbs: Any) -> None:
 
     serve = verbs.add_parser(
         "serve",
-        help="follow many vehicles behind HTTP: rows in, estimates, alarms and forecasts out, a live page",
-        description="Take rows of many vehicles over HTTP, keep each before it is acknowledged, follow every vehicle, "
-        "and show estimates, alarms and forecasts as JSON and on a page that lives. Needs the extra serve.",
+        help="follow many vehicles over HTTP: rows in, estimates, alarms and forecasts out, a live page",
+        description="Take rows of many vehicles over HTTP, store each before it is acknowledged, follow every vehicle, "
+        "and show estimates, alarms and forecasts as JSON and on a live page. Needs pip install 'hdev_jax[serve]'.",
         epilog="example:\n  hdev serve --sheets sheets --state fleet.sqlite --tokens tokens.toml",
     )
     serve.add_argument(
-        "--sheets", type=Path, required=True, metavar="DIR", help="VEHICLE.toml or FLEET/VEHICLE.toml; default.toml"
-    )
+        "--sheets", type=Path, required=True, metavar="DIR",
+        help="a folder of VEHICLE.toml or FLEET/VEHICLE.toml; default.toml is for vehicles without their own",
+    )  # fmt: skip
     file_argument(serve, "--state", "DB", "the database that keeps rows and states (SQLite)", required=True)
-    file_argument(serve, "--tokens", "TOKENS.toml", 'fleet = "SHA-256 of its token"; without: one fleet, here')
+    tokens = 'lines of fleet = "SHA-256 of its token"; without it: one fleet, this machine only'
+    file_argument(serve, "--tokens", "TOKENS.toml", tokens)
     serve.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen at (default: 127.0.0.1)")
     serve.add_argument("--port", type=int, default=8000, metavar="P", help="port to listen at (default: 8000)")
     serve.add_argument(
