@@ -145,7 +145,7 @@ def write_list_docs(
         ]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
-        lines += [f"At least as good as the paper in {better} of {compared}.", ""] if compared else []
+        lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
         first = [{"config": stem, **x} for stem, m in every for x in headlines(m)]
         with_paper = [x for x in first if x["paper"] is not None]
         alone = [x for x in first if x["paper"] is None]
