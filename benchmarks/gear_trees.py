@@ -115,11 +115,11 @@ def page(m: dict[str, Any]) -> str:
         lines += ["", verdict(part["predictors"], sizes), ""]
     lines += [
         f"A call from Python of a compiled JAX function that does nothing takes {m['empty_call_us']:.1f} µs here. "
-        "Beyond that lleaves has two things that arrays within jit do not: thresholds and leaves are constants of its "
-        "machine code, and a row walks down one path of a tree of any shape, where ours asks every node. Oblivious "
-        "trees have no path to save: there ours leads, and the table's best model is of these; no compiler here reads "
-        "CatBoost's file. On board the trees are a part of the one program that updates the "
-        "[estimates](online.md), in which no call is paid again and the gear's probabilities stay in JAX.", "",
+        "lleaves is faster for two reasons: thresholds and leaves are constants in its machine code, and a row "
+        "follows one path of a tree, while arrays within jit evaluate every node. In oblivious trees (CatBoost) a "
+        "single path saves nothing: there ours is faster, and the gear table's best model is of this kind; no "
+        "compiler here reads CatBoost's file. On board the trees are part of the one program that updates the "
+        "[estimates](online.md), so there is no second call, and the gear's probabilities stay in JAX.", "",
     ]  # fmt: skip
     return "\n".join(lines)
 

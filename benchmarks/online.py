@@ -59,8 +59,9 @@ def page(m: dict[str, Any]) -> str:
     lines = [
         "# Row by row: time", "",
         "Made by `python benchmarks/online.py --write`: a truck with four coefficients and seven channels, float64, "
-        f"{m['cores']} cores, one thread, load of the machine before it {m['load']:.1f}. A row is predicted, weighed "
-        f"and absorbed by {m['members']} models of its noise.", "",
+        f"{m['cores']} cores, one thread, load of the machine before it {m['load']:.1f}. Each row is predicted "
+        f"and weighted by {m['members']} models of the noise, and updates each. Cores count processor time, rows a "
+        "second the time that passed on the busy machine.", "",
         "| | measured | at most |", "|---|---:|---:|",
         *(f"| {what} | {value} | {limit} |" for what, value, limit in rows),
     ]  # fmt: skip

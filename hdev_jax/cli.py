@@ -112,7 +112,7 @@ def parser() -> argparse.ArgumentParser:
 
     init = verbs.add_parser(
         "init",
-        help="begin a vehicle sheet, and an adapter where one is needed, with what the log shows",
+        help="write a first vehicle sheet from what the log shows, or an adapter if one is needed",
         description="Write NAME.sheet.toml with what the log shows of the vehicle and typical values for the rest, "
         "with comments. Where the log's columns have other names, write NAME.adapter.toml instead, to be filled in.",
         epilog="examples:\n  hdev init trips.csv\n  hdev init other.csv --adapter other.adapter.toml",
@@ -128,7 +128,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="examples:\n  hdev diagnose trips.csv --vehicle truck.toml --out result\n"
         "  hdev diagnose day*.csv --vehicle truck.toml --train-trips mon,tue --test-trips wed --out result\n\n"
         "The folder gets report.html, diagnosis.json, figures/ and augmented_vehicle.toml, a sheet with the effects\n"
-        "in it. A run that was stopped goes on with the same command.",
+        "in it. A run that was stopped resumes with the same command.",
     )
     logs_and_sheet(diagnose)
     split_options(diagnose)
@@ -148,8 +148,8 @@ def parser() -> argparse.ArgumentParser:
     calibrate = verbs.add_parser(
         "calibrate",
         help="the sheet's coefficients with their uncertainty, from the declared values and the log",
-        description="Estimate the coefficients to which the sheet gives an sd, from their declared values, as priors, "
-        "and the training trips, with standard errors. No effect is searched.",
+        description="Estimate the coefficients that have an sd in the sheet, with standard errors: the declared values "
+        "are their priors, the training trips the data. No effect is searched.",
         epilog="examples:\n  hdev calibrate trips.csv --vehicle truck.toml --out calibrated\n"
         "  hdev calibrate trips.csv --vehicle truck.toml --method nuts --noise student_t --out drawn",
     )
@@ -175,8 +175,8 @@ def parser() -> argparse.ArgumentParser:
         "predict",
         help="what a vehicle sheet predicts for each row of a log, with an interval",
         description="Predict the target for each row of the logs, and the total of each trip, with intervals. The logs "
-        "need not have measured it. A sheet in the folder where hdev calibrate or diagnose wrote it has the covariance "
-        "and noise for the intervals beside it.",
+        "need not have measured it. Give the sheet in the folder where hdev calibrate or diagnose wrote it: the "
+        "covariance and the noise for the intervals are in a file beside it.",
         epilog="example:\n  hdev predict new.csv --vehicle result/augmented_vehicle.toml --out predicted.csv",
     )
     logs_and_sheet(predict)
@@ -191,7 +191,10 @@ def parser() -> argparse.ArgumentParser:
     )
     level = "probability inside the interval (default: 0.9)"
     predict.add_argument("--level", type=share, default=0.9, metavar="P", help=level)
-    predict.add_argument("--online", action="store_true", help="loads that switch follow the power of the rows before")
+    predict.add_argument(
+        "--online", action="store_true",
+        help="take the states of loads that switch from the measured power of earlier rows",
+    )  # fmt: skip
 
     live_parsers(verbs)
 

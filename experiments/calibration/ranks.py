@@ -248,8 +248,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         ],
         "notes": [
             f"{DRAWS} draws of each world, {APART} apart in a chain: ranks run from 0 to {DRAWS}",
-            "The prior of the noise, and the size that the noise grows with, are fixed before the rows are seen; hdev, "
-            "where they are not given, takes both from the same rows",
+            "The prior of the noise, and the size that the noise grows with, are fixed before the rows are seen; "
+            "without them, hdev takes both from the same rows",
         ],
     }  # fmt: skip
 

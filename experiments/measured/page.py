@@ -40,7 +40,7 @@ FOLDER = "figures/real_logs"
 COLD_C = 12.0  # heating runs below: splits the missions of ZTBus into about a third and two thirds
 HEAD = """# Measured logs
 
-What the diagnosis finds in two public logs, how far that depends on the training trips, and what stays unexplained.
+What the diagnosis finds in two public logs, how much that depends on the training trips, and what stays unexplained.
 Made by
 
     python -m experiments.measured.logs --work DIR --write
@@ -52,7 +52,7 @@ compiling included, on a shared machine, and its peak memory."""
 READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with what was found.
 - *found*: the diagnosis added the effect. *one of a class*: it added one of several that this log cannot distinguish.
 - The number after it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
-  the share in which the effect, or its class, is again the best of its kind.
+  the share in which the effect, or one of its class, comes first again.
 - Sizes are as in diagnosis.json with their standard deviation. *largest difference*: between two training sets, in
   standard deviations of the difference as if the two were independent. Sizes *agree* where it is at most what equal
   ones reach in 95 % of cases: {chance} sets (Tukey's studentized range)."""
@@ -177,7 +177,7 @@ def _agreeing(runs: Runs) -> str:
     text += f"{close} {'agrees' if close == 1 else 'agree'}."
     if apart:
         said = names.verbose_join([f"{' or '.join(f'`{p}`' for p in r.paths)} ({r.furthest():.1f} sd)" for r in apart])
-        text += f" Differing more: {said}."
+        text += f" These differ by more: {said}."
     return text
 
 
@@ -272,7 +272,7 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     caution = "Folds share training missions, so differences in sd are larger than given."
     lines += _details(runs, "fold", caution)
     lines += ["### What stays unexplained", "", *left_table(runs, "fold", "kW"), *_left_notes(runs), ""]
-    lines += folded("Where the rest is", "\n".join(["Test RMSE [kW] before → after:", "", *_subsets(runs)]))
+    lines += folded("Where the remaining error is", "\n".join(["Test RMSE [kW] before → after:", "", *_subsets(runs)]))
     order = sorted(after, key=lambda n: warm.get(n, 0.0))
     label = {n: f"{n[:18]} h{f', {warm[n]:.1f} °C' if n in warm else ''}".replace("_", " ") for n in order}
     blocks = {"": [(label[n], before[n]["rmse"], after[n]["rmse"]) for n in order]}

@@ -25,9 +25,14 @@ def loads_section(runs: Runs, head: str, unit: str) -> list[str]:
         for k, e in found
         for p in [e["parameters"]["power_w"]]
     ]  # fmt: skip
-    lines = ["### Loads that switch", "", "On or off in no channel of the log: decoded from the measured power.", ""]
+    lines = [
+        "### Loads that switch",
+        "",
+        "No channel of the log says when these loads are on: their states are decoded from the measured power.",
+        "",
+    ]
     lines += table([head, "load", "power [kW]", *(f"on at {c:.0f} °C" for c in temps), "stays on"], rows)
-    lines += ["", "Errors by what they may know, on held-out test trips:", ""]
+    lines += ["", "Errors on held-out test trips, by the measured power that the prediction may use:", ""]
     errors = [[k, *_errors(r)] for k, r in runs.items() if "given_states" in r["after"]]
     with_states = [r for r in runs.values() if "given_states" in r["after"]]
     every = [

@@ -196,8 +196,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     _figure(run, of["forecast"], config.shares, alarms)
     rows = [{"name": x["name"], "paper": None, "ours": x} for x in (*rests, *estimates, *alarms)]
     at = rests[len(rests) // 2]
-    found = [f"After {at['share_percent']:.0f} % of a trip the rest is {at['median_error_percent']:.1f} % off in the "
-             f"median of {at['n']} trips; 90 % intervals hold {at['inside_90']:.0f} %",
+    found = [f"After {at['share_percent']:.0f} % of a trip, the forecast of its remaining energy has a median error of "
+             f"{at['median_error_percent']:.1f} % ({at['n']} trips); 90 % intervals contain {at['inside_90']:.0f} %",
              f"Nothing planted: {false} of {quiet} streams have an alarm"]  # fmt: skip
     return {"artefact": config.artefact, "data": "synthetic fleet and logs", "synthetic": True, "rows": rows,
             "better_than_paper": 0, "of": 0, "missed": missed, "findings": found}  # fmt: skip

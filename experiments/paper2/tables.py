@@ -121,7 +121,7 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     several = [n for n in found if len(found[n]["losses"]) > 1]
     starts = {n: f"{n} ({len(found[n]['losses'])} starts)" for n in several}
     rules = {
-        "least": "ours is the start with the lowest loss on trip 1",
+        "least": "ours is the random start with the lowest loss on trip 1",
         "ensemble": "ours is the mean of all starts' predictions",
     }  # fmt: skip
     said = [
@@ -130,9 +130,9 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
         if (names := [n for n in several if config.models[n].rule == rule])
     ]
     if several:
-        said.append("median, least to most: over all starts, each number by itself, after ours was chosen")
-        said.append("ensemble: the mean of all starts' predictions")
-        said.append("the starts of a model are fitted side by side in one program (vmap)")
+        said.append("median, least to most: over all random starts, for each number separately")
+        said.append("ensemble: error of the mean prediction of all starts")
+        said.append("all starts of a model are fitted in one program (vmap)")
     for n in found:
         if found[n]["converged"] and not all(found[n]["converged"]):
             ended, steps = found[n]["converged"], config.models[n]

@@ -129,8 +129,8 @@ def collect(config: Any, results: Sequence[Log], run: Run) -> dict[str, Any]:
             "of the true one, the share whose time on in the training trips is within 3 points of the true one; the "
             "share of rows whose state is right, mean; the share of trips whose 90 % interval of energy holds the true "
             "one, mean",
-            "False name: the share of logs in which something is named that is not planted. Of a load that is not "
-            "found, auxiliary_power, hvac_power and periodic_load count as its mean or its cycle, not as false",
+            "False name: the share of logs in which something is named that is not planted. If a load is not found, "
+            "auxiliary_power, hvac_power and periodic_load are not false names: they stand for its mean or its cycle",
         ],
     }  # fmt: skip
 

@@ -45,45 +45,48 @@ WANTED = {  # what may be wanted of a setting: column with the share, in words, 
     "named_exactly_no_class": ("with no class", "no_class_wanted"),
     "called_unexplained": ("called unexplained", "unexplained_wanted"),
 }
-BY_TWIN = "Planted effects: one name of what has no twin, a class of what has one"
+BY_TWIN = "Planted effects: those without a twin have to be named alone, those with a twin in a class"
 LEGEND = {  # of each table that is there; the first of every page
     "": (
-        "Size: RMS of the planted effect's column, after the declared model's own columns are projected off it, over "
+        "Size: RMS of the planted effect's column, after projecting out the columns of the declared model, divided by "
         "the RMS of the noise. Noise: white; ar1, each row follows the one before by {ar:g}; ar1_white, a fifth of the "
         "variance is white; trip_levels, half of it is a random intercept of each trip; student_t, ar1 with "
         "innovations of 3 degrees of freedom; trip_variance, ar1 whose size differs by trip. Logs hold energy by road "
-        "segment, those called shaft samples of electric power with the motor's torque and speed",
+        "segment; logs called shaft hold samples of electric power with the motor's torque and speed",
     ),
     "planted": (
-        "Right: the share of logs with the right answer, with Wilson's 95 % interval. That is: all and only what "
-        "was planted (each by its id, or in a class of at most three); with nothing planted, no name; with a cause "
-        "outside the library, no wrong name (a constant load is right for the mean of one that switches); where a "
-        "coefficient absorbs the effect, or only more trips could decide, that this is said. Met: the share is at "
+        "Right: the share of logs with the right answer, with Wilson's 95 % interval. The right answer is: exactly "
+        "what was planted, each effect by its id or in a class of at most three; if nothing was planted, no name; if "
+        "the cause is outside the library, no wrong name (a constant load counts as right for a load that switches); "
+        "if a coefficient absorbs the effect or more trips are needed, that the diagnosis says so. Met: the share is "
+        "at "
         "least the wanted one{unexplained}",
-        "False name: logs in which an effect is named that was not planted. Called unexplained: logs in which "
-        "structure is left (random intercepts of trips count, though they are noise there)",
+        "False name: share of logs in which an effect is named that was not planted. Called unexplained: share of "
+        "logs in which structure is left (random intercepts of trips count, although they are noise in these logs)",
     ),
     "planted_errors": (
-        "Within 5 percent of oracle: test RMSE of the diagnosis against a fit on the same training trips that knows "
-        "the cause. After over noise: that RMSE over the noise's own, median. Sizes: of effects named by their own id. "
-        "Seconds: of one diagnosis, median, beside others on the same machine; a kind's first logs also compile",
+        "Within 5 percent of oracle: share of logs whose test RMSE is that close to a fit on the same training trips "
+        "that knows the cause. After over noise: test RMSE divided by the RMS of the noise, median. Sizes: of effects "
+        "named by their own id. Seconds: median time of one diagnosis, with others running on the same machine; the "
+        "first logs of each kind include compiling",
     ),
     "planted_names": (
-        "Named first: the first name of each entry is the planted one. No class: each entry is one name. Separable: "
-        "logs in which, by the truth, no other effect explains as much under this noise. Redrawn: logs drawn again "
-        "because the effect acted in one training trip only, or the noise was beyond what the reader takes",
+        "Named first: share of logs in which the first name of each entry is the planted effect. No class: share in "
+        "which each entry is a single name. Separable: share in which, judged by the true effect, no other effect "
+        "explains as much under this noise. Redrawn: number of logs drawn again because the effect acted in only one "
+        "training trip, or the noise was beyond what the reader takes",
     ),
     "planted_names_by_twin": (
         "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "
-        "rolling resistance and drag area are fitted. The right answer is a class of at most three that holds both. "
-        "In the first table one name of the two counts too, though it is a guess. Met: the share is at least the "
-        "wanted one, and so is that with no class, where one is wanted",
+        "rolling resistance and drag area are fitted. The right answer is a class of at most three that contains "
+        "both. In the first table either name alone counts too, although it is a guess. Met: the share is at least "
+        "the wanted one, and so is the share with no class, if one is wanted",
     ),
     "planted_rivals": (
-        "Ours is right where an entry, a name or a class, holds the planted effect; ours_first where the first name of "
-        "each entry is the planted effect, so that a twin named first is false. A rival's name is right where it is "
-        "the planted effect, its twin, an effect that this log cannot distinguish from it, or in the class that ours "
-        "gives. Seconds of ours include compiling, whose share is larger where there are few logs of a kind",
+        "Ours is right if an entry (a name or a class) contains the planted effect; ours_first, if the first name of "
+        "each entry is the planted effect, so a twin named first is false. A rival's name is right if it is the "
+        "planted effect, its twin, an effect that this log cannot distinguish from it, or in our class. Our seconds "
+        "include compiling, which weighs more where there are few logs of a kind",
     ),
 }
 

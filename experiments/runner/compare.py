@@ -6,7 +6,7 @@ from typing import Any
 
 __all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "notes", "numbers"]
 
-DECIDES = "Deciding number of each row; median, least and most over all starts of its fit"
+DECIDES = "The number that decides for each model; median and range are over all random starts of its fit"
 MOST_MISSED = 4  # targets that lead a page one by one
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
@@ -86,9 +86,9 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["tasks_left_out"]:
         said.append(f"Not run: {metrics['tasks_left_out']} more tasks of the config.")
     if metrics.get("skipped"):
-        said.append(f"{len(metrics['skipped'])} could not be made as the config says.")
+        said.append(f"Could not be made as the config says: {len(metrics['skipped'])}.")
     if metrics["of"]:
-        said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']}.")
+        said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += _sentences(metrics.get("findings", []))
     if missed := metrics.get("missed"):
         few = len(missed) <= MOST_MISSED

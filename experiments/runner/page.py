@@ -16,6 +16,7 @@ from hdev_jax.rundir import Run, atomic_file
 __all__ = ["Section", "folded", "of_run", "part", "write_docs", "write_html", "write_list_docs", "write_page"]
 
 MOST_COLUMNS = 8  # of the table that a page shows
+MOST_ROWS = 20  # of a table that a page of many runs shows; a longer one is folded
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
@@ -144,14 +145,20 @@ def write_list_docs(
         ]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
-        lines += [f"At least as good as the paper in {better} of {compared}.", ""] if compared else []
-        if first := [{"config": stem, **x} for stem, m in every for x in headlines(m)]:
-            lines += [_narrow(markdown(cells(first, 4), DECIDES)), ""]
+        lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
+        first = [{"config": stem, **x} for stem, m in every for x in headlines(m)]
+        with_paper = [x for x in first if x["paper"] is not None]
+        alone = [x for x in first if x["paper"] is None]
+        if with_paper:
+            lines += [*_open(_decides(with_paper)), ""]
+        if alone:
+            title = "Models that the paper does not have" if with_paper else "Every model"
+            lines += [*folded(title, _decides(alone)), ""]
         for path, folders in runs.items():
             lines += [f"## {path.stem}", ""]
             for k, folder in enumerate(folders):
                 before = f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"
-                lines += [*_lines(folder, path, docs, home.name, before), ""]
+                lines += [*_lines(folder, path, docs, home.name, before, most_rows=MOST_ROWS), ""]
         if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
             every_number = markdown(cells(against, 4), "Every number of the paper").rstrip()
             lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number)]
@@ -160,11 +167,19 @@ def write_list_docs(
     return pages
 
 
+def _decides(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The table of what decides, quantities in words."""
+    words = [{**x, "quantity": str(x["quantity"]).replace("_", " ")} for x in rows]
+    return _narrow(markdown(cells(words, 4), DECIDES))
+
+
 def _by(arguments: str) -> str:
     return f"Made by `python -m experiments {arguments}`."
 
 
-def _lines(folder: Path, config: Path, docs: Path, name: str, before: str) -> list[str]:
+def _lines(
+    folder: Path, config: Path, docs: Path, name: str, before: str, *, most_rows: int | None = None
+) -> list[str]:  # fmt: skip
     """What a page says of the run in `folder`; its figures are put under `docs/figures/NAME/`."""
     metrics = json.loads((folder / "metrics.json").read_text())
     figures, home = [], docs / "figures" / name
@@ -175,22 +190,34 @@ def _lines(folder: Path, config: Path, docs: Path, name: str, before: str) -> li
         figures.append(f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})")
     files = sorted((folder / "tables").glob("*.md"), key=lambda path: (path.stem != "table", path.stem))
     tables = [path.read_text(encoding="utf-8") for path in files]
-    return part([*_about(config), *findings(metrics)], figures, tables, notes(metrics))
+    return part([*_about(config), *findings(metrics)], figures, tables, notes(metrics), most_rows=most_rows)
 
 
-def part(said: Sequence[str], figures: Sequence[str], tables: Sequence[str], notes: Sequence[str]) -> list[str]:
-    """A part of a page: what it shows and found, its figures, its first table; notes and other tables folded."""
+def part(
+    said: Sequence[str], figures: Sequence[str], tables: Sequence[str], notes: Sequence[str],
+    *, most_rows: int | None = None,
+) -> list[str]:  # fmt: skip
+    """A part of a page: what it shows and found, its figures, its first table; notes and other tables folded.
+
+    **Arguments:** `most_rows`, of the first table: a longer one is folded too; None for any number.
+    """
     lines = [" ".join(said)]
     for figure in figures:
         lines += ["", figure]
     first = _narrow(tables[0]) if tables else ""
     more = [t.rstrip() for t in tables if t.rstrip() != first]
-    lines += ["", first] if first else []
+    lines += ["", *_open(first, most_rows)] if first else []
     if notes:
         lines += ["", *folded("Notes", "\n".join(f"- {line}" for line in notes))]
     if more:
         lines += ["", *folded("More tables", "\n\n".join(more))]
     return lines
+
+
+def _open(table: str, most_rows: int | None = MOST_ROWS) -> list[str]:
+    """A table as it is, or folded under its number of rows where it has more than `most_rows`."""
+    rows = sum(line.startswith("|") for line in table.split("\n")) - 2
+    return [table] if most_rows is None or rows <= most_rows else folded(f"Table of {rows} rows", table)
 
 
 def _about(config: Path) -> list[str]:

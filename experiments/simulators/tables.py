@@ -18,24 +18,24 @@ __all__ = ["Group", "change_row", "collect", "confusion", "rival_rows"]
 Group = Sequence[tuple[dict[str, Any], dict[str, Any]]]  # tasks with their results
 ARTEFACT = "studies/simulators"
 NOTES = (
-    "Right: nothing changed, no false name, and the form of the efficiency is named (regenerating efficiency, losses "
-    "by load), two efficiencies are declared already, or something is called unexplained; one change, an entry or a "
-    "class of at most three holds it, or a declared coefficient that takes it has a 90 % interval beyond the sheet's "
-    "value, on the right side; no slope in the log, no false name, and something is called unexplained or the slope is "
-    "said to be missing",
-    "False name: an entry that is neither the change nor the form of the efficiency, which FASTSim has by load and "
-    "direction and SUMO by direction, while the sheet declares one number. In logs of samples of the past second a "
-    "late slope, a time skew or a filter is no false name either. Blamed: of these, an instrument or the "
-    "payload. Impossible: a size or a coefficient that no vehicle has",
-    "Error over refit: test RMSE over that of a refit that knows the cause: the kernel with the simulator's true "
-    "parameters, the change and the form of the efficiency, calibrated on the same training trips; median, logs "
-    "without the slope left out, for the refit has it. Covered: 90 % intervals that hold the true size; coefficients "
-    "covered: those of rolling resistance and drag area that hold the truth, whatever was changed. Segments of 100 m "
-    "lose what happens within them, for the refit too",
-    "A headwind is driven as the slope of the same force, regeneration that is not recovered is taken off the "
-    "electric power, for neither simulator knows a wind and FASTSim no share of friction braking",
-    "Rivals get the declared model's residual and every effect's column; a name is right where it is the change, false "
-    "where it is neither that nor the form of the efficiency. LightGBM names nothing",
+    "Right, if nothing changed: no false name, and either the form of the efficiency is named (regenerating "
+    "efficiency, losses by load), or the sheet already declares two efficiencies, or the diagnosis reports "
+    "unexplained structure. Right, with one change: an entry or a class of at most three contains it, or the declared "
+    "coefficient that takes it up has a 90 % interval that excludes the sheet's value, on the right side. Right, with "
+    "no slope in the log: no false name, and the diagnosis reports unexplained structure or that the slope is missing",
+    "False name: an entry that is neither the change nor the form of the efficiency. (The sheet declares one "
+    "efficiency; FASTSim's depends on load and direction, SUMO's on direction.) In logs whose samples are means of "
+    "the past second, a late slope, a time skew or a filter is not false either. Blamed: a false name that is an "
+    "instrument's fault or the payload. Impossible: a size or a coefficient that no vehicle has",
+    "Error over refit: test RMSE divided by that of a refit that knows the cause, that is the kernel with the "
+    "simulator's true parameters, the change and the form of the efficiency, calibrated on the same training trips. "
+    "It is the median over logs with a slope, because the refit knows the slope. Covered: share of 90 % intervals "
+    "that contain the true size. Coefficients covered: the same for rolling resistance and drag area, whatever was "
+    "changed. Segments of 100 m average over what happens within them, for the refit too",
+    "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim has no share of "
+    "friction braking, so regeneration that is lost is subtracted from the electric power",
+    "Rivals get the declared model's residual and every effect's column. A name is right if it is the change, and "
+    "false if it is neither the change nor the form of the efficiency. LightGBM names nothing",
 )
 
 

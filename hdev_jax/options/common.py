@@ -29,7 +29,7 @@ def logs_and_sheet(verb: argparse.ArgumentParser, *, vehicle_required: bool = Tr
     """The logs, their adapter and the vehicle sheet."""
     log_files(verb)
     file_argument(
-        verb, "--vehicle", "V.toml", "the vehicle sheet: what is known of the vehicle", required=vehicle_required
+        verb, "--vehicle", "V.toml", "the vehicle sheet: what you know about the vehicle", required=vehicle_required
     )
 
 
@@ -60,7 +60,7 @@ def split_options(verb: argparse.ArgumentParser) -> None:
 
 def effects_option(verb: argparse.ArgumentParser) -> None:
     """A file of a user's own effects."""
-    file_argument(verb, "--effects", "FILE.py", "effects of your own, for the search and for the sheet")
+    file_argument(verb, "--effects", "FILE.py", "effects of your own, which the search tries and a sheet may declare")
 
 
 def out_options(verb: argparse.ArgumentParser) -> None:
@@ -70,10 +70,10 @@ def out_options(verb: argparse.ArgumentParser) -> None:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Names with commas between them."""
+    """Names separated by commas."""
     found = tuple(part.strip() for part in text.split(","))
     if not all(found):
-        raise argparse.ArgumentTypeError(f"expected names with commas between them, found {text!r}")
+        raise argparse.ArgumentTypeError(f"expected names separated by commas, found {text!r}")
     return found
 
 

@@ -25,10 +25,10 @@ def energy_parsers(verbs: Any) -> None:
     ledger = verbs.add_parser(
         "ledger",
         help="where the energy goes: kWh, share and cost by cause, trip, week and vehicle",
-        description="Share the measured energy out by cause (rolling, air, slope, losses, loads, each effect of the "
+        description="Divide the measured energy by cause (rolling, air, slope, losses, loads, each effect of the "
         "sheet) with intervals, for the whole log, each vehicle, week and trip. What no cause explains is a "
-        "row of its own, so that each block adds up to what was measured. A sheet that hdev calibrate or "
-        "diagnose wrote is taken as fitted, another one is calibrated on this log.",
+        "row of its own, so that each table adds up to the measured energy. A sheet that hdev calibrate or "
+        "diagnose wrote is used as fitted; any other sheet is calibrated on this log first.",
         epilog="examples:\n  hdev ledger trips.csv --vehicle truck.toml --out where\n"
         "  hdev ledger trips.csv --vehicle result/augmented_vehicle.toml --price 0.25 --out where",
     )
@@ -44,7 +44,7 @@ def energy_parsers(verbs: Any) -> None:
         help="the vehicle's road load A + B·v + C·v² with intervals, from driving or a coast-down",
         description="Estimate A, B and C of the road load and the force at 50 and 80 km/h, with intervals: from "
         "driving in service by the sheet, or from a coast-down log (force or torque 0 throughout, or only time and "
-        "speed), time-based in both directions after SAE J1263 and J2263. What the log cannot tell is said.",
+        "speed), by time, in both directions, after SAE J1263 and J2263. Notes say what the log cannot tell.",
         epilog="examples:\n  hdev roadload trips.csv --vehicle truck.toml --out load\n"
         "  hdev roadload coasting.csv --vehicle truck.toml --coastdown --out load",
     )
@@ -52,23 +52,25 @@ def energy_parsers(verbs: Any) -> None:
     target_option(roadload)
     effects_option(roadload)
     roadload.add_argument(
-        "--mass", type=float, metavar="KG", help="mass at which the load holds (default: the log's mean)"
+        "--mass", type=float, metavar="KG", help="mass for which the road load is given (default: the log's mean)"
     )
-    roadload.add_argument("--coastdown", action="store_true", help="take the log as a coast-down whatever it measures")
+    roadload.add_argument("--coastdown", action="store_true", help="treat the log as a coast-down in any case")
     out_options(roadload)
 
     whatif = verbs.add_parser(
         "whatif",
         help="what a change of the vehicle, its load or the weather would cost on the trips as driven",
         description="Predict the energy of the trips as driven with a change, by trip and by cause, with intervals. A "
-        "value with a sign is a change (-10%, +500), one without is the new value. Keys are those of the "
+        "value with a sign is a change (-10%, +500), a value without one replaces the old value. Keys are those of the "
         "sheet, or channels of the log.",
         epilog="examples:\n  hdev whatif truck.toml trips.csv --set road.c_rr=-10% --out tyres\n"
         "  hdev whatif truck.toml trips.csv --set mass_kg=+500 --set ambient_temp_c=-10 --out winter",
     )
     file_argument(whatif, "vehicle", "SHEET", "the vehicle sheet")
     log_files(whatif)
-    whatif.add_argument("--set", dest="changes", action="append", required=True, metavar="KEY=VALUE", help="one change")
+    whatif.add_argument(
+        "--set", dest="changes", action="append", required=True, metavar="KEY=VALUE", help="a change; may be repeated"
+    )
     target_option(whatif)
     effects_option(whatif)
     _trust(whatif)
@@ -76,16 +78,16 @@ def energy_parsers(verbs: Any) -> None:
 
     saved = verbs.add_parser(
         "saved",
-        help="what a change has saved, with weather, load, route and speed taken out",
+        help="what a change has saved, corrected for weather, load, route and speed",
         description="Calibrate the vehicle on the trips before a change (tyres, a spoiler, training of drivers) and "
-        "compare the trips after it with what the vehicle as it was would have taken: the share saved with an "
-        "interval, how many further trips would settle it, and what else changed meanwhile.",
+        "compare the trips after it with what the unchanged vehicle would have used: the share saved with an "
+        "interval, how many more trips would make it significant, and what else changed.",
         epilog="examples:\n  hdev saved trips.csv --vehicle truck.toml --before ..2024-03-31 --after 2024-04-01.. "
         "--out tyres\n"
         "  hdev saved trips.csv --vehicle truck.toml --before T01..T08 --after T09,T11,T12 --out tyres",
     )
     logs_and_sheet(saved)
-    words = "dates or trips with two dots between, or names of trips with commas"
+    words = "first..last (dates or trips), or names of trips separated by commas"
     saved.add_argument("--before", required=True, metavar="A..B", help=f"trips before the change: {words}")
     saved.add_argument("--after", required=True, metavar="C..D", help=f"trips after the change: {words}")
     target_option(saved)
@@ -105,7 +107,7 @@ def energy_parsers(verbs: Any) -> None:
     compare.add_argument("b", metavar="B", help="the other one")
     file_argument(compare, "--log", "LOG", "log files, read as one log", nargs="+", dest="logs", required=True)
     file_argument(compare, "--adapter", "A.toml", "how to read files whose columns have other names or units")
-    file_argument(compare, "--vehicle", "V.toml", "the vehicle sheet, where trips or vehicles are compared")
+    file_argument(compare, "--vehicle", "V.toml", "the vehicle sheet, needed to compare trips or vehicles")
     target_option(compare)
     effects_option(compare)
     _trust(compare)

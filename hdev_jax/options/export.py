@@ -12,8 +12,8 @@ def export_parser(verbs: Any) -> None:
     export = verbs.add_parser(
         "export",
         help="a vehicle sheet for other programs: compiled function, table, simulators' vehicle files",
-        description="Write the vehicle of a sheet, entered at the road and up to the battery, in the format of another "
-        "program. What a format cannot hold is said, and stands with inputs and errors in FILE.json beside.",
+        description="Write the vehicle of a sheet, from the road to the battery, in the format of another program. "
+        "What the format cannot hold is printed, and listed with the inputs and errors in FILE.json.",
         epilog="examples:\n  hdev export truck.toml --to stablehlo --out truck.stablehlo\n"
         "  hdev export result/augmented_vehicle.toml --to lookup --out truck.csv\n"
         "  hdev export truck.toml --to sumo --out truck.add.xml",
@@ -30,7 +30,7 @@ def export_parser(verbs: Any) -> None:
         "--channels",
         type=names,
         metavar="A,B",
-        help="inputs beside the interval of driving (default: slope, mass and what the sheet's effects read)",
+        help="inputs besides duration, distance and speeds (default: slope, mass and what the sheet's effects read)",
     )
     effects_option(export)
     file_argument(export, "--out", "FILE", "the file to write; FILE.json is written beside it", required=True)

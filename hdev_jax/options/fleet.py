@@ -13,11 +13,11 @@ def fleet_parser(verbs: Any) -> None:
     """Add the parser to the subparsers `verbs`."""
     fleet = verbs.add_parser(
         "fleet",
-        help="many vehicles: each diagnosed, evidence and coefficients pooled, which differ, a ledger",
-        description="Check, calibrate and diagnose every vehicle, then say what only a fleet can tell: effects that no "
-        "single log decides, coefficients by type, which vehicles differ from their like, by what and since when, and "
-        "where the energy goes. A vehicle whose log is bad is a line of the result. A run that was stopped goes on "
-        "with the same command.",
+        help="many vehicles: each diagnosed, effects and coefficients pooled by type, which differ, an energy ledger",
+        description="Check, calibrate and diagnose every vehicle, then compare them: effects that no single log is "
+        "enough to name, coefficients by type, vehicles that differ from their type or have changed, with the date, "
+        "and where the energy goes. A vehicle with a bad log gets a line in the result. A run that was stopped "
+        "resumes with the same command.",
         epilog="examples:\n  hdev fleet logs/ --vehicles sheets/ --out fleet\n"
         "  hdev fleet logs/ --vehicles truck.toml --workers 4 --price 0.25 --out fleet\n"
         "  hdev fleet logs.parquet --vehicles vehicles.csv --scheduler tcp://10.0.0.1:8786 --out fleet",

@@ -59,8 +59,8 @@ def strongly_correlated(names: Sequence[str], covariance: Float[np.ndarray, "k k
     correlation = covariance / np.outer(sd, sd)
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > STRONG, 1)), strict=True)
     return [
-        f"{names[i]} and {names[k]} are strongly correlated ({correlation[i, k]:+.2f}): the log determines them "
-        "together, not each by itself"
+        f"{names[i]} and {names[k]} are strongly correlated ({correlation[i, k]:+.2f}): the log determines only their "
+        "combination"
         for i, k in pairs
     ]
 

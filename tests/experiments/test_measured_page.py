@@ -154,7 +154,10 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
             (row,) = size_rows(offsets(5.0, 5.0 + factor * bound, *[5.0 + 0.5 * bound] * (sets - 2)))
             assert row.agrees() == close
     assert "Of 1 sizes found more than once, 1 agrees." in page._agreement(offsets(5.0, 5.5), "")[0]
-    assert "0 agree. Differing more: `torque_offset.offset_nm` (2.1 sd)." in page._agreement(offsets(5.0, 8.0), "")[0]
+    assert (
+        "0 agree. These differ by more: `torque_offset.offset_nm` (2.1 sd)."
+        in page._agreement(offsets(5.0, 8.0), "")[0]
+    )
 
 
 def test_an_effect_whose_sign_turns_is_told_first(results):

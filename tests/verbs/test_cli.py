@@ -159,7 +159,7 @@ def test_version(capsys):
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--fdr", "5"], "between 0 and 1, found '5'"),
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--fdr", "nan"], "between 0 and 1, found 'nan'"),
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--seed", "-1"], "expected a whole number"),
-        (["diagnose", "a.csv", *SHEET, "--out", "d", "--train-trips", "1,,2"], "commas between them, found '1,,2'"),
+        (["diagnose", "a.csv", *SHEET, "--out", "d", "--train-trips", "1,,2"], "separated by commas, found '1,,2'"),
         (["diagnose", "a.csv", *SHEET, "--out", "d", "--target", "power"], "invalid choice: 'power'"),
         (["calibrate", "a.csv", *SHEET, "--out", "d", "--method", "ols"], "invalid choice: 'ols'"),
     ],

@@ -95,7 +95,8 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         return no(Kind.NO_EFFECT, "nothing is left that could have levels")
     q = min(1.0, max(t.p for t in tests) * len(training.library))
     if model is None or q > settings.fdr:
-        return no(Kind.NOT_SIGNIFICANT, f"no more levels than noise of this colour has (FDR-adjusted p = {q:.2g})", q)
+        why = f"levels no clearer than in noise with the same autocorrelation (FDR-adjusted p = {q:.2g})"
+        return no(Kind.NOT_SIGNIFICANT, why, q)
     decoded = decode(model, rows)
     places = range(len(held), len(model.power_w))
     why = {k: x for k in places if (x := _unlike(rows, model, decoded, k, training.clusters, settings))}

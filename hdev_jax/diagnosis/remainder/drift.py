@@ -78,11 +78,11 @@ class Drift:
         if self.memory_s <= 0:
             return ""
         size = {
-            "load": f"like a load of {self.sd / 1e3:.2g} kW",
-            "force": f"like a force of {self.sd:.2g} N",
-            "gain": f"like a gain of {100 * self.sd:.2g} % of the power",
-        }.get(self.like, "like no single load, force or gain")
-        return f"it drifts, {size} (standard deviation), and forgets in about {self.memory_s / 60:.0f} min"
+            "load": f"like a load of {self.sd / 1e3:.2g} kW (standard deviation)",
+            "force": f"like a force of {self.sd:.2g} N (standard deviation)",
+            "gain": f"like a gain of {100 * self.sd:.2g} % of the power (standard deviation)",
+        }.get(self.like, "but like no single load, force or gain")
+        return f"it drifts, {size}; its correlation time is about {self.memory_s / 60:.0f} min"
 
     def course(self, slow: Slow, names: Sequence[str], shown: Sequence[int]) -> dict[str, Any] | None:
         """Its energy in each trip, and its power over one of the trips `shown`: the one in which it varies most; means

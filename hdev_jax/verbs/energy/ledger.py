@@ -162,8 +162,8 @@ def _page(fitted: Fitted, found: Ledger, price: float | None, asked: Asked, note
     sections = [
         Section(
             "Where the energy goes",
-            "Forces count at the wheel; the driveline's loss is what its efficiency makes of their sum. What the "
-            "causes leave of the measured energy is unexplained; its interval has the noise of the trips besides.",
+            "Forces count at the wheel; the driveline's loss follows from its efficiency and their sum. The difference "
+            "to the measured energy is unexplained; its interval includes the noise of the trips.",
             {"waterfall": (lambda: waterfall(whole, *per), "Bars of energy by cause that add up to what was measured.",
                            "Energy by cause over the whole log.")},
             (_causes(whole, price),),

@@ -113,11 +113,11 @@ def battery_target(log: Log, target: str | None) -> str:
     """The battery's target that the log measures. Raises `InputError` where it measures none, or another is asked."""
     if target is not None and (target not in TARGETS or not TARGETS[target].of_battery):
         able = ", ".join(t.name for t in TARGETS.values() if t.of_battery)
-        raise InputError(f"--target {target}: energy at the battery is what this is about; accepted: {able}")
+        raise InputError(f"--target {target}: this command is about energy at the battery; accepted: {able}")
     if target is None and not log.measured:
         raise InputError(
             "the log measures no energy or power at the battery (energy_wh, battery_power_w, battery_power_kw), which "
-            "this answer is about; hdev check shows what was read"
+            "this command needs; hdev check shows what was read"
         )
     return target or log.default_target
 
@@ -138,7 +138,7 @@ def trusted(problem: Problem, trust: bool) -> None:
     """
     if not trust and (found := implausible(problem)):
         lines = "; ".join(s.line() for s in found)
-        raise InputError(f"the log is suspect: {lines} (--trust answers all the same)")
+        raise InputError(f"the log is suspect: {lines} (--trust computes the answer anyway)")
 
 
 def fitted_for(problem: Problem, vehicle: Vehicles, *, calibrate: bool = True) -> Fitted:

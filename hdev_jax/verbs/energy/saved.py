@@ -40,7 +40,8 @@ def saved(
 
     **Arguments:** `before` and `after`: dates `2024-03-01..2024-03-31` (one end may be open), trips in the order of the
     log `T01..T08`, or names `T01,T02`. **Returns:** an `EnergyResult`: the share saved with a 90 % interval, how many
-    further trips would settle it, the tables `trips` and `circumstances` (what else changed). **Raises:** `InputError`.
+    more trips would make it significant, the tables `trips` and `circumstances` (what else changed).
+    **Raises:** `InputError`.
     """
     asked = Asked.of(
         "saved", logs, adapter, effects, seed, {"target": target, "before": before, "after": after, "trust": trust}
@@ -70,18 +71,18 @@ def _percent(x: float) -> str:
 
 
 def _verdict(found: Saving) -> str:
-    """Whether it is settled, and what would settle it."""
+    """Whether the saving is significant, and how many trips would make it so."""
     if found.shown:
-        return "the interval does not hold 0: settled"
-    both = f"{found.more_both} further trips before and as many after"
+        return "significant: the interval does not contain 0"
+    both = f"{found.more_both} more trips before and as many after"
     if found.more_after is None:
         return (
-            f"not settled: further trips after alone would not settle it, since these trips before can show "
-            f"{100 * found.least_share:.2g} % or more; {both} would"
+            f"not significant yet: more trips after the change are not enough, because these trips before it can only "
+            f"show a saving of {100 * found.least_share:.2g} % or more; {both} would be"
         )
     return (
-        f"not settled: {found.more_after} further trips after would settle it (80 % chance, if it is as large as it "
-        f"looks), or {both}"
+        f"not significant yet: {found.more_after} more trips after the change would make it so (80 % power, if the "
+        f"saving is as large as estimated), or {both}"
     )
 
 
@@ -93,8 +94,8 @@ def _answer(
     notes = list(fitted.notes)
     if moved:
         notes.append(
-            f"what else changed: {', '.join(moved)}; the kernel takes them out as far as the sheet has their effects, "
-            "but what it lacks there would count as saved"
+            f"what else changed: {', '.join(moved)}; the kernel corrects for them if the sheet has their effects, "
+            "but an effect that the sheet lacks would count as saved"
         )
     kwh = [found.expected_kwh * x for x in (found.share, found.lower, found.upper)]
     summary = {
@@ -127,21 +128,21 @@ def _page(
     percents = (
         100 * trips[["saved_kwh", "lower", "upper"]].to_numpy(float) / trips[["expected_kwh"]].abs().to_numpy(float)
     )
-    needed = "settled" if found.shown else "–" if found.more_after is None else f"{found.more_after} trips"
+    needed = "none" if found.shown else "–" if found.more_after is None else f"{found.more_after} trips"
     whole = (100 * found.share, 100 * found.lower, 100 * found.upper)
     shown = others.assign(difference_sd=[f"{x:+.2f}".replace("-", "−") for x in others["difference_sd"]],
                           differs=np.where(others["differs"], "differs", ""))  # fmt: skip
     return Page(
         "saved", sheet.name, "what a change saved", synthetic(log, [sheet.name]),
         [("Saved ", False), (_percent(found.share), True),
-         (f" ({_percent(found.lower)} to {_percent(found.upper)}) of what the vehicle as it was before would have "
+         (f" ({_percent(found.lower)} to {_percent(found.upper)}) of what the unchanged vehicle would have "
           f"taken; {_verdict(found)}.", False)],
         [("Energy saved", span(kwh[0], kwh[1], kwh[2]) + " kWh", "90 % interval, on the trips after"),
          ("Expected without the change", words.number(found.expected_kwh, 4, "kWh"), f"{len(trips)} trips after"),
-         ("To settle it", needed, "further ones after, 80 % chance")],
+         ("More trips needed", needed, "after the change, 80 % power")],
         [Section(
             "Trips after the change", "Expected: by the vehicle calibrated on the trips before, on the same speeds, "
-            "slopes, loads and weather. Intervals of a trip have its noise and what the coefficients leave open.",
+            "slopes, loads and weather. A trip's interval includes its noise and the uncertainty of the coefficients.",
             {"trips": (lambda: trip_intervals(list(trips["trip_id"]), percents, "saved [% of expected]",
                                               "Saved on each trip", whole),
                        "Share saved on each trip with its interval.", "Saved on each trip after the change.")},
@@ -150,7 +151,7 @@ def _page(
                 "saved_kwh": "saved [kWh]", "lower": "from", "upper": "to"}, file="trips.csv"),)),
          Section(
             "What else changed", "Means of trips; the difference in standard deviations of trips. A large one is no "
-            "fault by itself: the kernel takes out what it has a term for.",
+            "fault by itself: the kernel corrects for what it has a term for.",
             {}, (table_of(shown, "Circumstances", {
                 "what": "What", "unit": "unit", "before": "before", "after": "after",
                 "difference_sd": "difference [sd]", "differs": ""}, text=2),))],

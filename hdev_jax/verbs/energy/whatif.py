@@ -64,7 +64,7 @@ def whatif(
 
 def _answer(fitted: Fitted, steps: list[Step], asked: Asked, command: str) -> EnergyResult:
     found = changed(fitted, steps, seed=asked.seed)
-    said = [f"{s.text} changes nothing on these trips: no effect of the sheet answers to {s.key} (see hdev effects)"
+    said = [f"{s.text} changes nothing on these trips: no effect of the sheet uses {s.key} (see hdev effects)"
             for s in idle(fitted, steps)]  # fmt: skip
     fitted = replace(fitted, notes=(*fitted.notes, *said))
     log = fitted.problem.log
