@@ -16,17 +16,32 @@ import matplotlib.figure
 import numpy as np
 import PIL.Image
 import pytest
+from jax._src import lru_cache
 
-# One cache of compiled programs for a test process and the processes that it starts: the tests compile the same few
-# programs for log after log. A folder of its own for each worker, for JAX does not write an entry in one step.
-_COMPILED = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
+# One cache of compiled programs for all test processes and those that they start: the tests compile the same few
+# programs for log after log.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _COMPILED = tempfile.TemporaryDirectory(prefix="hdev-compiled-")
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _COMPILED.name
 for _name, _value in {
-    "jax_compilation_cache_dir": _COMPILED.name,
+    "jax_compilation_cache_dir": os.environ["JAX_COMPILATION_CACHE_DIR"],
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }.items():
     jax.config.update(_name, _value)
     os.environ[_name.upper()] = str(_value)  # the same for the processes that a test starts
+
+
+def _put(self: lru_cache.LRUCache, key: str, value: bytes) -> None:
+    """In one step, as JAX does not: another process could read half of an entry."""
+    path = Path(str(self.path)) / f"{key}{lru_cache._CACHE_SUFFIX}"
+    if not path.exists():
+        part = path.with_name(f"{path.name}.{os.getpid()}")
+        part.write_bytes(value)
+        part.replace(path)
+
+
+lru_cache.LRUCache.put = _put  # type: ignore[method-assign]
 
 
 def _with_shapes() -> list[str]:

@@ -80,7 +80,7 @@ class Postgres(Server):
         subprocess.run(
             [self.bin / "initdb", "-D", folder / "data", "-U", "hdev", "--auth=scram-sha-256", "--encoding=UTF8",
              "--locale=C", "--no-sync", "--no-instructions", f"--pwfile={folder / 'password'}"],
-            check=True, capture_output=True, user=self.user, group=self.user, cwd="/",
+            check=True, stdout=subprocess.DEVNULL, user=self.user, group=self.user, cwd="/",
         )  # fmt: skip
         self.start()
 
