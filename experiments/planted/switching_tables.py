@@ -294,6 +294,6 @@ def _figure(run: Run, logs: Sequence[Log]) -> None:
         ax.minorticks_off()
         ax.set_xlabel("power of the load over the noise's")
         tidy(ax)
-    left.legend(loc="upper left", fontsize=7)
+    left.legend(loc="lower right", fontsize=7)
     right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7)
     save_figure(run, fig, "switching")

@@ -15,7 +15,7 @@ from experiments.runner.config import CONFIGS, artefact, changes, every_config, 
 from experiments.runner.data import MissingDataError
 from experiments.runner.engine import plan, run_config
 from experiments.runner.log import Log
-from experiments.runner.page import write_docs
+from experiments.runner.page import MOST_ROWS, part, write_docs
 from experiments.runner.tables import wilson
 from hdev_jax.errors import InputError
 
@@ -280,3 +280,11 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     assert "planted.toml --set cases.single.logs=3 --set" in page
     for name in re.findall(r"\]\((figures/[^)]*)\)", page):
         assert (tmp_path / "docs" / name).stat().st_size > 200
+
+
+def test_a_long_table_of_a_page_of_many_runs_is_folded():
+    table = "\n".join(["| a | b |", "|---|---|", *(f"| {k} | 1 |" for k in range(MOST_ROWS + 1))])
+    whole, some = (part(["Said."], [], [table], [], most_rows=most) for most in (None, MOST_ROWS))
+    assert "<details" not in "\n".join(whole)
+    assert f"<summary>Table of {MOST_ROWS + 1} rows</summary>" in "\n".join(some)
+    assert all(f"| {k} | 1 |" in "\n".join(some) for k in range(MOST_ROWS + 1))
