@@ -380,3 +380,35 @@ def test_killed_while_rows_come_it_loses_and_repeats_none(fleet, rows, sheets, j
     assert again.known("fleet", "T1")["rows"] == fleet.known("fleet", "T1")["rows"]
     live = [f._current(("fleet", "T1")).followed.live.numbers for f in (again, fleet)]
     np.testing.assert_array_equal(*live)
+
+
+def test_a_state_that_had_other_numbers_is_made_again_from_the_rows(tmp_path, sheets, rows):
+    first = Fleet(Journal(tmp_path / "s.sqlite"), sheets_in(sheets), watch=False)
+    first.put("a", checked(named(rows, "T1")))
+    expected, version = first.known("a", "T1"), first.version
+    assert version > 0
+    first.close()
+    journal = Journal(tmp_path / "s.sqlite")
+    kept = journal.kept("a", "T1")
+    del kept.about["stream"]["so_far"]
+    journal.keep([("a", "T1", kept)])
+    again = Fleet(journal, sheets_in(sheets), watch=False)
+    assert again.known("a", "T1") == expected
+    assert again.version > 0, "who listens is told of what a start has used"
+
+
+def test_brakes_that_drag_let_go_on_the_rest_of_the_trip(tmp_path, sheets, rows):
+    text = (sheets / "default.toml").read_text()
+    (tmp_path / "sheets").mkdir()
+    drag = "\n[effects.brake_drag]\nforce_n = 3000.0\ntau_s = 20.0\n"
+    (tmp_path / "sheets" / "default.toml").write_text(text + drag)
+    fleet = Fleet(Journal(tmp_path / "s.sqlite"), sheets_in(tmp_path / "sheets"), watch=False)
+    sent = [{**r, "brake_pressure_pa": 5e5 if k >= 30 else 0.0} for k, r in enumerate(rows[:60])]
+    fleet.put("a", checked(named(sent, "T1")))
+    ahead = [{"duration_s": 10.0, "speed_start_mps": 15.0, "speed_end_mps": 15.0, "grade_rad": 0.0,
+              "brake_pressure_pa": 0.0, "mass_kg": 3e4} for _ in range(60)]  # fmt: skip
+    told = fleet.ahead("a", "T1", ahead)["energy_wh"]
+    late = fleet.ahead("a", "T1", [{**r, "time_s": 1e6 + 10.0 * k} for k, r in enumerate(ahead)])["energy_wh"]
+    assert told == late, "times of rows to come are their durations added up"
+    dragged = fleet.ahead("a", "T1", ahead[:2])["energy_wh"] * 30.0
+    assert told < 0.95 * dragged

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import queue
 import signal
 import threading
 import time
@@ -184,3 +185,28 @@ def test_what_is_no_topic_is_one_line_without_a_password(broker, monkeypatch):
     monkeypatch.setenv("HDEV_MQTT_PASSWORD", "from elsewhere")
     place = place_of("mqtts://tr%40ck@h/a/+/b?/%23")
     assert place == ("h", 8883, "a/+/b?/#", True, "tr@ck", "from elsewhere")
+
+
+def test_every_message_is_given_and_acknowledged_however_many_are_there():
+    came, acknowledged = queue.SimpleQueue(), []
+
+    class Client:
+        def ack(self, mid, qos):
+            acknowledged.append(mid)
+
+    for mid in range(12):
+        came.put(mqtt._Message(json.dumps([{"time_s": 100 * mid + k} for k in range(100)]).encode(), mid, 1))
+    topic, got = Topic(place_of("mqtt://here/t"), Client(), came), []
+    for batch in topic.batches():
+        got += batch
+        topic.kept()
+        if len(got) >= 1200 or not batch:
+            break
+    assert [r["time_s"] for r in got] == list(range(1200))
+    assert acknowledged == list(range(12))
+
+
+@pytest.mark.parametrize("url", ["ssl://u:p@h:8883/t", "wss://h:443/t", "http://h:80/t"])
+def test_another_scheme_is_refused_and_not_sent_in_clear(url):
+    with pytest.raises(InputError, match="mqtt://HOST:PORT/TOPIC is expected"):
+        place_of(url)

@@ -11,7 +11,7 @@ from hdev_jax.inference.states import Decoded, StateRows, Switching, errors_alon
 from hdev_jax.physics.states import KNOTS_C
 from hdev_jax.segments import trip_slices
 
-__all__ = ["FIRST_ROUNDS", "Tested", "besides", "level_test"]
+__all__ = ["FIRST_ROUNDS", "LOAD_NUMBERS", "Tested", "besides", "level_test"]
 
 COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
 FIRST_ROUNDS = 3  # of expectation-maximisation
@@ -19,7 +19,8 @@ MOST_ROWS = 30_000  # that the test looks at: time
 LEAST_ROWS = 100
 LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
-LEAST_SPREAD = 2.0  # sd of a load's gain on noise: of half a χ² of its 8 free numbers
+LOAD_NUMBERS = 8  # free numbers of a load: its power, its base, shares at four temperatures, a memory, the errors' size
+LEAST_SPREAD = 0.5 * float(np.sqrt(2.0 * LOAD_NUMBERS))  # sd of a load's gain on noise: of half a χ² of so many
 EARLY = 3  # surrogates, after which one that gains as much ends the test: p is 0.25 at least, and the rest saves time
 
 

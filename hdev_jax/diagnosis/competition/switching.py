@@ -15,7 +15,7 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import Candidate, plan_of
 from hdev_jax.diagnosis.competition.cycle import barred
 from hdev_jax.diagnosis.competition.grid import LEADERS
-from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, Tested, besides, level_test
+from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, LOAD_NUMBERS, Tested, besides, level_test
 from hdev_jax.diagnosis.competition.refit import fitted, joined, without
 from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
 from hdev_jax.diagnosis.gates.gates import RESAMPLES
@@ -124,7 +124,10 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         stability = _stability(rows, model, decoded, k, rng, settings)
         found = Found(c.id, replace(score, gain=gain, left_out_gain=gain), q, stability, (), gain)
         new = replace(new, fit=fit, found=(*new.found, found))
-    return (_without_last(training, new) if len(kept) > 1 else None) or new, None
+    less = _without_last(training, new) if len(kept) > 1 else None
+    if less is not None and len(kept) - 1 == len(held):
+        return no(Kind.OUTSCORED, "an effect that loads look like explains more beside the other load", q)
+    return less or new, None
 
 
 def _without_last(training: Training, state: State) -> State | None:
@@ -140,11 +143,12 @@ def _without_last(training: Training, state: State) -> State | None:
     like = [c for k, c in training.library.items() if k in SwitchingLoad.mistaken_for and not less.fit.vehicle.has(k)]
     scores = score_all(there, less.fit, plan_of(less.fit.vehicle, like, training.facts, training.target))
     leaders = sorted(scores.best.values(), key=scores.worth, reverse=True)[:LEADERS]
-    fit = next((fit for s in leaders if (fit := joined(there, less, s)) is not None), None)
-    if fit is None:
+    able = ((s, fit) for s in leaders if (fit := joined(there, less, s)) is not None)
+    if (found := next(able, None)) is None:
         return None
-    one = _likelihoods(training, decoded_again(training, replace(less, fit=fit)))
-    return None if np.all(_likelihoods(training, state) > one) else less
+    one = _likelihoods(training, decoded_again(training, replace(less, fit=found[1])))
+    more = training.settings.size_cost * (LOAD_NUMBERS - found[0].candidate.freedoms)
+    return None if np.all(_likelihoods(training, state) > one + more) else less
 
 
 def _likelihoods(training: Training, state: State) -> Float[np.ndarray, "2"]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax import __version__
+from hdev_jax import __version__, progress
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.online.followed import Followed
@@ -62,20 +62,26 @@ class Fleet:
                 self._doubtful.update((fleet, r[0]) for r in rows)
                 raise
             for vehicle, sent in new:
-                key = fleet, vehicle
-                if key not in self._pending:
-                    self._pending[key] = []
-                    self._worker.submit(self._used, key)
-                self._pending[key].append(sent)
+                self._waiting((fleet, vehicle)).append(sent)
+            for vehicle in {r[0] for r in rows if (fleet, r[0]) in self._doubtful}:
+                self._waiting((fleet, vehicle))  # perhaps all of them were kept before
             self._names.setdefault(fleet, set()).update(r[0] for r in rows)
             self.behind += len(new)
         return {"accepted": len(new), "repeated": len(rows) - len(new)}
+
+    def _waiting(self, key: Key) -> list[Sent]:
+        """The rows of a vehicle that are to be used; the worker is told of the first."""
+        if key not in self._pending:
+            self._worker.submit(self._used, key)
+        return self._pending.setdefault(key, [])
 
     def _used(self, key: Key) -> None:
         try:
             self._current(key)
         except (InputError, UnavailableError):  # its sheet was taken away, or the database: whoever asks is told
             return  # its rows stay in the journal
+        except Exception as e:  # nobody waits for this
+            progress.step(f"vehicle {key[1]}: its rows could not be used ({type(e).__name__}: {e})")
 
     def _current(self, key: Key) -> Tracked:
         """The vehicle with all its rows so far used. Raises `InputError` where it has no sheet, `UnavailableError`
@@ -88,10 +94,11 @@ class Fleet:
                     self._doubtful.remove(key)
                     self._vehicles.pop(key, None)  # again from the journal, with rows that nobody was told of
             vehicle = self._vehicles.get(key)
+            anew = vehicle is None
             if vehicle is None:
                 vehicle = self._vehicles[key] = self._again(key)
             sents = [s for s in sents if s.seq > vehicle.upto]  # those before it has from the journal
-            if sents:
+            if sents or anew:
                 vehicle.take(sents)
                 self._keep([key])
                 self.version += 1
@@ -99,17 +106,18 @@ class Fleet:
 
     def _again(self, key: Key) -> Tracked:
         """The vehicle as the journal has it."""
-        sheet = self._sheet_for(*key)
-        vehicle, kept = Tracked(Followed(sheet, watch=self._watch)), self.journal.kept(*key)
-        # of another sheet, version or watch: from its first row
+        sheet, kept = self._sheet_for(*key), self.journal.kept(*key)
+        # of another sheet, version or watch, or of a state that had other numbers: from its first row
         if kept is not None and kept.about.get("of") == self._of(sheet):
-            vehicle.again(kept)
-            sents = [*self.journal.since(*key, vehicle.upto, kept.about["waiting"])]
-            vehicle.waiting = [s for s in sents if s.seq <= vehicle.upto]
-            sents = [s for s in sents if s.seq > vehicle.upto]
-        else:
-            sents = [*self.journal.since(*key, 0)]
-        vehicle.take(sents)
+            with contextlib.suppress(KeyError, TypeError, ValueError):
+                vehicle = Tracked(Followed(sheet, watch=self._watch))
+                vehicle.again(kept)
+                sents = [*self.journal.since(*key, vehicle.upto, kept.about["waiting"])]
+                vehicle.waiting = [s for s in sents if s.seq <= vehicle.upto]
+                vehicle.take([s for s in sents if s.seq > vehicle.upto])
+                return vehicle
+        vehicle = Tracked(Followed(sheet, watch=self._watch))
+        vehicle.take([*self.journal.since(*key, 0)])
         return vehicle
 
     def _of(self, sheet: Sheet) -> list[Any]:
@@ -148,7 +156,9 @@ class Fleet:
 
     def known(self, fleet: str, name: str) -> dict[str, Any] | None:
         """What is known of a vehicle now; None where the fleet has none of this name."""
-        if name not in self.names(fleet):
+        with self._entry:
+            there = name in self._names.get(fleet, ())
+        if not there:
             return None
         with self._lock:
             try:

@@ -176,12 +176,15 @@ class Tracked:
             raise RefusedError(["rows"], "no row of this vehicle has been used yet; send its trip first")
         state, trips = self.followed.live.state, self.followed.stream.trips
         vectors, so_far = [], self.followed.stream.so_far
+        at = {c: float(x) for c, x in zip(state.form.columns, np.asarray(state.last), strict=True)}
+        time = at["time_s"] + at["duration_s"]  # of the trip, as the state counts it
         for i, row in enumerate(rows):
             for key in ("duration_s", "speed_start_mps", "speed_end_mps"):
                 value = row.get(key)
                 if value is None or value < 0 or (key == "duration_s" and value == 0):
                     raise RefusedError(["rows", i, key], "a number above 0 is expected: rows to come are intervals")
             known = {k: float(x) for k, x in row.items() if isinstance(x, int | float)}
+            known["time_s"], time = time, time + known["duration_s"]
             so_far, running = so_far.after(known)
             vectors.append(Arrived.of(state.form, trips[-1], len(trips), known | running).vector)
         reserve = battery.pop("reserve", 0.0)

@@ -68,10 +68,15 @@ def follow(
             following.topic = topic = stack.enter_context(subscribed(mqtt, state))
             topic.again = following.began_again
             named, source = topic.place.shown, topic.batches(stop.waiting)
+        whole = True
         try:
             with contextlib.suppress(KeyboardInterrupt):
                 for batch in source:
+                    whole = False
                     following.take(batch)
+                    whole = True
+            if not whole:  # asked twice: rows are half used, and the file stays as it was
+                return None if json else "stopped within a batch of rows; --state holds what was saved before"
             following.end()
             return None if json else following.summary()
         except InputError as e:

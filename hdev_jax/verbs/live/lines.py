@@ -47,7 +47,7 @@ def batches(rows: Records | BinaryIO, *, again: bool, waiting: Waiting = context
             if not text:
                 continue
             if text.startswith("{"):
-                found += rows_of_json(line)
+                found += rows_of_json(text.encode())
             elif header is None:
                 mark = ";" if text.count(";") > text.count(",") else ","
                 header = _cells(text, mark)

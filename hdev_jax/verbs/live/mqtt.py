@@ -54,7 +54,7 @@ def place_of(url: str) -> Place:
     with contextlib.suppress(ValueError):
         parts = urlsplit(f"//{server}")
         port = parts.port or PORTS.get(scheme)
-        if parts.hostname and port and _is_filter(topic):
+        if scheme in PORTS and parts.hostname and port and _is_filter(topic):
             user, password = (None if x is None else unquote(x) for x in (parts.username, parts.password))
             return Place(parts.hostname, port, topic, scheme == "mqtts", user, password or os.environ.get(PASSWORD))
     raise InputError(
@@ -100,9 +100,11 @@ class Topic:
             with contextlib.suppress(queue.Empty):
                 with waiting():
                     came = self._came.get(timeout=IDLE_S)
-                while isinstance(came, _Message) and len(found) < MOST:
+                while isinstance(came, _Message):
                     self._given.append(came)
                     found += rows_of_json(came.payload)
+                    if len(found) >= MOST:  # the next one stays where it is
+                        break
                     came = self._came.get_nowait()
                 turn = came if isinstance(came, str) else None
             yield found
@@ -168,8 +170,8 @@ def subscribed(url: str, state: str | Path | None) -> Iterator[Topic]:
     client.on_message = lambda c, d, m: came.put(_Message(m.payload, m.mid, m.qos))
     try:
         client.connect(place.host, place.port, KEEPALIVE_S)
-    except OSError as e:
-        raise InputError(f"--mqtt {place.shown}: cannot be reached ({e.strerror or e})") from None
+    except (OSError, ValueError) as e:  # also a name that is none of a host
+        raise InputError(f"--mqtt {place.shown}: cannot be reached ({getattr(e, 'strerror', None) or e})") from None
     client.loop_start()
     try:
         try:

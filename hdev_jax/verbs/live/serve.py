@@ -53,6 +53,7 @@ def _bound(host: str, port: int) -> socket.socket:
     try:
         at.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         at.bind((host, port))
+        at.listen()  # two may be bound, one alone listens
     except (OSError, OverflowError) as e:
         at.close()
         raise InputError(
