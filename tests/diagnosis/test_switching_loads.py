@@ -178,6 +178,22 @@ def test_what_is_on_once_at_the_start_of_each_trip_is_no_load_that_switches():
     assert said[1] is None
 
 
+def test_a_warm_up_beside_a_load_is_no_second_load(tmp_path):
+    bare = synthetic_log(
+        seed=525001, trips=12, rows_per_trip=250, mode="segments", entry="road", effects={"cabin_warmup": {}},
+        ratio=1.0, noise="ar1",
+    )  # fmt: skip
+    files = with_loads(bare, [Load(20.9e3, kind="chain", share=0.4, dwell_s=90.0)], seed=525001).write(
+        tmp_path, truth=False
+    )
+    split = split_trips(read_log([files["log"]]))
+    library = FEW | {"cabin_warmup": LIBRARY["cabin_warmup"]}
+    found = diagnosed(prepare(split.log, read_sheet(files["sheet"])), split, library, seed=525001)
+    assert {e["id"] for e in found.summary["effects"]} == {"switching_load", "cabin_warmup"}
+    load = next(e for e in found.summary["effects"] if e["id"] == "switching_load")
+    assert load["parameters"]["power_w"]["value"] == pytest.approx(20.9e3, rel=0.1)
+
+
 def test_a_load_whose_states_drown_in_noise_is_not_named():
     rng, trips, n = np.random.default_rng(0), 10, 1200
     on = np.tile(np.arange(n) % 300 < 120, trips)
