@@ -143,7 +143,7 @@ def test_a_broker_that_goes_away_is_waited_for(broker, send, rows, until, said, 
     until((0, lambda: send("away", *rows[:8])), (8, away), (8 + len(rows), nothing))  # 8 are not saved: they come again
     found = told(f"mqtt://127.0.0.1:{broker.port}/away", state=tmp_path / "s.state")
     assert found == through(rows)
-    assert [line.split(": ")[1] for line in said] == ["gone", "there again"]
+    assert [line.split(": ")[1] for line in said] == ["waiting for rows", "gone", "there again"]
 
 
 @pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals go to the main thread")

@@ -181,6 +181,7 @@ def subscribed(url: str, state: str | Path | None) -> Iterator[Topic]:
         if what:
             raise InputError(f"--mqtt {place.shown}: {what}")
         began = True
+        progress.step(f"{place.shown}: waiting for rows")
         yield Topic(place, client, came)
     finally:
         client.disconnect()
