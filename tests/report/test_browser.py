@@ -3,20 +3,15 @@
 import html
 import json
 import re
-import shutil
 import subprocess
 
 import pytest
+from chromium import CHROMIUM, FLAGS
 
 import hdev_jax
 from hdev_jax.fleet import demo_log
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--allow-file-access-from-files", "--enable-logging=stderr",
-    "--virtual-time-budget=4000",
-]  # fmt: skip
+OF_A_FILE = ["--allow-file-access-from-files", "--enable-logging=stderr", "--virtual-time-budget=4000"]
 # A page that holds the report in a frame of a given width and writes down what it measures there.
 FRAME = """<!doctype html><iframe id="f" src="report.html" style="width:{width}px;height:900px;border:0"></iframe>
 <pre id="found"></pre><script>
@@ -61,7 +56,7 @@ def report(tmp_path_factory):
 def test_nothing_overflows_and_no_error_is_logged(width, dark, report, tmp_path):
     page = report / f"frame_{width}.html"
     page.write_text(FRAME.format(width=width))
-    flags = [*FLAGS, f"--user-data-dir={tmp_path}", f"--window-size={width + 60},1000"]
+    flags = [*FLAGS, *OF_A_FILE, f"--user-data-dir={tmp_path}", f"--window-size={width + 60},1000"]
     flags += ["--blink-settings=preferredColorScheme=0"] if dark else ["--blink-settings=preferredColorScheme=1"]
     done = subprocess.run([CHROMIUM, *flags, "--dump-dom", page.as_uri()], capture_output=True, text=True, timeout=120)
     said = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)

@@ -156,9 +156,7 @@ def _likelihoods(training: Training, state: State) -> Float[np.ndarray, "2"]:
     likely course."""
     assert state.hidden is not None
     at = with_states(training, state)
-    left = _rows(at, at.residual(state.fit))
-    rows = replace(left, residual_w=left.residual_w + _loads_w(at, state))
-    return np.array([decode(state.hidden.model, rows).log_likelihood, at.noise(state.fit).log_likelihood])
+    return np.array([decode(state.hidden.model, _beside(at, state)).log_likelihood, at.noise(state.fit).log_likelihood])
 
 
 def _sought(
@@ -200,9 +198,7 @@ def decoded_again(training: Training, state: State) -> State:
     kept = [k for k, id_ in enumerate(state.hidden.ids) if state.fit.vehicle.has(id_)]
     if not kept:
         return replace(state, hidden=None)
-    at = with_states(training, state)
-    rows = _rows(at, at.residual(state.fit))
-    rows = replace(rows, residual_w=rows.residual_w + _loads_w(at, state))
+    rows = _beside(with_states(training, state), state)
     model, decoded = fit_switching(state.hidden.model.only(kept), rows, FIRST_ROUNDS)
     hidden = Hidden(tuple(state.hidden.ids[k] for k in kept), model, decoded.on)
     state = replace(state, hidden=hidden, found=tuple(_reshaped(f, hidden) for f in state.found))
@@ -243,6 +239,12 @@ def _rows(training: Training, residual: Float[np.ndarray, " row"]) -> StateRows:
     """The training rows with a residual of the target."""
     watts = as_watts(training.target, residual, training.seconds)
     return rows_of(training.rows.segments, watts, samples=TARGETS[training.target].weight != "row")
+
+
+def _beside(training: Training, state: State) -> StateRows:
+    """The training rows, which have the states, with what is left beside all but the decoded loads."""
+    left = _rows(training, training.residual(state.fit))
+    return replace(left, residual_w=left.residual_w + _loads_w(training, state))
 
 
 def _loads_w(training: Training, state: State) -> np.ndarray:

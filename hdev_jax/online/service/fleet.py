@@ -70,7 +70,7 @@ class Fleet:
         return {"accepted": len(new), "repeated": len(rows) - len(new)}
 
     def _waiting(self, key: Key) -> list[Sent]:
-        """The rows of a vehicle that are to be used; the worker is told of the first."""
+        """The rows of a vehicle that are to be used; the first one starts the worker."""
         if key not in self._pending:
             self._worker.submit(self._used, key)
         return self._pending.setdefault(key, [])
@@ -78,7 +78,10 @@ class Fleet:
     def _used(self, key: Key) -> None:
         try:
             self._current(key)
-        except (InputError, UnavailableError):  # its sheet was taken away, or the database: whoever asks is told
+        except (
+            InputError,
+            UnavailableError,
+        ):  # its sheet was taken away, or the database: whoever asks gets the reason
             return  # its rows stay in the journal
         except Exception as e:  # nobody waits for this
             progress.step(f"vehicle {key[1]}: its rows could not be used ({type(e).__name__}: {e})")
@@ -92,7 +95,7 @@ class Fleet:
                 self.behind -= len(sents)
                 if key in self._doubtful:
                     self._doubtful.remove(key)
-                    self._vehicles.pop(key, None)  # again from the journal, with rows that nobody was told of
+                    self._vehicles.pop(key, None)  # again from the journal, with rows whose commit was not confirmed
             vehicle = self._vehicles.get(key)
             anew = vehicle is None
             if vehicle is None:

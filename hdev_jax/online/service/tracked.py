@@ -1,4 +1,4 @@
-"""One vehicle of a service: its rows put in order, used by its estimator, and what is told of it."""
+"""One vehicle of a service: its rows put in order, used by its estimator, and its estimates as JSON has them."""
 
 import itertools
 import math
