@@ -1,4 +1,4 @@
-"""The one exception for whatever the user can put right: `hdev` prints it as one line and exits with status 2."""
+"""The exception for every fault that the user can put right: `hdev` prints it as one line and exits with status 2."""
 
 __all__ = ["InputError", "MissingColumnError"]
 
@@ -13,4 +13,4 @@ class InputError(Exception):
 
 
 class MissingColumnError(InputError):
-    """A column that every log needs is not there, or has another name."""
+    """A column that every log needs is missing, or has another name."""

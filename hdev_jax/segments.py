@@ -19,14 +19,14 @@ anything, and offered as none."""
 
 
 class Segments(eqx.Module):
-    """Columns with one leading axis; ragged trips are concatenated and told apart by `trip`.
+    """The rows of a log as columns `[row]`. Trips of any length stand one after another; `trip` tells them apart.
 
-    The row kernel sees the same class with scalar leaves, so an effect is written for one row. Columns a log may lack
-    (`grade_rad`, `mass_kg`, `motor_torque_nm`, `ambient_temp_c`, …, named as in a log's header, in SI) are in
-    `channels`; whether one is there is structure and known before tracing.
+    Columns that a log may lack (`grade_rad`, `mass_kg`, `motor_torque_nm`, `ambient_temp_c`, …) are in `channels`,
+    named as in a log's header and in SI. Which channels there are is known before tracing. The kernel sees the same
+    class with one number per column, so an effect is written for one row.
 
-    **Arguments:** `trip` and `vehicle` are 0-based ids (rows of a trip are contiguous and in time order), `time_s` is
-    the start of the interval from the start of the trip, `duration_s` > 0, `distance_m` ≥ 0, speeds in m/s.
+    **Arguments:** `trip` and `vehicle` are 0-based ids; rows of a trip are contiguous and in time order. `time_s` is
+    the start of the interval, counted from the start of the trip; `duration_s` > 0, `distance_m` ≥ 0, speeds in m/s.
     """
 
     trip: Ids
@@ -51,11 +51,12 @@ class Segments(eqx.Module):
         vehicle: Any = None,
         **channels: Any,
     ) -> "Segments":
-        """Rows from arrays (or numbers) of one length, in SI.
+        """Rows from arrays of one length, in SI; a number stands for a constant column.
 
-        **Arguments:** `distance_m`, by default the mean of the two speeds times the duration; `time_s`, by default the
-        sum of the durations before each row of its trip; `trip` and `vehicle`, 0-based ids, by default one of each;
-        `channels` as in a log: `grade_rad`, `mass_kg`, … **Raises:** `ValueError` for arrays that do not go together.
+        **Arguments:** `distance_m`: by default the mean of the two speeds times the duration. `time_s`: by default the
+        sum of the durations before the row in its trip. `trip`, `vehicle`: 0-based ids, by default one trip and one
+        vehicle. `channels`: as in a log (`grade_rad`, `mass_kg`, …). **Raises:** `ValueError` for arrays that do not
+        go together.
         """
         ends = [np.atleast_1d(np.asarray(x, dtype=float)) for x in (duration_s, speed_start_mps, speed_end_mps)]
         every = {k: np.atleast_1d(np.asarray(v, dtype=float)) for k, v in channels.items()}

@@ -1,9 +1,10 @@
 """Energy by cause and trip through the kernel, at the estimates and at draws of the coefficients.
 
-**Convention.** `Vehicle.breakdown`: a force counts at the wheel (rolling resistance is m·g·c_rr·v there); the loss of
-driveline and machine is the power after the stage less that before it, of all forces together; a load or a loss behind
-them is what it adds at its place in the chain; the correction of an instrument is the difference that it makes. Losses
-that multiply are so shared out by differences along the chain, and the causes add up to the predicted energy exactly.
+**Convention** (`Vehicle.breakdown`). A force counts at the wheel: rolling resistance is m·g·c_rr·v there. The loss of
+driveline and machine is the power after the stage minus the power before it, for all forces together. A load or a loss
+behind them counts as what it adds at its place in the chain. The correction of an instrument counts as the difference
+that it makes. So losses that multiply are shared out by differences along the chain, and the causes add up to the
+predicted energy exactly.
 """
 
 from collections.abc import Callable

@@ -27,12 +27,16 @@ KINEMATICS = ("time_s", "duration_s", "distance_m", "speed_mps", "speed_start_mp
 class Log:
     """A log in memory, SI, float64 on the host.
 
-    **Fields:** `segments`; `measured`, what is positive out of the battery and kept out of the channels
-    (`battery_power_w`, `energy_wh`); `trip_names[trip[i]]` and `vehicle_names[segments.vehicle[i]]` name row i;
-    `sampled` says that rows are samples, not intervals; `columns` and `files` say where everything came from; `part`,
-    where one trip is split into several: the part that each row is in, in the place of its trip among the names;
-    `started_s`, when trips began, in seconds since 1970 by the log's clock, of those whose clock has a date;
-    `instruments`, noise and steps of what was read.
+    **Fields:**
+
+    - `segments`: the rows, as the kernel takes them.
+    - `measured`: `battery_power_w` or `energy_wh` `[row]`, positive out of the battery; not among the channels.
+    - `trip_names`, `vehicle_names`: `trip_names[trip[i]]` and `vehicle_names[segments.vehicle[i]]` name row i.
+    - `sampled`: rows are samples, not intervals.
+    - `columns`, `files`: where each column came from.
+    - `part`: where a trip was split, the part of each row, as an index of `trip_names`; else None.
+    - `started_s`: start of each trip whose clock has a date, in seconds since 1970.
+    - `instruments`: noise and resolution of the channels that were read.
     """
 
     segments: Segments
@@ -49,10 +53,11 @@ class Log:
 
     @classmethod
     def from_frame(cls, frame: Any, *, name: str = "frame", adapter: Any = None) -> "Log":
-        """A log from a pandas, polars or pyarrow table, or a mapping of names to arrays, by the rules for files.
+        """A log from a table in memory, by the same rules as from a file.
 
-        **Arguments:** `name` stands for the file in messages, and for the trip where there is no `trip_id`; `adapter`,
-        a TOML file where columns have other names. **Raises:** `InputError`, one line that says what to do.
+        **Arguments:** `frame`: a pandas, polars or pyarrow table, or a mapping of names to arrays. `name`: what
+        messages call the table, and the trip's name where there is no `trip_id`. `adapter`: a TOML file, where columns
+        have other names. **Raises:** `InputError`, one line that says what to do.
         """
         from hdev_jax.logs.read import log_from_frame  # that module makes logs
 
@@ -70,7 +75,7 @@ class Log:
 
     @property
     def trip(self) -> np.ndarray:
-        """What each row is called, as an index of `trip_names`: its trip, or the part of it."""
+        """The trip of each row, or its part of a split trip, as an index of `trip_names`."""
         return np.asarray(self.segments.trip if self.part is None else self.part)
 
     @property
@@ -84,7 +89,7 @@ class Log:
 
     @property
     def default_target(self) -> str:
-        """What the log measures nearest the battery. Raises `InputError` where it measures nothing of the kind."""
+        """The measured target nearest the battery. Raises `InputError` where the log measures none."""
         if not self.targets:
             none = f"none of {', '.join(self._accepted())} is measured"
             raise InputError(f"{self._name()}: no target: {none}{self._near()}")

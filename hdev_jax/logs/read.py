@@ -32,10 +32,11 @@ __all__ = ["log_from_frame", "read_log"]
 def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Adapter | None = None) -> Log:
     """Read one log from files and folders (several files are one log).
 
-    **Arguments:** `paths`, in the order in which trips are to come; `adapter`, the path of a TOML file or an `Adapter`
-    where the files have other column names.
+    **Arguments:** `paths`: files and folders; trips keep this order. `adapter`: the path of a TOML file or an
+    `Adapter`, where the files have other column names.
 
-    Raises `InputError`, one line saying which file, row and column and what to do, for whatever contract §1 refuses.
+    **Raises:** `InputError` for a log that section 1 of the contract refuses: one line that says which file, row and
+    column is at fault, and what to do.
     """
     given = [paths] if isinstance(paths, str | Path) else list(paths)
     if not given:

@@ -1,4 +1,4 @@
-"""Many measured vehicles: each by itself, then what only a fleet can tell."""
+"""Many measured vehicles: each is diagnosed by itself, then all are compared and pooled."""
 
 from hdev_jax.many.beside import looking_again
 from hdev_jax.many.result import FleetResult, fleet_result

@@ -1,4 +1,4 @@
-"""A second look at the vehicles of a type, beside the effects that they show together."""
+"""A second scan of the vehicles of a type, with the effects that they show together already in their models."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -15,7 +15,11 @@ LOOSE = 10.0  # times the sd with which a vehicle's own effect was fitted: wide 
 def looking_again(
     tasks: Sequence[Mapping[str, Any]], where: Workers, tell: Callable[[str], None] = lambda _: None
 ) -> Again:
-    """What `effects_of_types` asks for: scans of vehicles beside effects, worked out from their `tasks`, `where`."""
+    """The function that `effects_of_types` takes as `again`: it scans vehicles with more effects in their models.
+
+    **Arguments:** `tasks`: those of `vehicle_record`. `where`: the processes or the cluster. `tell`: takes progress as
+    text.
+    """
     by_name = {t["name"]: t for t in tasks}
 
     def again(records: Sequence[Mapping[str, Any]], shown: Mapping[str, Any]) -> dict[str, Any]:

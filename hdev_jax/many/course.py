@@ -1,7 +1,7 @@
-"""Trip by trip: what each trip says of every coefficient, what it took and in which conditions.
+"""Trip by trip: each trip's information on the coefficients, its energy and its conditions.
 
-With the rows whitened, J the Jacobian of the fitted coefficients and r the residual, a trip tells of them its normal
-equations JᵀJ and Jᵀr. Those of several trips add up; a step of a coefficient at any trip is algebra on them
+A trip's information is its normal equations JᵀJ and Jᵀr, with whitened rows, J the Jacobian of the fitted coefficients
+and r the residual. Those of several trips add up, so a step of a coefficient at any trip is tested from them alone
 (`hdev_jax.many.unlike`).
 """
 

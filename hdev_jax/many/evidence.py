@@ -1,4 +1,4 @@
-"""What the vehicles of a type show together: effects that no single log decides, and how many finds may be false."""
+"""Effects that the vehicles of a type show together though no single log decides, with control of false discoveries."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -33,13 +33,15 @@ def effects_of_types(
 ) -> list[dict[str, Any]]:
     """Every effect in every type with enough vehicles: its pooled size where it is clearest, with its p-value.
 
-    The forms of an effect (shapes on a grid) are one hypothesis: their p-values are combined (`cauchy`). Adjusted over
-    types × effects by Benjamini and Yekutieli, as effects resemble each other. A vehicle whose own diagnosis named the
-    effect counts with the size found there. What one effect leaves others may take for theirs: where a type shows more
-    than one, the clearest goes into its vehicles' models and `again` gives their scans beside it, until no other is
-    left.
+    The forms of an effect (shapes on a grid) are one hypothesis: their p-values are combined (`cauchy`). They are
+    adjusted over types × effects by Benjamini and Yekutieli, as effects resemble each other. A vehicle whose own
+    diagnosis named the effect counts with the size found there.
 
-    **Arguments:** `again(records, effect by vehicle)`: scans by vehicle's name, beside its own effects and these.
+    One missing effect can make others look significant. So where a type shows more than one, the clearest goes into the
+    models of its vehicles, `again` scans them anew, and so on until no other is left.
+
+    **Arguments:** `again(records, effect by vehicle)`: returns scans by vehicle's name, with the vehicle's own effects
+    and these in its model.
 
     **Returns:** `type`, `id`, `size` with its `unit`, `shapes`, `value`, `sd`, `between` (sd over vehicles),
     `vehicles`, `named_in` (by their own diagnoses), `p`, `q`, `found`.
@@ -139,9 +141,9 @@ def heavier(clusters: float) -> float:
 def families(records: Sequence[Record], fdr: float) -> float:
     """The highest adjusted p-value, within a vehicle, of an effect that counts in the fleet.
 
-    Vehicles are families of hypotheses, selected by Benjamini and Hochberg on their best p-value, and each is tested at
-    `fdr` times the share that was selected: so the expected share of false finds, averaged over the vehicles with any,
-    is at most `fdr` (Benjamini and Bogomolov, JRSS B 76, 2014).
+    Each vehicle is a family of hypotheses. Families are selected by Benjamini and Hochberg on their smallest p-value,
+    and each is tested at `fdr` times the share of families selected. So the expected share of false discoveries,
+    averaged over the selected vehicles, is at most `fdr` (Benjamini and Bogomolov, JRSS B 76, 2014).
     """
     best = [min((e["q_value"] for e in r["effects"]), default=1.0) for r in records if r["status"] == "done"]
     if not best:

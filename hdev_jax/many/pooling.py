@@ -1,8 +1,8 @@
-"""Partial pooling in closed form: estimates that vary about a common mean, by more than their errors.
+"""Partial pooling in closed form: estimates that vary about a common mean by more than their errors.
 
 x_v ~ N(θ_v, s_v²), θ_v ~ N(μ, τ²). τ² is Paule and Mandel's (J. Res. NBS 87, 1982): Σ w_v (x_v − μ)² = n − 1 with
-w_v = 1/(s_v² + τ²). The mean's error is Hartung and Knapp's (Statistics in Medicine 20, 2001), known to n − 1 degrees
-of freedom, no smaller than the one by the weights.
+w_v = 1/(s_v² + τ²). The standard error of the mean is Hartung and Knapp's (Statistics in Medicine 20, 2001), with n − 1
+degrees of freedom, but not below the one by the weights.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ MANY = 200  # estimates above which the spread over all stands for that without 
 
 @dataclass(frozen=True)
 class Pooled:
-    """`mean` with its standard `error` known to `freedom` degrees, `between` the standard deviation τ, of `n`."""
+    """A common `mean` of `n` estimates, its standard `error`, and the standard deviation τ `between` them."""
 
     mean: float
     error: float
@@ -65,7 +65,7 @@ def pooled(value: Float[np.ndarray, " n"], sd: Float[np.ndarray, " n"]) -> Poole
 def shrunk(
     value: Float[np.ndarray, " n"], sd: Float[np.ndarray, " n"], pool: Pooled
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Each estimate drawn towards the common mean, and its sd with that of the mean (empirical Bayes)."""
+    """Each estimate shrunk towards the common mean, and its sd, which includes that of the mean (empirical Bayes)."""
     share = pool.between**2 / (pool.between**2 + sd**2)  # of the vehicle's own
     return share * value + (1 - share) * pool.mean, np.sqrt(share * sd**2 + ((1 - share) * pool.error) ** 2)
 
@@ -73,8 +73,9 @@ def shrunk(
 def without_each(
     value: Float[np.ndarray, " n"], sd: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """How each differs from what the others predict of it: the difference, its sd, and the two-sided p-value by
-    Student's t of n − 2 degrees of freedom."""
+    """Each estimate against the prediction from all others: difference, its sd, and the two-sided p-value.
+
+    The p-value is by Student's t with n − 2 degrees of freedom."""
     n = len(value)
     away, error = np.empty(n), np.empty(n)
     if n > MANY:  # one of so many hardly moves the spread: that of all, and the mean of the others in closed form

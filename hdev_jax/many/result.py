@@ -1,4 +1,4 @@
-"""The result of a fleet: its vehicles' records, and what they tell together."""
+"""The result of a fleet: the records of its vehicles, and what they show together."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ _SHOWN = ("name", "type", "sheet", "status", "message", "target", "unit", "rows"
 
 @dataclass(frozen=True)
 class FleetResult:
-    """`summary`, what fleet.json holds; `tables` by name; `records`, everything of each vehicle."""
+    """The result of a fleet. `summary`: what fleet.json holds; `tables`: by name; `records`: all of each vehicle."""
 
     summary: dict[str, Any]
     tables: dict[str, pd.DataFrame]
@@ -32,11 +32,14 @@ def fleet_result(
     records: Sequence[Mapping[str, Any]], *, fdr: float, seed: int, price: float | None = None,
     notes: Sequence[str] = (), again: Again | None = None,
 ) -> FleetResult:  # fmt: skip
-    """What `records` (`vehicle_record` of each vehicle) tell: alone, and together; `again` as `effects_of_types`.
+    """The result of a fleet from the records of its vehicles, in the order of the vehicles' names.
 
-    **Returns:** a `FleetResult` whose summary has `vehicles` (one record each), `counts` by status, `effects` by type,
-    `coefficients` pooled by type, `unlike` (vehicles that differ from their like, or changed, by cost), `ledger` of the
-    whole fleet. In an order of its own: that of the vehicles' names, whatever order they ended in.
+    **Arguments:** `records`: a `vehicle_record` of each vehicle. `fdr`: the highest adjusted p-value. `price`: of a
+    kWh. `notes`: what was left out. `again`: as in `effects_of_types`.
+
+    **Returns:** a `FleetResult`. Its summary has `vehicles` (a short record of each), `counts` by status, `effects` by
+    type, `coefficients` pooled by type, `unlike` (vehicles that differ from the others of their type, or changed, by
+    cost) and the `ledger` of the whole fleet.
     """
     settings = replace(FLEET_SETTINGS, fdr=fdr)
     each = [dict(r) for r in sorted(records, key=lambda r: r["name"])]

@@ -1,8 +1,8 @@
-"""What a vehicle's log says of every effect that its model lacks, too little to name it alone: a size and its error.
+"""The size and standard error of every effect that a vehicle's model lacks, to be pooled over vehicles.
 
-The first-order estimate of each candidate with one size beside the fitted model, by generalised least squares, and its
-standard error from trips left out in turn (`hdev_jax.diagnosis.scores`). Effects that the vehicle's own diagnosis named
-are in the model, with their fitted sizes. Those of several sizes at once are not added up over vehicles.
+Each candidate with one size is estimated to first order, in addition to the fitted model, by generalised least squares;
+its standard error is a jackknife over trips (`hdev_jax.diagnosis.scores`). Effects that the vehicle's own diagnosis
+named are in the model, with their fitted sizes. Candidates with several sizes are not pooled.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ def key_of(candidate: Candidate) -> str:
 
 
 def scan_of(outcome: Outcome, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
-    """Size and standard error of each candidate, from its null, by its key (`key_of`), beside the effects found.
+    """Size (from its null) and standard error of each candidate, by its key (`key_of`), with the found effects in.
 
     **Returns:** of each `id`, `kind` ("size", or "limit": a switch, whose size is a share of its full difference),
     `value`, `sd`, `clusters` (how many trips, or blocks, it rests on). Empty where the model has loads with a state.
@@ -52,7 +52,7 @@ def scan_of(outcome: Outcome, split: Split, settings: Settings) -> dict[str, dic
 
 
 def scan_beside(problem: Problem, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
-    """The same beside the effects of the problem's sheet, which is calibrated with them."""
+    """As `scan_of`, for a sheet that has the effects in it; it is calibrated with them."""
     return _scanned(problem, split, settings, problem.vehicle, problem.table)
 
 

@@ -19,8 +19,8 @@ _TABLE = ("vehicle", "sheet")
 class Source:
     """One vehicle: the files of its log in the order of their names, its sheet, and the type that a table gives it.
 
-    `missing`: why it cannot be analysed, where it has no sheet or no log; `whole` says that the files are parts of one
-    table, so that a trip may begin in one and end in the next.
+    `missing`: why the vehicle cannot be analysed, where it has no sheet or no log. `whole`: the files are parts of one
+    table, so that a trip may begin in one file and end in the next.
     """
 
     name: str
@@ -34,12 +34,12 @@ class Source:
 def sources(logs: Sequence[str | Path] | str | Path, vehicles: str | Path) -> tuple[list[Source], list[str]]:
     """The vehicles of a fleet, by name, and notes on what was left out.
 
-    **Arguments:** `logs`, files (the log of the vehicle that is called as the file without its ending) and folders; in
-    a folder a file is a vehicle, and so is a folder of files: `A/` or, as in a partitioned Parquet data set,
-    `vehicle_id=A/`. `vehicles`: one sheet for all, a folder of sheets `A.toml`, or a CSV table with the columns
-    `vehicle` and `sheet` (a path beside the table) and, if the sheets' names do not tell, `type`.
+    **Arguments:** `logs`: files and folders. A file is one vehicle, named as the file without its ending. In a folder,
+    each file is a vehicle, and so is each folder of files: `A/` or, as in a partitioned Parquet data set,
+    `vehicle_id=A/`. `vehicles`: one sheet for all; a folder of sheets `A.toml`; or a CSV table with the columns
+    `vehicle`, `sheet` (a path relative to the table) and, where the sheets' names do not give the type, `type`.
 
-    **Raises:** `InputError` where nothing is there, or a vehicle's name is there twice.
+    **Raises:** `InputError` where there is no log or no sheet, or where two vehicles have the same name.
     """
     found: dict[str, tuple[tuple[str, ...], bool]] = {}
     notes: list[str] = []

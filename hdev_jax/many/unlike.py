@@ -1,4 +1,4 @@
-"""Which vehicles differ from their like, by what, since when, and what that costs."""
+"""Vehicles that differ from the others of their type: in which coefficient, since when, and at what cost."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ CLOSE = 1.92  # log-likelihood of the best split less that of another which is a
 
 
 def pooled_coefficients(records: Sequence[Record], settings: FleetSettings) -> list[dict[str, Any]]:
-    """Each declared coefficient by type: `mean`, `sd`, `between` vehicles, and each vehicle's own drawn towards it.
+    """Each declared coefficient by type: `mean`, `sd`, `between` vehicles, and each vehicle's estimate, shrunk to it.
 
-    Estimates are taken without the sheet's table for that coefficient, so that the table is not counted once a vehicle.
+    Estimates are taken without the sheet's prior for that coefficient; else the prior would count once per vehicle.
     """
     out = []
     for kind, each in by_type(records).items():
@@ -79,13 +79,13 @@ def levels(records: Sequence[Record], settings: FleetSettings) -> list[dict[str,
 
 
 def changes(records: Sequence[Record], settings: FleetSettings, seed: int) -> list[dict[str, Any]]:
-    """Each vehicle's coefficients, trip by trip, against one step: as `levels`, with the trip and the date (`since`, in
-    seconds since 1970, None without a date) and the range of trips where a step fits as well.
+    """Steps in time of each vehicle's coefficients: as `levels`, with the trip and the date of the step.
 
-    What all vehicles of a type do alike in a week (a season) is taken off first, where there are enough of them; those
-    that changed are no part of that, which takes a second look at all. Where
-    several coefficients of a vehicle changed, the one that explains most is kept, as it shows in the others too: `q`
-    is of the vehicle.
+    The date is `since`, in seconds since 1970, None without a date; a range of trips says where a step fits as well.
+
+    What all vehicles of a type do alike in a week (a season) is removed first, where there are enough of them. Vehicles
+    that changed are then left out of that common course, and all are tested again. Where several coefficients of a
+    vehicle changed, only the one that explains most is kept, as it shows in the others too; `q` is of the vehicle.
     """
     first = {e["vehicle"] for e in _changes(records, settings, seed, frozenset()) if e["found"]}
     return _changes(records, settings, seed, frozenset(first))

@@ -1,4 +1,4 @@
-"""One vehicle of a fleet: read, calibrated, diagnosed, its energy shared out, as plain values."""
+"""One vehicle of a fleet: read, calibrated and diagnosed, with its energy by cause, as plain values."""
 
 import math
 import time
@@ -31,15 +31,15 @@ LEAST_KNOWN = 1e-3  # of a table's precision: with less, the log says nothing of
 
 
 def vehicle_record(task: Mapping[str, Any]) -> dict[str, Any]:
-    """What one vehicle's log tells, as JSON has it. Nothing is raised: a bad log is a result, with its message.
+    """The diagnosis of one vehicle's log, as plain values for JSON. It raises nothing: a bad log gives a message.
 
     **Arguments:** `task`, plain values: `name`, `files`, `whole`, `sheet`, `kind` and `missing` of its `Source`;
     `adapter`, `target`, `fdr`, `seed`, `trust`.
 
-    **Returns:** `name`, `type`, `status` ("done"; "suspect": a unit or a sign is in doubt, no effect was searched;
-    "refused": the input is at fault; "failed": ours), `message`, `seconds`; of one that is done `before` and `after`
-    (errors on held-out trips), `effects`, `coefficients`, `scan` (`hdev_jax.many.scan`), `course`
-    (`hdev_jax.many.course`), `ledger`.
+    **Returns:** `name`, `type`, `status`, `message`, `seconds`. The status is "done", "suspect" (a unit or a sign is in
+    doubt, and no effect was searched), "refused" (the input is at fault) or "failed" (a fault of this program). A
+    vehicle that is done also has `before` and `after` (errors on held-out trips), `effects`, `coefficients`, `scan`
+    (`hdev_jax.many.scan`), `course` (`hdev_jax.many.course`) and `ledger`.
     """
     started = time.perf_counter()
     head = {"name": task["name"], "type": task["kind"] or "", "sheet": task["sheet"], "message": ""}
@@ -74,10 +74,10 @@ def _log(task: Mapping[str, Any]) -> Log:
 
 
 def scanned_again(task: Mapping[str, Any]) -> dict[str, Any]:
-    """The scan of a vehicle beside its own effects and those that its type shows.
+    """The scan of a vehicle with its own effects and those of its type in its model.
 
     **Arguments:** `task` as for `vehicle_record`, with `beside`: values and sds (0: known) by effect and parameter.
-    **Returns:** `name`, `scan`, and `message`: why it is empty, where the vehicle cannot be fitted so.
+    **Returns:** `name`, `scan` and `message`: why the scan is empty, where the vehicle cannot be fitted with them.
     """
     try:
         return plain({"name": task["name"], "scan": _beside(task), "message": ""})
@@ -181,7 +181,7 @@ def _lines(frame: pd.DataFrame, columns: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def plain(x: Any) -> Any:
-    """Nested values as JSON has them: numbers that are none become None."""
+    """Nested values as JSON has them: NaN and infinity become None."""
     if isinstance(x, Mapping):
         return {str(k): plain(v) for k, v in x.items()}
     if isinstance(x, np.ndarray):

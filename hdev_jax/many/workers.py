@@ -1,6 +1,7 @@
-"""Where vehicles are worked out: in this process, in worker processes, or on a Dask cluster whose workers come and go.
+"""Vehicles are analysed in this process, in worker processes, or on a Dask cluster whose workers come and go.
 
-Each way yields `(index, record)` in the order in which vehicles end. What a lost worker had in hand another one does.
+Each way yields `(index, record)` in the order in which vehicles are finished. The work of a lost worker is done by
+another.
 """
 
 import contextlib
@@ -33,9 +34,11 @@ class Workers:
 
 
 def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> Iterator[tuple[int, dict[str, Any]]]:
-    """`work(task)` of each task, with its index, as they end.
+    """Yields the index of each task and `work(task)`, in the order in which they are finished.
 
-    **Arguments:** `work`, a function that a module of this package defines, of plain values to plain values.
+    **Arguments:** `work`: a function in a module of this package, from plain values to plain values. `where`: the
+    processes or the cluster.
+
     **Raises:** `InputError` where Dask is needed and not installed, or no scheduler answers.
     """
     if not tasks:

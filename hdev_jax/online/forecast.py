@@ -1,4 +1,4 @@
-"""The rest of the way: its energy from rows that are expected, with an interval that narrows as the trip goes on."""
+"""Energy of the rest of the trip, from expected rows, with an interval that narrows as the trip goes on."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,10 +23,11 @@ SHORTEST = 64  # rows
 
 @dataclass(frozen=True)
 class Forecast:
-    """Energy of rows that are still to come [Wh], as a Student t of `freedom` degrees about `energy_wh`.
+    """Energy of the rows to come [Wh]: a Student t about `energy_wh` with `scale` and `freedom` degrees of freedom.
 
-    `parts` are the standard deviations that its `scale` is made of: what the coefficients, the trip's own level among
-    them, leave open, and the noise of the rows. `capacity_wh` and `soc` of the battery, where they are known.
+    `level`: probability inside its intervals. `parts`: the standard deviations [Wh] that add up in quadrature to
+    `scale`: of the coefficients with the trip's level, and of the noise of rows. `soc`, `capacity_wh`: of the battery,
+    where they are known.
     """
 
     energy_wh: float
@@ -45,7 +46,7 @@ class Forecast:
 
     @property
     def soc_at_end(self) -> tuple[float, float, float] | None:
-        """State of charge at the end, with its interval; below 0 where the battery does not hold enough."""
+        """State of charge at the end with its interval, None if unknown. Below 0 the battery does not hold enough."""
         if self.soc is None or self.capacity_wh is None:
             return None
         low, high = self.interval_wh
@@ -53,7 +54,7 @@ class Forecast:
         return soc - self.energy_wh / whole, soc - high / whole, soc - low / whole
 
     def chance_of_arriving(self, reserve: float = 0.0) -> float | None:
-        """Probability that the state of charge at the end is above `reserve`; None where it is not known."""
+        """Probability that the state of charge at the end is above `reserve` (0…1); None if it is unknown."""
         if self.soc is None or self.capacity_wh is None:
             return None
         left = (self.soc - reserve) * self.capacity_wh
@@ -68,16 +69,16 @@ def forecast(
     capacity_wh: float | None = None,
     soc: float | None = None,
 ) -> Forecast:
-    """Energy of the rows that are expected, with the uncertainty of the coefficients, of the trip's own level and of
-    rows whose errors are correlated.
+    """Energy of expected rows. The interval covers the coefficients, the trip's level and correlated errors of rows.
 
-    **Arguments:** `rows` `[row, column]` as `Form.columns` names them, with the expected speeds, slopes, weather; a
-    channel that is NaN keeps its last value, `measured` is not read. `same_trip`: they go on where the vehicle is, else
-    they are a trip of their own. `capacity_wh` of the battery, and `soc` now (by default the last that was logged).
+    The expected speeds and weather count as certain: the interval does not cover a speed or a wind that turns out
+    otherwise.
+
+    **Arguments:** `rows` `[row, column]`, in the order of `Form.columns`, with the expected speeds, slopes and weather;
+    a channel that is NaN keeps its last value, and `measured` is not read. `same_trip`: the rows continue the present
+    trip; else they are a new trip. `capacity_wh`: of the battery. `soc`: now, 0…1; by default the last that was logged.
 
     **Raises:** `ValueError` for rows without a duration or speeds.
-
-    What is expected is taken as certain: a speed or a wind that comes out otherwise is not in the interval.
     """
     form = state.form
     rows = np.array(rows, dtype=float)

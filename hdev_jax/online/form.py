@@ -27,14 +27,18 @@ LEVELS: dict[str, tuple[str, ...]] = {
 class Form:
     """The structure of a state. Hashable: states of one form share a compiled program, and can be stacked.
 
-    **Fields:** `columns` of a row in order (`NEEDED`, then the channels); `structure` says where each coefficient sits
-    (`ParameterTable.structure`), `names` and `units` what it is called; `by_trip`, places of coefficients that each
-    trip has anew; `levels`, what neighbouring rows of a trip have in common besides (a load, a force); `members`, the
-    models of the noise that are weighed against each other: correlation from row to row, and how long levels last [s];
-    `robust`, whether outliers count less; `drifts`, whether any
-    coefficient wanders; `known_noise`, whether the noise of a row is declared and not estimated; `level`, probability
-    inside the intervals; `candidates`, the effect that each watched candidate is a form of, and `alpha`, how likely any
-    of them may ever be named where there is none.
+    **Fields:**
+
+    - `columns`: of a row, in order: `NEEDED`, then the channels.
+    - `structure`, `names`, `units`: where each coefficient sits (`ParameterTable.structure`), its name and its unit.
+    - `by_trip`: indices of the coefficients that are estimated anew in each trip.
+    - `levels`: errors that neighbouring rows of a trip share (a load, a force).
+    - `members`: the models of the noise that are weighed against each other, each a correlation from row to row and
+      the time for which levels last [s].
+    - `robust`: outliers count less. `drifts`: some coefficient drifts. `known_noise`: the noise of a row is declared.
+    - `level`: probability inside the intervals.
+    - `candidates`: the effect that each watched candidate is a form of. `alpha`: the probability that any effect is
+      ever named although none is missing.
     """
 
     columns: tuple[str, ...]
@@ -76,7 +80,7 @@ class Form:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Columns of a row that it may do without."""
+        """Columns that a row may lack."""
         return self.columns[len(NEEDED) :]
 
     @property
@@ -96,12 +100,12 @@ class Form:
 
     @property
     def anew(self) -> tuple[int, ...]:
-        """Places of those that each trip has anew."""
+        """Indices of what is estimated anew in each trip."""
         return (*self.by_trip, *range(len(self.names), self.size))
 
     @property
     def counts(self) -> tuple[str, ...]:
-        """What is counted: rows by what became of them, and by channel how often its last value stood in."""
+        """What is counted: how each row was used, and how often a channel's last value stood in for a missing one."""
         return (*COUNTS, *(f"held {c}" for c in ("distance_m", *self.channels)))
 
     @property
@@ -111,9 +115,9 @@ class Form:
 
 
 def packed(form: Form, row: Mapping[str, float]) -> np.ndarray:
-    """A row by name as the vector that `update` takes; NaN where it has none.
+    """The vector `[column]` that `update` takes, from a row as a mapping of names to numbers; NaN where one is missing.
 
-    Raises `InputError` for a name that the form does not have.
+    **Raises:** `InputError` for a name that the form does not have.
     """
     if unknown := sorted(set(row) - set(form.columns)):
         raise InputError(f"row: unknown column '{unknown[0]}'; accepted: {', '.join(form.columns)}")

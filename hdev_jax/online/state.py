@@ -1,8 +1,7 @@
 """The state of one vehicle that is followed row by row: what is known of its coefficients and of its noise.
 
-What the rows tell is kept as sums of their squares and products (information form), for each of a few models of the
-noise. Tables, noise and correlation may be judged anew after every row: nothing that the first rows were
-thought to be worth stays in it.
+The rows are kept as sums of their squares and products (information form), once for each of a few models of the noise.
+The sums hold no estimate of the noise, so noise and correlation can be estimated anew after every row.
 """
 
 from collections.abc import Iterable, Mapping
@@ -67,21 +66,28 @@ class Sums(eqx.Module):
 
 
 class State(eqx.Module):
-    """What is known after the rows so far. A leading axis where it is of several vehicles (`stacked`).
+    """What is known after the rows so far. Several vehicles (`stacked`) add a leading axis to every array.
 
-    **Fields:** `vehicle` at its tabular values; `gears`, the trees that tell its gear where rows have none. `centre`
-    those values of the free coefficients and `scale` their sds:
-    estimates are steps from the centre in units of the scale, followed by the levels of the trip (kW and 100 N, or the
-    target's unit). `drift`: sd [scale] by which each wanders in an hour. `noise`: of a row where it is declared.
-    For each member, a model of the noise: `sums` over rows; `mean` and `covariance` of the posterior, `variance` of a
-    whitened row, `wide`, that of a row as it counts in a total, `score`, mean square of a weighed error over its scale;
-    `evidence`, the logarithm of its likelihood. `growth`, moments of squared errors and the target's size, and `worth`,
-    of all rows in those of the usual noise. `before` and `candidate`, the last row used, [x | r] and c, and `since`,
-    how many rows ago it was; `last`, the last good value of each column. `counts` as in `Form.counts`;
-    `totals`: of rows, the target's squares, squares of the levels' columns; `level_squares` of finished trips;
-    `driven_s`, how long all rows were. Of effects that are watched: `cost_wh`, what one unit of each candidate came to;
-    `lowest`, the least log e-value that it had, and `lowest_at` which row; `alarm_at`, the row at which each effect was
-    first certain (0: not yet).
+    Estimates are steps from the tabular values, in units of their standard deviations. The levels of the trip follow
+    them (in kW and 100 N, or in the target's unit).
+
+    **Fields of the vehicle:** `vehicle`: at its tabular values. `gears`: the trees that tell the gear where rows lack
+    it. `centre`, `scale` `[k]`: tabular value and sd of each free coefficient. `drift`: sd [scale] of each estimate's
+    drift in an hour. `noise`: of a row, where it is declared.
+
+    **For each member, a model of the noise:** `sums` over rows; `mean` and `covariance` of the posterior; `variance`
+    of a whitened row; `wide`: the variance per row of a total; `score`: mean square of a weighted error over its
+    scale; `evidence`: log-likelihood.
+
+    **Of the noise in common:** `growth`: moments of squared errors and of the target's size. `worth`: the number of
+    rows with the usual noise that carry as much information as all rows so far.
+
+    **Of the rows:** `before`, `candidate`: the last row that was used, [x | r] and c. `since`: how many rows ago that
+    was. `last`: the last valid value of each column. `counts`: as `Form.counts`. `totals`: number of rows, squares of
+    the target, squares of the levels' columns. `level_squares`: of finished trips. `driven_s`: duration of all rows.
+
+    **Of the watched effects:** `cost_wh`: energy of one unit of each candidate so far. `lowest`: its smallest log
+    e-value, at row `lowest_at`. `alarm_at`: the row at which each effect was first certain (0: not yet).
     """
 
     form: Form = eqx.field(static=True)
@@ -151,19 +157,24 @@ class State(eqx.Module):
         return self.weights @ jnp.asarray(self.form.memories)
 
     def counted(self) -> dict[str, int]:
-        """What became of the rows, by `Form.counts`; what never happened is left out."""
+        """How the rows were used, by the names of `Form.counts`; zeros are left out."""
         found = zip(self.form.counts, np.asarray(self.counts), strict=True)
         return {name: int(n) for name, n in found if n}
 
 
 class Now(eqx.Module):
-    """What is known now: of the row that came, from the rows before it, and after it.
+    """What is known at one row: its prediction from the rows before, and the estimates after it.
 
-    **Fields:** `predicted` in the target's unit with its interval, from the rows before; `model`, the same without
-    what the error of the row before tells; `energy_wh` of the row where the target is the battery's, else its work;
-    `values` and `sd` of the coefficients after the row; `sigma`, `memory`, as of the state; `weight` of the row (1: in
-    full, 0: not used); `alarm`, not 0 once an effect is certain that the sheet lacks. Of a row that cannot be used NaN,
-    and of the first one no interval.
+    **Fields:**
+
+    - `predicted`, `lower`, `upper`: prediction from the rows before, with its interval, in the target's unit.
+    - `model`: the prediction without the correction by the error of the row before.
+    - `energy_wh`: energy of the row where the target is at the battery, else its mechanical work.
+    - `values`, `sd` `[k]`: the coefficients after the row, in their units.
+    - `sigma`, `memory`: as in `State`. `weight`: of the row in the fit, from 0 (not used) to 1.
+    - `alarm`: not 0 once it is certain that the sheet lacks an effect.
+
+    For a row that cannot be used the numbers are NaN. The first row has no interval.
     """
 
     predicted: Float[Array, "*row"]
@@ -179,12 +190,12 @@ class Now(eqx.Module):
     alarm: Float[Array, "*row"]
 
     def row(self, i: int) -> "Now":
-        """Of rows, the i-th."""
+        """The i-th row."""
         return jax.tree.map(lambda x: x[i], self)
 
 
 def sample_row(channels: Iterable[str]) -> Segments:
-    """One plausible row with these channels, which says what a log of them can be asked."""
+    """One plausible row with these channels; it shows which targets and effects such rows allow."""
     return Segments.from_arrays(
         duration_s=1.0, speed_start_mps=10.0, speed_end_mps=10.0, **{c: SAMPLE.get(c, 0.0) for c in channels}
     )
@@ -207,19 +218,25 @@ def start(
     alpha: float = 0.01,
     gears: Surrogate | None = None,
 ) -> tuple[State, list[str]]:
-    """The state before the first row, from the sheet's tabular priors; and notes on what of the sheet is not used.
+    """The state before the first row, from the sheet's tabular priors.
 
-    **Arguments:** `channels` that rows will have (`grade_rad`, `mass_kg`, …); `target`, what is measured. `by_trip`:
-    paths of coefficients that each trip has anew. `drift`: by path, how far a coefficient wanders in an hour of driving
-    (sd, in its unit; nothing by default). `levels`: whether neighbouring rows of a trip err together, by a load and
-    a force at the battery, whose sizes are learned from trip to trip. `memories`, `lasting_s`: correlations of a row's
-    error with the one before, and times for which levels last, that are weighed by their likelihood. `robust`: errors
-    are Student t of 4 degrees of freedom. `noise` of a row, where it is known [target's unit]. `level`,
-    probability inside intervals. `candidates`, the effect of each candidate that is watched (`Watch`), and `alpha`, the
-    probability that any of them is ever named where there is none. `gears`: what tells the gear where the sheet's
-    efficiency is a map over several and rows have none (default: the trees of the sheet's `driveline.gear_model`).
+    **Arguments:**
 
-    **Raises:** `InputError` where the sheet lacks what is in use, or nothing in it is to be estimated.
+    - `channels`: those that rows will have (`grade_rad`, `mass_kg`, …). `target`: what is measured.
+    - `by_trip`: paths of the coefficients that are estimated anew in each trip.
+    - `drift`: by path, the sd of a coefficient's drift in an hour of driving, in its unit; by default none.
+    - `levels`: neighbouring rows of a trip share errors, by a load and a force whose sizes are learned from the trips.
+    - `memories`: correlations of a row's error with that of the row before. `lasting_s`: times for which levels last.
+      All are tried, and weighed by their likelihood.
+    - `robust`: errors follow a Student t with 4 degrees of freedom, else a normal distribution.
+    - `noise`: of a row [target's unit], where it is known. `level`: probability inside intervals.
+    - `candidates`: the effect of each watched candidate (`Watch.candidates`). `alpha`: the probability that any effect
+      is ever named although none is missing.
+    - `gears`: a classifier of the gear, needed where the efficiency is a map over several gears and rows have no gear;
+      by default the trees of the sheet's `driveline.gear_model`.
+
+    **Returns:** the state, and notes on parts of the sheet that are not used. **Raises:** `InputError` where the sheet
+    lacks something that is needed, or has nothing to estimate.
     """
     sample = sample_row(channels).without(*TARGETS[target].follows)
     built = build(sheet, sample, choose_entry(sample, target, sheet), target)
@@ -274,7 +291,7 @@ def start(
 
 
 def stacked(states: Iterable[State]) -> State:
-    """States of several vehicles as one, for `jax.vmap(update)`. Raises `ValueError` where their forms differ."""
+    """The states of several vehicles as one, for `jax.vmap(update)`. Raises `ValueError` where their forms differ."""
     every = list(states)
     if any(s.form != every[0].form for s in every):
         raise ValueError("states of one form are expected: the same columns, target and coefficients")

@@ -133,12 +133,14 @@ def _next(state: State, at: dict[str, int]) -> Array:
 
 
 def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " candidate"] = ()) -> tuple[State, Now]:
-    """The state after one row, and what is known now. What cannot be used is counted, and never NaN in the state.
+    """The state after one row, and what is known at it. A row that cannot be used is counted; the state stays finite.
 
-    **Arguments:** `row`, `[column]` as `Form.columns` names them (`packed`); `measured` is the target, `trip` a number
-    that changes from trip to trip. NaN: missing. A missing channel keeps its last value; a row without the target is
-    predicted alone. A gap longer than ten rows, or a clock that goes back, ends the correlation of errors.
-    `candidates`, where effects are watched: what each would add to the row (`Watch.columns`).
+    **Arguments:** `row`: `[column]`, in the order of `Form.columns` (`packed` makes it). In it `measured` is the target
+    and `trip` a number that changes from trip to trip. NaN means missing: a missing channel keeps its last value, and
+    a row without the target is only predicted. `candidates`: where effects are watched, what each would add to the row
+    (`Watch.columns`).
+
+    After a gap longer than ten rows, or where the clock goes back, errors count as uncorrelated with those before.
     """
     form = state.form
     row, c = (jnp.asarray(v, dtype=state.sums.gram.dtype) for v in (row, candidates))
@@ -263,9 +265,10 @@ def _counted(held: Any, good: Any, heard: Any, fault: Any, gap: Any, jumps: Any,
 
 @eqx.filter_jit
 def scan(state: State, rows: Float[Any, "row column"], candidates: Any = None) -> tuple[State, Now]:
-    """`update` over rows, one after the other: the state after them, and what was known at each `[row]`.
+    """`update` over rows, one after the other.
 
-    **Arguments:** `candidates` `[row, candidate]`, where effects are watched.
+    **Arguments:** `rows` `[row, column]`; `candidates` `[row, candidate]`, where effects are watched. **Returns:** the
+    state after the last row, and what was known at each row, `Now` with a leading axis `[row]`.
     """
     rows = jnp.asarray(rows)
     each = jnp.zeros((len(rows), 0)) if candidates is None else jnp.asarray(candidates)

@@ -1,18 +1,18 @@
-"""Is the declared model still right? For every effect of the library a test that may be looked at after every row.
+"""Is the declared model still right? A test of every effect of the library that one may read after every row.
 
-Of each candidate, a form of an effect with its column c (what one typical size of it adds to a row), the Bayes factor
+A candidate is one form of an effect; its column c is what one typical size of it adds to a row. The Bayes factor
 
     E = (1 + I)^−½ · exp(½·S²/(1 + I)),   S = c⊥ᵀe/σ²,   I = c⊥ᵀc⊥/σ²
 
-compares its size β ~ N(0, 1) with β = 0; e and c⊥ are whitened, the declared coefficients and the trip's levels
-projected out. While the effect is not there E is a martingale about 1, whose chance of ever being above 1/a is at most
-a (Ville 1939; normal mixture: Robbins, Ann. Math. Statist. 41, 1970; Ramdas et al., Statistical Science 38, 2023): one
-may look after every row and stop at will. Models of the noise, and the forms of an effect, are averaged, which E
-allows; an alarm is E above the number of effects over alpha, so that the chance that any of them is ever wrong is at
-most alpha.
+compares a size β ~ N(0, 1) with β = 0. Here e and c⊥ are whitened, and the declared coefficients and the trip's levels
+are projected out of them. While the effect is absent, E is a martingale with mean 1, so the probability that it ever
+exceeds 1/a is at most a (Ville 1939; normal mixture: Robbins, Ann. Math. Statist. 41, 1970; Ramdas et al., Statistical
+Science 38, 2023). So one may look after every row and stop at any time. The mean of E over models of the noise and over
+the forms of an effect has the same property. An alarm is an E above (number of effects)/alpha: the probability of any
+false alarm, ever, is at most alpha.
 
-**What is approximate:** σ and the correlation of errors are the estimates of the model without the effect, so alarms
-wait for `WATCH_ROWS` rows. A noise whose size differs from trip to trip by a factor of two is louder than E believes.
+**What is approximate:** σ and the correlation of errors are estimates of the model without the effect, so alarms wait
+for `WATCH_ROWS` rows. Where the noise differs from trip to trip by a factor of two, E takes it for smaller than it is.
 """
 
 from collections.abc import Mapping
@@ -86,11 +86,16 @@ def watched(state: State, counts: Bool[Array, ""], row: Float[Array, ""]) -> Sta
 
 @dataclass(frozen=True)
 class Alarm:
-    """The declared model lacks an effect: the one that explains most of what it does not.
+    """An effect that the declared model lacks: the one that explains most of the model's error.
 
-    **Fields:** `size` of its parameter `name` in `unit` with its `sd`, `shapes` of the form that explains most; the
-    rows (from 1) since which it has been seen and at which some effect was certain; `log_e`, logarithm of its e-value;
-    `wh_per_day` of so long driving; `instead`, effects that explain about as much.
+    **Fields:**
+
+    - `effect`: its id. `name`, `unit`, `size`, `sd`: its parameter with the estimate. `shapes`: of the form that
+      explains most.
+    - `since_row`: the row (from 1) since which it shows. `certain_row`: the row at which some effect was certain.
+    - `log_e`: logarithm of its e-value.
+    - `wh_per_day`: its energy in a day with `SHIFT_S` of driving.
+    - `instead`: effects that explain about as much.
     """
 
     effect: str
@@ -120,8 +125,8 @@ class Alarm:
 class Watch:
     """The effects of the library that one vehicle's channels allow, and what each would add to a row.
 
-    `left_out` says by id why others are not watched. Effects that act across rows, have a search of their own, or a
-    number for each gear are not.
+    Not watched are effects that act across rows, that have a search of their own, or that have one number for each
+    gear. `left_out` gives the reason by id.
     """
 
     form: Form
@@ -132,12 +137,12 @@ class Watch:
 
     @staticmethod
     def of(state: State, library: Mapping[str, type[Effect]] = LIBRARY) -> "Watch":
-        """What can be watched beside this state's vehicle; its `effects` go to `start(candidates=…)`."""
+        """The effects that this state's vehicle lacks and its channels allow: `start(candidates=watch.candidates)`."""
         return Watch.beside(state.vehicle, state.form, library)
 
     @staticmethod
     def beside(vehicle: Vehicle, form: Form, library: Mapping[str, type[Effect]] = LIBRARY) -> "Watch":
-        """The same from a vehicle and a form."""
+        """As `of`, from a vehicle and a form."""
         why = {k: "acts across rows" for k, c in library.items() if c.acts_across_rows(form.channels)}
         why |= {k: "is looked for by a search of its own" for k, c in library.items() if c.searched}
         why |= {k: "has a number for each group" for k, c in library.items() if any(p.by for p in c.parameters)}
@@ -186,10 +191,10 @@ class Watch:
         return np.where(np.isfinite(by["distance_m"]), by["distance_m"], made)
 
     def alarm(self, state: State) -> Alarm | None:
-        """What the declared model lacks, once it has been certain that it lacks something; None until then.
+        """The effect that the model lacks, once it has been certain that one is missing; None until then.
 
-        Of the effects that have been certain it is the one with the most evidence now. What another effect seems to
-        explain besides is not distinguished before this one is in the sheet: `hdev diagnose` does that.
+        Of the effects that have been certain it is the one with the most evidence now. Whether a second effect is
+        missing shows only once this one is in the sheet: `hdev diagnose` adds it and looks again.
         """
         found = np.asarray(state.alarm_at)
         if not found.any():

@@ -56,7 +56,7 @@ class BatteryResistance(Effect):
 
 
 class VoltageDependence(Effect):
-    """Consumption that follows the voltage: P·k·(V − V₀)."""
+    """Consumption that depends on the battery's voltage: P·k·(V − V₀)."""
 
     id: ClassVar[str] = "voltage_dependence"
     label: ClassVar[str] = "dependence on the battery's voltage"
@@ -83,10 +83,10 @@ class VoltageDependence(Effect):
 
 
 class EfficiencyScale(Effect):
-    """The declared efficiency is off by as much in both directions: s·|P| lost, P what comes from the drive.
+    """The declared efficiency is wrong by the same amount in both directions: s·|P| is lost, P the drive's power.
 
-    With an efficiency that is estimated it is that efficiency under another name; with one that is known, or a map, it
-    is `gear_efficiency` where the vehicle has one gear.
+    Where the efficiency is estimated, this effect is that efficiency under another name. Where it is known or a map,
+    the effect is the same as `gear_efficiency` in a vehicle with one gear.
     """
 
     id: ClassVar[str] = "efficiency_scale"
@@ -105,9 +105,9 @@ class EfficiencyScale(Effect):
 
 
 class RegenEfficiency(Effect):
-    """Of the braking energy another share is recovered than the sheet says: s·max(−P, 0) is lost.
+    """A smaller (or larger) share of the braking energy is recovered than the sheet says: s·max(−P, 0) is lost.
 
-    A machine brakes hardly better than it drives.
+    The plausible range ends at −0.05: a machine brakes hardly better than it drives.
     """
 
     id: ClassVar[str] = "regen_efficiency"
@@ -128,7 +128,7 @@ class RegenEfficiency(Effect):
 
 
 class FrictionBlending(Effect):
-    """Braking power that the friction brakes take: s·|P| less recovered while the brake has pressure."""
+    """Braking power that the friction brakes take: s·|P| is not recovered while there is brake pressure."""
 
     id: ClassVar[str] = "friction_blending"
     label: ClassVar[str] = "blending of the friction brake"
@@ -152,9 +152,9 @@ class FrictionBlending(Effect):
 
 
 class RegenLimit(Effect):
-    """The battery takes no more than P_lim, or only a part of what exceeds it: + s·max(−P − P_lim, 0).
+    """The battery accepts at most P_lim, or only a part of what exceeds it: + s·max(−P − P_lim, 0).
 
-    s = 1 is a hard limit; brakes that blend act in part.
+    s = 1 is a hard limit. With brakes that blend, s is smaller.
     """
 
     id: ClassVar[str] = "regen_limit"
@@ -218,7 +218,7 @@ class TractionLimit(Effect):
 
 
 class StepChange(Effect):
-    """A change that stays, from trip k on: a load, a rolling resistance, or a loss in proportion to power."""
+    """A lasting change from trip k on: a load, a rolling resistance, or a loss proportional to power."""
 
     id: ClassVar[str] = "step_change"
     label: ClassVar[str] = "step change of a coefficient"
@@ -248,9 +248,9 @@ class StepChange(Effect):
 
 
 class ModeChange(Effect):
-    """A second mode that holds in some trips: a load, a rolling resistance, a loss, or regeneration that is weaker.
+    """A second mode in some trips: a load, a rolling resistance, a loss, or weaker regeneration.
 
-    The trips are searched for, not declared; on a trip outside the fit (`in_mode` NaN) z is the share of trips in the
+    A search finds the trips in the mode. On a trip outside the fit (`in_mode` NaN) z is the share of trips in the
     mode.
     """
 

@@ -1,4 +1,4 @@
-"""What the friction brakes do to the force at the wheels: take some of it, hold the vehicle at rest, drag on."""
+"""Friction brakes and the force at the wheels: braking, holding the vehicle at rest, dragging after release."""
 
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ ROAD = ("road",)
 
 
 class BrakeDrag(Effect):
-    """Pads that do not let go: F·exp(−t/τ), t since the brake was released."""
+    """Pads that drag after braking: F·exp(−t/τ), t the time since the brake was released."""
 
     id: ClassVar[str] = "brake_drag"
     label: ClassVar[str] = "brake drag"
@@ -47,10 +47,10 @@ class BrakeDrag(Effect):
 
 
 class FrictionBrake(Effect):
-    """What the drive is spared or must overcome by the friction brakes: + k·brake signal, while the vehicle moves.
+    """Braking force of the friction brakes: + k·brake signal, while the vehicle moves.
 
-    The wheels need m·a + resistances; what the friction brakes take away the drive need not take: F_drive = that sum
-    + F_brake (less negative while braking).
+    F_drive = m·a + resistances + F_brake. While braking the drive's force is negative; what the friction brakes take
+    makes it less negative.
     """
 
     id: ClassVar[str] = "friction_brake"
@@ -82,9 +82,9 @@ class FrictionBrake(Effect):
 
 
 class StandstillHold(Effect):
-    """At rest the brakes hold the vehicle: of the forces that the road asks for, the drive gives only what is left.
+    """At rest the brakes hold the vehicle: they carry the share s of the road's forces, and the drive the rest.
 
-    Only a measured force or torque can show it: at rest the drive's power is zero anyway.
+    Only a measured force or torque can show this: at rest the drive's power is zero anyway.
     """
 
     id: ClassVar[str] = "standstill_hold"

@@ -24,13 +24,13 @@ WHEEL_RADIUS_M = (22.5 * 0.0254 / 2) + 0.70 * 0.275  # 275/70 R22.5, the common 
 class EfficiencyMap(eqx.Module):
     """Efficiency over gear, motor speed and torque: monotone cubic inside a gear's grid, clamped at its edges.
 
-    A bicubic Hermite patch on each cell, its slopes at the nodes those of the monotone cubic along each axis (Fritsch
-    and Butland, SIAM J. Sci. Stat. Comput. 5, 1984). Chosen over the bilinear patch for its gradient, continuous inside
-    the grid, and over a spline for having no waves: along the lines of the grid it stays between its nodes, also beside
-    the cliff at small torque. A plane that is sampled on even axes comes back as that plane.
+    Each cell is a bicubic Hermite patch. Its slopes at the nodes are those of the monotone cubic along each axis
+    (Fritsch and Butland, SIAM J. Sci. Stat. Comput. 5, 1984). Unlike a bilinear patch it has a continuous gradient
+    inside the grid. Unlike a spline it does not overshoot: along the lines of the grid it stays between its nodes, also
+    beside the steep fall at small torque. On evenly spaced axes it reproduces a plane.
 
     **Arguments:** `gears` [g], `speeds_radps` [s] and `torques_nm` [t], increasing; `values` [g, s, t] in (0, 1].
-    A gear between two of the map takes the nearest.
+    A gear that the map lacks takes the nearest one.
     """
 
     gears: Float[Array, " gear"] = eqx.field(converter=as_array)
@@ -65,7 +65,7 @@ class EfficiencyMap(eqx.Module):
         return eta
 
     def outside(self, speed_radps: Any, torque_nm: Any) -> Any:
-        """Whether the map's edge stands for a point that lies beyond it."""
+        """Whether the point lies beyond the map, so that the value at its edge is used."""
         s, t = self.speeds_radps, self.torques_nm
         return (speed_radps < s[0]) | (speed_radps > s[-1]) | (torque_nm < t[0]) | (torque_nm > t[-1])
 
@@ -115,17 +115,20 @@ def _end(h0: Array, h1: Array, d0: Array, d1: Array) -> Array:
 
 
 class Driveline(eqx.Module):
-    """Between wheel and motor shaft.
+    """The chain between the wheel and the motor shaft.
 
-    **Arguments:** `efficiency`, a number in (0, 1] or an `EfficiencyMap`; `gear_ratios` by gear from the first,
-    `final_drive` and `wheel_radius_m` where known: without them torques and speeds are those of a wheel of
-    `WHEEL_RADIUS_M`. `covers_machine`: the efficiency reaches from the wheel to the battery, as η in paper 1.
-    `regenerating_efficiency`: of braking, where that is another; the output is divided by the one and multiplied by the
-    other.
+    **Arguments:**
 
-    Rows that have `GEAR_PROBABILITY` are in no one gear: their ratio is Σ p·i and their efficiency Σ p·η, each η at the
-    motor speed and torque of its own gear (paper 1, section 3.1, with the classifier's probabilities in place of its
-    choice). With a probability of 1 that is the gear itself, to the last bit.
+    - `efficiency`: a number in (0, 1], or an `EfficiencyMap`.
+    - `gear_ratios` (from the first gear up), `final_drive`, `wheel_radius_m`: without them, torques and speeds are
+      those of a wheel of radius `WHEEL_RADIUS_M`.
+    - `covers_machine`: the efficiency covers the chain from the wheel to the battery, as η in paper 1.
+    - `regenerating_efficiency`: while braking, where it differs. Driving power is divided by the efficiency, braking
+      power multiplied by it.
+
+    A row with the channel `GEAR_PROBABILITY` has a probability p for each gear instead of one gear. Its ratio is Σ p·i
+    and its efficiency Σ p·η, with each η at the motor speed and torque of its own gear (paper 1, section 3.1, with the
+    classifier's probabilities in place of its choice). With p = 1 the result is exactly that of the gear.
     """
 
     efficiency: Any = eqx.field(converter=as_array, default=1.0)

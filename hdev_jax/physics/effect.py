@@ -50,7 +50,7 @@ class Point(eqx.Module):
 
 
 class Grouped(eqx.Module):
-    """A coefficient with one value for each vehicle, trip, gear or kind of surface, looked up by the row's id."""
+    """A coefficient with one value for each vehicle, trip, gear or kind of surface; a row's id picks its value."""
 
     values: Float[Array, "*row group"] = eqx.field(converter=as_array)
     by: str = eqx.field(static=True)
@@ -81,7 +81,7 @@ def _is_class_variable(annotation: Any) -> bool:
 
 @runtime_checkable
 class Ratios(Protocol):
-    """What effects read of the driveline."""
+    """The part of the driveline that effects use."""
 
     def ratio_radpm(self, row: Row) -> Any:
         """Motor speed over vehicle speed [rad/m]."""
@@ -90,7 +90,7 @@ class Ratios(Protocol):
 
 @runtime_checkable
 class Car(Protocol):
-    """What effects read of the vehicle that they are in, its groups resolved for the row."""
+    """The part of their vehicle that effects use, with each `Grouped` coefficient replaced by its value for the row."""
 
     @property
     def effects(self) -> "tuple[Effect, ...]":
@@ -128,16 +128,17 @@ class Car(Protocol):
 
 
 class Effect(eqx.Module):
-    """One named cause of consumption. A subclass overrides the hook of its stage and no other.
+    """One named cause of consumption. A subclass overrides the method of its stage and no other.
 
-    `force`, `drive` and `power` return what the effect *adds* for one row (N, N, W) and must be zero when every size
-    is at its null value. `sense` returns corrected measurements of one row. What acts across rows overrides `derive`
-    (channels of its own), `across` (corrected measurements) or `observe` (the predicted column), all by trip and
-    differentiable in their parameters.
+    **Methods for one row:** `force`, `drive` and `power` return what the effect *adds* (N, N, W); it must be zero while
+    every size is at its null value. `sense` returns the row's measurements, corrected.
 
-    Class attributes: `id` as in the contract, `label` as a report calls it, `stage`, `equation`, `source`; `needs`, the
-    channels it reads, each an alternative of names joined by `|`; `mistaken_for` and `separated_by`, ids and the drive
-    that tells them apart; `goes_with`, what its force is in proportion to. Nothing of an effect is kept elsewhere.
+    **Methods across the rows of a trip:** `derive` adds channels of its own, `across` corrects measurements, `observe`
+    changes the predicted column. All must be differentiable in the effect's parameters.
+
+    **Class attributes:** `id`, `label` (its name in a report), `stage`, `equation`, `source`. `needs`: the channels it
+    reads; names joined by `|` are alternatives. `mistaken_for`: ids of effects that look alike; `separated_by`: the
+    drive that tells them apart. `goes_with`: what its force is proportional to (`weight` or `air`).
     """
 
     id: ClassVar[str]
@@ -175,17 +176,17 @@ class Effect(eqx.Module):
 
     @classmethod
     def reads(cls) -> frozenset[str]:
-        """Every channel that it may read, for itself or for the groups of its sizes."""
+        """Every channel that the effect may read, also those that its sizes are grouped by."""
         return frozenset(n for need in cls.needs for n in need.split("|")) | {p.by for p in cls.parameters if p.by}
 
     @classmethod
     def implausible(cls, values: Mapping[str, Any]) -> str:
         """Why these values make no sense, in one phrase; empty where they do.
 
-        **Arguments:** numbers by name, also one for each group (`Grouped`, arrays); what is left out, `None` or NaN is
-        not judged. Of a switch or a size the null is plausible: the effect is not there.
+        **Arguments:** `values`: numbers by name, or arrays with one number for each group. A value that is missing,
+        `None` or NaN is not judged. The null value of a size or a switch is plausible: the effect is absent.
 
-        **Raises:** `KeyError` for a name that is none of its parameters.
+        **Raises:** `KeyError` for a name that is not one of its parameters.
         """
         by_name = {p.name: p for p in cls.parameters}
         given = {k: _numbers(v) for k, v in values.items() if v is not None}
@@ -204,7 +205,7 @@ class Effect(eqx.Module):
         return segments
 
     def across(self, segments: Segments) -> Segments:
-        """Measurements as this effect says they should have been, by trip."""
+        """The measurements as they should have been by this effect, trip by trip."""
         return segments
 
     def sense(self, row: Row, car: Car) -> Row:
@@ -212,11 +213,11 @@ class Effect(eqx.Module):
         return row
 
     def force(self, row: Row, car: Car) -> Real | float:
-        """Force that the road asks for besides [N]."""
+        """Force that this effect adds at the wheels [N]."""
         return 0.0
 
     def split(self, row: Row, car: Car) -> tuple[Real | float, Real | float]:
-        """Of its force the parts that go with the weight and with the air [N]."""
+        """The parts of its force that are proportional to the weight and to the air's drag [N]."""
         if not self.goes_with:
             return 0.0, 0.0
         force = self.force(row, car)
@@ -227,7 +228,7 @@ class Effect(eqx.Module):
         return 0.0
 
     def power(self, row: Row, car: Car, point: Point) -> Real | float:
-        """Power besides, at the machine or the battery [W]."""
+        """Power that this effect adds at the machine or the battery [W]."""
         return 0.0
 
     def observe(self, column: Signal, segments: Segments) -> Signal:
@@ -236,11 +237,11 @@ class Effect(eqx.Module):
 
     @classmethod
     def acts_across_rows(cls, known: Iterable[str] = ()) -> bool:
-        """Whether it needs more of a trip than one row in which the channels `known` are there."""
+        """Whether it needs other rows of the trip too, given that the channels `known` are there."""
         derives = cls.overrides("derive") and not (cls.derives and {*cls.derives} <= {*known})
         return derives or cls.overrides("across") or cls.overrides("observe")
 
     @classmethod
     def overrides(cls, hook: str) -> bool:
-        """Whether this class has a hook of its own, so that the kernel calls only what does something."""
+        """Whether this class overrides a method; the kernel calls only those that do something."""
         return getattr(cls, hook) is not getattr(Effect, hook)

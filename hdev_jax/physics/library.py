@@ -1,4 +1,4 @@
-"""The library: every effect a diagnosis may add, and what of it a given log can show."""
+"""The library: every effect that a diagnosis may add, and which of them a given log can show."""
 
 from collections.abc import Iterable
 
@@ -39,7 +39,7 @@ LIBRARY: dict[str, type[Effect]] = _all()
 
 
 def library(extra: Iterable[type[Effect]] = ()) -> dict[str, type[Effect]]:
-    """The library by id, with a user's own effects. Raises `ValueError` for an id that is there already."""
+    """The library by id, with a user's own effects added. Raises `ValueError` for an id that exists already."""
     found = dict(LIBRARY)
     for c in extra:
         if c.id in found:
@@ -49,7 +49,7 @@ def library(extra: Iterable[type[Effect]] = ()) -> dict[str, type[Effect]]:
 
 
 def most_group(segments: Segments, channels: tuple[str, ...] = GROUPS) -> int:
-    """The highest id in the channels that coefficients may be grouped by (gears, kinds of surface); at least 1."""
+    """The highest id in the channels by which coefficients may be grouped (gear, kind of surface); at least 1."""
     seen = [np.asarray(segments.channels[k], dtype=float) for k in channels if segments.has(k)]
     finite = [x[np.isfinite(x)] for x in seen]
     return max([1, *(int(x.max()) for x in finite if len(x))])
@@ -58,7 +58,7 @@ def most_group(segments: Segments, channels: tuple[str, ...] = GROUPS) -> int:
 def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
     """An instance with every size at its null value and every shape at its default.
 
-    `gears` is the highest id that a grouped size has to have a value for, as `most_group` gives it.
+    **Arguments:** `gears`: the highest id for which a grouped size needs a value, from `most_group`.
     """
     values = {}
     for p in effect.parameters:
@@ -71,7 +71,7 @@ def at_null(effect: type[Effect], *, gears: int = 1) -> Effect:
 
 @jax.jit
 def derived(segments: Segments) -> Segments:
-    """The same rows with what any effect of the library derives by trip worked out once."""
+    """The same rows with every channel that an effect of the library derives by trip."""
     segments = with_bounds(segments)
     for c in LIBRARY.values():
         e = at_null(c)
@@ -83,7 +83,8 @@ def derived(segments: Segments) -> Segments:
 def unavailable(effect: type[Effect], segments: Segments, entry: str, stands_in: Iterable[str] = ()) -> str | None:
     """Why this log cannot show the effect, in one phrase; None where it can.
 
-    `stands_in`: what the vehicle has in the place of a channel (`Vehicle.stands_in`).
+    **Arguments:** `entry`: where the chain begins (`Vehicle.entry`). `stands_in`: values that can replace a channel
+    (`Vehicle.stands_in`).
     """
     if entry not in effect.entries:
         where = {"road": "road", "wheel": "measured traction force", "shaft": "measured motor torque"}[entry]

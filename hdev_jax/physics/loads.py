@@ -40,7 +40,7 @@ class Auxiliary(Effect):
 
 
 class AuxiliaryPower(Effect):
-    """A constant load besides the declared one."""
+    """A constant load in addition to the declared one."""
 
     id: ClassVar[str] = "auxiliary_power"
     label: ClassVar[str] = "constant auxiliary load"
@@ -95,9 +95,9 @@ class HvacPower(Effect):
 
 
 class PassengerHeat(Effect):
-    """Warmth of the passengers: spares so much heating of the cabin, and costs so much cooling, for each of them.
+    """Warmth of the passengers: each of them saves the power h while heating, and costs it while cooling.
 
-    The temperatures that part heating from cooling are those of `hvac_power` where the vehicle has it.
+    The limits of heating and cooling, T₁ and T₂, are those of `hvac_power` where the vehicle has it.
     """
 
     id: ClassVar[str] = "passenger_heat"
@@ -151,8 +151,8 @@ class CabinWarmup(Effect):
 class PeriodicLoad(Effect):
     """A load that switches on and off: P while cos(2π(t/T + φ)) > cos(πD).
 
-    φ may differ from trip to trip; where it is not known (NaN), as on a trip outside the fit, the load is its
-    mean P·D.
+    T is the period, D the share of time on, and φ the phase, which may differ from trip to trip. Where φ is unknown
+    (NaN), as on a trip outside the fit, the load is its mean P·D.
     """
 
     id: ClassVar[str] = "periodic_load"
@@ -178,9 +178,9 @@ class PeriodicLoad(Effect):
         return self.power_w * self.on(row.time_s, row.duration_s)
 
     def on(self, start_s: Any, duration_s: Any) -> Any:
-        """Share of an interval that the load is on; `start_s` since the trip's start [s]; any shape.
+        """Share of an interval during which the load is on; `start_s` from the trip's start [s]; arrays of any shape.
 
-        The mean of the square wave, not its value somewhere inside: continuous in period, duty and phase.
+        It is the mean of the square wave over the interval, so it is continuous in period, duty and phase.
         """
         known = jnp.logical_not(jnp.isnan(self.phase))
         lag = jnp.where(known, self.phase, 0.0) + 0.5 * self.duty
@@ -194,7 +194,7 @@ class PeriodicLoad(Effect):
 
 
 class StandstillLoad(Effect):
-    """A load while standing still: P·[v = 0], all of the time or only while the doors are open."""
+    """A load while the vehicle stands: P·[v = 0], all the time or only while the doors are open."""
 
     id: ClassVar[str] = "standstill_load"
     label: ClassVar[str] = "load at standstill"

@@ -1,4 +1,4 @@
-"""Losses of the driveline and of the machine with its inverter that a declared efficiency does not hold."""
+"""Losses of the driveline and of the machine with its inverter that a declared efficiency does not include."""
 
 from typing import Any, ClassVar
 
@@ -13,7 +13,7 @@ __all__ = ["CopperLoss", "DrivelineDrag", "GearEfficiency", "InverterLoss", "Iro
 class DrivelineDrag(Effect):
     """Drag torque at the motor shaft while it turns, by gear: τ₀[n] as a force τ₀[n]·i/r at the wheel.
 
-    The same torque in all gears is iron loss by the motor's speed under another name.
+    With the same torque in all gears the effect equals `iron_loss` proportional to the motor's speed.
     """
 
     id: ClassVar[str] = "driveline_drag"
@@ -123,10 +123,10 @@ class InverterLoss(Effect):
 
 
 class PartLoad(Effect):
-    """Efficiency that falls at low load, and at high load: P₀·|P|/(P_h + |P|) + c·P², P what comes from the drive.
+    """Efficiency that falls at low load and at high load: P₀·|P|/(P_h + |P|) + c·P², P the drive's power.
 
-    The part in proportion to |P| is the declared efficiency (`efficiency_scale`). The first term levels off at P₀: half
-    of it is lost at P_h, nothing where the drive does nothing, which distinguishes it from a load at standstill.
+    A loss proportional to |P| is no part of it: that is the declared efficiency (`efficiency_scale`). The first term
+    grows from 0 without load to half of P₀ at P_h and levels off at P₀; so it differs from a load at standstill.
     """
 
     id: ClassVar[str] = "part_load"

@@ -1,4 +1,4 @@
-"""The numbers of an effect: four kinds of parameter, and what a field makes of the number that it is given."""
+"""The parameters of an effect, of four kinds, and the conversion of numbers to arrays for its fields."""
 
 import math
 import numbers
@@ -17,10 +17,10 @@ GROUPS = ("gear", "road_surface")  # channels of ids that a coefficient may be g
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of an effect: its name, unit, null value and what a plausible one looks like.
+    """A parameter of an effect: its name, unit, null value and plausible range.
 
-    One of four kinds: `Size`, `Switch`, `Shape`, `Choice`. `lower` and `upper` bound the plausible range (a drag cannot
-    help); `scale` is a typical size, for conditioning and for the weak prior of a found effect.
+    It is one of four kinds: `Size`, `Switch`, `Shape`, `Choice`. `lower` and `upper` bound the plausible range (a drag
+    cannot push). `scale` is a typical size; it conditions the fit and is the weak prior of an effect that is found.
 
     **Raises:** `ValueError` for a combination that could never be fitted or tried.
     """
@@ -88,11 +88,11 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Size(Parameter):
-    """A size has a derivative at the null: its column is one `jvp`.
+    """A parameter with a derivative at its null value, where the effect is absent: its column is one `jvp`.
 
-    `least` is the smallest worth naming. `by`: one value for each id in that channel; `whole`: the commonest group
-    has one too (nothing declared stands for it), and a log without groups has one number. `constant`: it adds the same
-    in every row.
+    `least`: the smallest size worth naming. `by`: a channel; each id in it has a value of its own, except the
+    commonest, for which the declared coefficient stands. `whole`: the commonest has one too, as no declared coefficient
+    stands for it, and a log without that channel has one number. `constant`: the effect adds the same in every row.
     """
 
     least: float = field(default=0.0, kw_only=True)
@@ -111,10 +111,11 @@ class Size(Parameter):
 
 @dataclass(frozen=True)
 class Switch(Parameter):
-    """A switch (a limit, a delay) has no derivative at the null: its column is a difference for each value of `grid`.
+    """A parameter without a derivative at its null value (a limit, a delay): each value of `grid` gives a column.
 
-    `smooth`: the difference grows about in proportion, so a fraction of a step of the grid is as good. `in_rows`:
-    `grid` and `scale` count rows of the log; they are multiplied by its median duration.
+    The column is the difference that the value makes. `smooth`: the difference is nearly proportional to the value, so
+    values between those of the grid count too. `in_rows`: `grid` and `scale` count rows of the log; they are multiplied
+    by the median duration of a row.
     """
 
     grid: Sequence[float] | np.ndarray = field(kw_only=True)
@@ -129,9 +130,9 @@ class Switch(Parameter):
 
 @dataclass(frozen=True)
 class Shape(Parameter):
-    """A shape (a time constant, a threshold) matters only once a size is not null: tried on `grid`, then refined.
+    """A parameter that acts only once a size is not null (a time constant, a threshold): tried on `grid`, then refined.
 
-    `of`: the only size that it acts on. The null is its usual value.
+    `of`: the only size that it acts on. Its null is its usual value.
     """
 
     grid: Sequence[float] | np.ndarray = field(kw_only=True)
@@ -143,10 +144,10 @@ class Shape(Parameter):
 
 @dataclass(frozen=True)
 class Choice(Parameter):
-    """A shape that is only ever one of its `grid`; without a grid the log or a search of its own says which.
+    """A shape that takes only the values of its `grid`; without a grid the log or a search of its own sets it.
 
-    Its null may be NaN: not known until it is chosen. `of` as a shape's. `mean_of`: a channel whose mean over the log
-    is the only value.
+    Its null may be NaN: unknown until a value is chosen. `of`: as in `Shape`. `mean_of`: a channel; its mean over the
+    log is the value.
     """
 
     grid: Sequence[float] | np.ndarray = field(default=(), kw_only=True)
@@ -160,10 +161,10 @@ def _is_number(x: Any) -> bool:
 
 
 def as_array(x: Any) -> Any:
-    """A number, or a list of numbers, as a strong array of floats; `None`, groups, maps and texts as they are.
+    """A number, or a list of numbers, as a strongly typed array of floats, for `equinox.field(converter=…)`.
 
-    A Python number would be static under jit, with no gradient and a program for each value; a weak type would cost a
-    second program. Floats keep their precision. For `equinox.field(converter=…)`.
+    `None`, groups, maps and texts stay as they are. A Python number would be static under jit: no gradient, and a new
+    compilation for each value. A weakly typed array would compile once more. Floats keep their precision.
     """
     if isinstance(x, list | tuple):
         x = jnp.asarray(x)

@@ -131,7 +131,7 @@ def _extra_drag(row: Segments, car: Car, wind_mps: Any) -> Any:
 
 
 class ConstantHeadwind(Effect):
-    """The same wind against every row: ½ρC_dA((v+w)² − v²)."""
+    """The same headwind w in every row: ½ρC_dA((v+w)² − v²)."""
 
     id: ClassVar[str] = "constant_headwind"
     label: ClassVar[str] = "constant headwind"
@@ -243,7 +243,7 @@ class Drafting(Effect):
 
 
 class RotatingMass(Effect):
-    """Inertia of what turns: f·m·a besides the declared one."""
+    """Inertia of rotating parts, in addition to the declared one: f·m·a."""
 
     id: ClassVar[str] = "rotating_mass"
     label: ClassVar[str] = "rotating mass"
@@ -261,7 +261,7 @@ class RotatingMass(Effect):
 
 
 class RoadGrade(Effect):
-    """Slope that the log lacks, from an accelerometer that feels gravity: s·m·(accelerometer − dv/dt)."""
+    """Slope where the log has none, from an accelerometer, which feels gravity: s·m·(a_sensor − dv/dt)."""
 
     id: ClassVar[str] = "road_grade"
     label: ClassVar[str] = "road slope"

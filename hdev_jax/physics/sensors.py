@@ -1,4 +1,4 @@
-"""What the measurements themselves may have wrong: scales, offsets, delays and filters."""
+"""Faults of the measurements themselves: scales, offsets, delays and filters."""
 
 from typing import Any, ClassVar
 
@@ -25,7 +25,7 @@ __all__ = [
 
 
 class MassScale(Effect):
-    """The mass is another than logged: m·(1 + s)."""
+    """The mass differs from the logged one: m·(1 + s)."""
 
     id: ClassVar[str] = "mass_scale"
     label: ClassVar[str] = "payload error"
@@ -43,7 +43,7 @@ class MassScale(Effect):
 
 
 class GradeBias(Effect):
-    """The slope has an offset: θ + b. The same as rolling resistance on every log that is not out and back."""
+    """The slope has an offset: θ + b. Only a road driven out and back tells it from rolling resistance."""
 
     id: ClassVar[str] = "grade_bias"
     label: ClassVar[str] = "slope bias"
@@ -63,7 +63,7 @@ class GradeBias(Effect):
 
 
 class GradeScale(Effect):
-    """The slope is read too steep or too flat, as from heights that were smoothed: θ·(1 + s)."""
+    """The slope is read too steep or too flat, for instance from smoothed heights: θ·(1 + s)."""
 
     id: ClassVar[str] = "grade_scale"
     label: ClassVar[str] = "scale of the slope"
@@ -85,7 +85,7 @@ class GradeScale(Effect):
 
 
 class GradeLag(Effect):
-    """The slope comes late: what is logged at t was the road at t − L."""
+    """The slope signal lags: the slope logged at t is that of the road at t − L."""
 
     id: ClassVar[str] = "grade_lag"
     label: ClassVar[str] = "lag of the slope"
@@ -108,7 +108,7 @@ class GradeLag(Effect):
 
 
 class SpeedScale(Effect):
-    """Speed and distance are off by a factor, as by a wrong wheel radius: v·(1 + s)."""
+    """Speed and distance are wrong by a factor, for instance by a wrong wheel radius: v·(1 + s)."""
 
     id: ClassVar[str] = "speed_scale"
     label: ClassVar[str] = "scale of the speed signal"
@@ -132,7 +132,7 @@ class SpeedScale(Effect):
 
 
 class AccelerometerBias(Effect):
-    """The accelerometer is tilted: a_sensor − b. Matters where the slope comes from it."""
+    """The accelerometer is tilted: a_sensor − b. It matters where the slope comes from the accelerometer."""
 
     id: ClassVar[str] = "accelerometer_bias"
     label: ClassVar[str] = "bias of the accelerometer"
@@ -229,7 +229,7 @@ class TimeSkew(Effect):
 class SamplingFilter(Effect):
     """The target is filtered: P + c₁·Δ₁²P + c₂·Δ₂²P with Δⱼ² = x(k−j) − 2x(k) + x(k+j), or a lag of first order τ.
 
-    Negative taps sharpen: then it is the inputs that were smoothed.
+    Negative taps c sharpen the target: then the inputs are what was smoothed.
     """
 
     id: ClassVar[str] = "sampling_filter"

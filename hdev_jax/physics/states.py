@@ -28,8 +28,10 @@ HALF = 0.5  # state of charge at which the shares are given
 
 
 class Covariate(NamedTuple):
-    """What the share of time on may depend on beside the outside temperature: the parameter that holds its log-odds,
-    the value in a row, and in words where that is highest and lowest."""
+    """A quantity, beside the outside temperature, on which the share of time on may depend.
+
+    `name`: the parameter that holds its log-odds. `value`: its value in a row. `high`, `low`: where that is highest
+    and lowest, in words."""
 
     name: str
     value: Callable[[Any], Any]
@@ -53,14 +55,14 @@ def covariates_of(row: Any) -> Any:
 
 
 def state_channel(effect_id: str) -> str:
-    """The channel that holds the state of an effect where it has been decoded: the share of each row that it is on."""
+    """The channel with the decoded state of an effect: the share of each row during which it is on."""
     return f"derived:{effect_id}"
 
 
 def expected_share(temp_c: Any, shares: Any, log_odds: Any = 0.0) -> Any:
-    """Share of time on at an ambient temperature [°C], linear between `KNOTS_C` and constant beyond; any shape.
+    """Share of time on at an ambient temperature [°C], linear between `KNOTS_C` and constant beyond; of any shape.
 
-    `log_odds` by other covariates multiply the odds of being on by e^log_odds; shares of 0 and 1 stay.
+    `log_odds` of other covariates multiply the odds of being on by e^log_odds; shares of 0 and 1 stay as they are.
     """
     shares = jnp.asarray(shares)
     share = jnp.interp(jnp.asarray(temp_c, shares.dtype), jnp.asarray(KNOTS_C, shares.dtype), shares)
@@ -69,13 +71,15 @@ def expected_share(temp_c: Any, shares: Any, log_odds: Any = 0.0) -> Any:
 
 
 class SwitchingLoad(Effect):
-    """A consumer that is on or off: P·s. Which rows it is on in is a hidden state, s = 1 while it is on.
+    """A consumer that is on or off: P·s, with a hidden state s, 1 while it is on.
 
-    Where the state has been decoded from measured power, it is the channel `derived:switching_load`. Where it has not
-    (a prediction without measured power), the load is its expected value, by the share of time on at the ambient
-    temperature. The odds of being on may depend on `COVARIATES` too: the shares are those in motion, long after the
-    trip's start, with half a charge and closed doors. It forgets its state within `memory_s`: the rates of switching on
-    and off are share/memory and (1 − share)/memory, so that it stays on for memory/(1 − share) on average.
+    Where measured power is there, the state is decoded from it into the channel `derived:switching_load`. In a
+    prediction without measured power the load is its expected value, P times the share of time on at the ambient
+    temperature. The odds of being on may also depend on `COVARIATES`; the shares `share_…` hold in motion, long after
+    the trip's start, with half a charge and closed doors.
+
+    `memory_s` is the time in which the load forgets its state: it switches on at the rate share/memory and off at
+    (1 − share)/memory, so it stays on for memory/(1 − share) on average.
     """
 
     id: ClassVar[str] = "switching_load"

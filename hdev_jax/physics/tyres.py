@@ -1,4 +1,4 @@
-"""What tyres and the road's surface cost beside the declared rolling resistance."""
+"""Forces of tyres and the road's surface in addition to the declared rolling resistance."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -40,8 +40,8 @@ class RollingSpeed(Effect):
 class RollingLinear(Effect):
     """A force linear in speed, the B of a road load: b·v. A sheet declares it as `[road] b_n_per_mps`.
 
-    Oil in hubs and gears. Where the motor's speed goes with the vehicle's it is nearly iron loss in ω², and over a
-    narrow range of speeds the linear part of a headwind.
+    Its cause is oil in hubs and gears. With a fixed gear ratio it is nearly the same as iron loss in ω²; over a narrow
+    range of speeds it is nearly the same as a headwind.
     """
 
     id: ClassVar[str] = "rolling_linear"
@@ -64,7 +64,7 @@ class RollingLinear(Effect):
 
 
 class RollingTemperature(Effect):
-    """Rolling resistance by temperature: m·g·cosθ·k·(T − 20 °C); k is negative, cold tyres roll worse."""
+    """Rolling resistance by temperature: m·g·cosθ·k·(T − 20 °C); k is negative, as cold tyres resist more."""
 
     id: ClassVar[str] = "rolling_temperature"
     label: ClassVar[str] = "rolling resistance by temperature"
@@ -149,7 +149,7 @@ class WetRoad(Effect):
 
 
 class RoadSurface(Effect):
-    """Rolling resistance by kind or place of the road: m·g·cosθ·C_rr·e[surface], against the commonest of the log."""
+    """Rolling resistance by kind or place of the road: m·g·cosθ·C_rr·e[surface], relative to the commonest surface."""
 
     id: ClassVar[str] = "road_surface"
     label: ClassVar[str] = "road surface by place"

@@ -35,11 +35,14 @@ class _Chain(NamedTuple):
 class Vehicle(eqx.Module):
     """A sum of effects. Nothing is changed in place: `plus` and `minus` return new vehicles.
 
-    **Arguments:** `effects` in any order (they are kept by stage); `mass_kg` where the log has no `mass_kg`;
-    `driveline` and `machine`, the efficiencies of the chain (default: no losses; a driveline's efficiency reaches from
-    the wheel to the battery unless it says otherwise); `entry`, the measured quantity where the chain begins: `road`
-    (nothing measured), `wheel` (`traction_force_n`), `shaft` (`motor_torque_nm`; a motor speed that is not logged is
-    that of the wheels times the ratio); `nominal_voltage_v` where the log has no `voltage_v`.
+    **Arguments:**
+
+    - `effects`: in any order; they are kept by stage.
+    - `mass_kg`, `nominal_voltage_v`: used where the log has no `mass_kg` or no `voltage_v`.
+    - `driveline`, `machine`: the efficiencies of the chain; by default no losses. A driveline's efficiency covers the
+      chain from the wheel to the battery unless its `covers_machine` is False.
+    - `entry`: the measured quantity where the chain begins: `road` (nothing is measured), `wheel` (`traction_force_n`)
+      or `shaft` (`motor_torque_nm`; without a logged motor speed, the wheels' speed times the ratio).
     """
 
     effects: tuple[Effect, ...]
@@ -77,7 +80,7 @@ class Vehicle(eqx.Module):
         return self._with((*self.effects, *effects))
 
     def minus(self, *ids: str) -> "Vehicle":
-        """This vehicle without these effects. Raises `ValueError` for one it does not have."""
+        """This vehicle without the effects of these ids. Raises `ValueError` for one that it does not have."""
         if missing := set(ids) - {e.id for e in self.effects}:
             raise ValueError(
                 f"no such effect in this vehicle: {sorted(missing)}; it has {[e.id for e in self.effects]}"
@@ -133,7 +136,7 @@ class Vehicle(eqx.Module):
 
     @property
     def stands_in(self) -> tuple[str, ...]:
-        """What the vehicle has in the place of a channel of the log."""
+        """Names of the vehicle's values that can replace a channel of the log (`nominal_voltage_v`)."""
         return () if self.nominal_voltage_v is None else ("nominal_voltage_v",)
 
     # --- one row ---------------------------------------------------------------------------------------------------
@@ -228,7 +231,7 @@ class Vehicle(eqx.Module):
         return self._observed(self._rows(segments, lambda c, _: c.point.power_w), segments)
 
     def energy(self, segments: Segments) -> Float[Array, " row"]:
-        """Battery energy of each row [Wh]: e of paper 1, equation 5, with the vehicle's other effects."""
+        """Battery energy of each row [Wh]: e of paper 1, equation 5, with all effects of the vehicle."""
         return self.power(segments) * (jnp.asarray(segments.duration_s) / J_PER_WH)
 
     def force(self, segments: Segments) -> Float[Array, " row"]:
@@ -247,7 +250,7 @@ class Vehicle(eqx.Module):
         return self._observed(self._rows(segments, lambda c, row: held(row, c.point.torque_nm)), segments)
 
     def predict(self, segments: Segments, target: str | Target) -> Float[Array, " row"]:
-        """The target's column in the target's unit; the target by its name or its record."""
+        """The prediction of a target, in the target's unit; `target` is its name (`energy_wh`, …) or a `Target`."""
         match target_of(target).name:
             case "energy_wh":
                 return self.energy(segments)
@@ -259,10 +262,10 @@ class Vehicle(eqx.Module):
                 return self.force(segments)
 
     def breakdown(self, segments: Segments) -> dict[str, Float[Array, " row"]]:
-        """Energy of each effect by row [Wh]. The entries add up to `energy` to rounding.
+        """Energy of each effect by row [Wh], by effect id. The entries add up to `energy`, but for rounding.
 
-        Forces count at the wheel; `driveline` and `machine` are what the efficiencies cost; a sensor effect counts as
-        the difference it makes.
+        Forces count at the wheel. The entries `driveline` and `machine` are the losses by their efficiencies. A sensor
+        effect counts by the difference that it makes to the prediction.
         """
         hours = jnp.asarray(segments.duration_s) / J_PER_WH
         chain_only = self._with(tuple(e for e in self.effects if not _is_sensor(e)))
@@ -286,11 +289,12 @@ def _is_sensor(e: Effect) -> bool:
 
 
 def coefficients_that_hold(car: Vehicle, row: Segments) -> tuple[Real, Real]:
-    """c_rr and C_d·A [m²] with which rolling resistance and drag alone are the force of all effects that go with the
-    weight or with the air, in one row; the channels that these derive by trip must be there.
+    """c_rr and C_d·A [m²] of one row that stand for all its forces proportional to the weight and to the air's drag.
 
-    Where the vehicle does not move (for C_d·A: is slower than 0.1 m/s) it is the declared coefficient. **Raises:**
-    `KeyError` for a vehicle without rolling resistance or drag.
+    Rolling resistance and drag with these coefficients alone equal the sum of those effects. The channels that the
+    effects derive by trip must be there. At a standstill (for C_d·A below 0.1 m/s) the declared coefficient holds.
+
+    **Raises:** `KeyError` for a vehicle without rolling resistance or drag.
     """
     car = resolve(car, row)
     parts = [e.split(row, car) for e in car.effects]

@@ -40,13 +40,17 @@ def calibrate(
 ) -> CalibrationResult:
     """Coefficients of the sheet with uncertainty, from their tabular priors and the training trips of the logs.
 
-    `method` "map": Levenberg-Marquardt to the most probable values, standard errors clustered by trip. "linear":
-    Bayesian linear regression in closed form. "nuts": draws, from sufficient statistics where they are enough and by
-    NUTS through the kernel otherwise; `posterior.nc` holds them for ArviZ. `noise` "student_t" weighs outliers down.
+    **Arguments:**
 
-    **Arguments:** `logs`: a path or several, a `Log`, or a table in memory; `vehicle`: a sheet's path or a `Sheet`;
-    `out`: a folder for `calibration.json`, a report and `calibrated_vehicle.toml`. **Returns:** a `CalibrationResult`;
-    `str()` is a table. **Raises:** `InputError`.
+    - `logs`: a path or several, a `Log`, or a table in memory. `vehicle`: a sheet's path or a `Sheet`.
+    - `method`: `"map"` finds the most probable values by Levenberg-Marquardt, with standard errors clustered by trip.
+      `"linear"` is Bayesian linear regression in closed form. `"nuts"` draws from the posterior: from sufficient
+      statistics where the model is linear enough, else by NUTS through the kernel. `posterior.nc` holds the draws for
+      ArviZ.
+    - `noise`: `"student_t"` gives outliers less weight.
+    - `out`: a folder for `calibration.json`, a report and `calibrated_vehicle.toml`.
+
+    **Returns:** a `CalibrationResult`; `str()` is a table. **Raises:** `InputError`.
     """
     if method not in METHODS:
         raise InputError(f"--method {method!r}: accepted are {', '.join(METHODS)}")

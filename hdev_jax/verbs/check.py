@@ -23,7 +23,8 @@ def check(
 ) -> str:
     """What was read: columns, units, trips, kWh/km by trip, what was dropped, filled or clipped. Nothing is fitted.
 
-    With `skeleton`, an adapter to fill in instead. Raises `InputError`.
+    **Arguments:** `logs`: a path or several, a `Log`, or a table in memory. `vehicle`: a sheet, to check the log
+    against it. `skeleton`: return an adapter to fill in instead. **Returns:** text. **Raises:** `InputError`.
     """
     if skeleton:
         first = Path(logs if isinstance(logs, str | Path) else next(iter(logs)))

@@ -61,10 +61,17 @@ def diagnose(
     found.report("bus.html")
     ```
 
-    **Arguments:** as the options of `hdev diagnose`. `logs`: a path or several, a `Log`, or a table in memory;
-    `vehicle`: a sheet's path, a `Sheet` or a mapping of its sections; `effects`: a Python file or classes of your own
-    effects; `trust`: search although a unit or a sign is suspected of being wrong; `out`: a folder for
-    `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`, from which an interrupted run resumes.
+    **Arguments:** as the options of `hdev diagnose`.
+
+    - `logs`: a path or several, a `Log`, or a table in memory.
+    - `vehicle`: a sheet's path, a `Sheet`, or a mapping of its sections.
+    - `target`: what is explained; by default what the log measures nearest the battery.
+    - `train_trips`, `test_trips`: names of trips; by default every third trip is a test trip.
+    - `effects`: your own effects, as a Python file or as classes. `only`, `exclude`: ids of effects.
+    - `fdr`: the highest adjusted p-value of an effect that is named.
+    - `trust`: search even where a unit or a sign seems to be wrong.
+    - `out`: a folder for `diagnosis.json`, `report.html`, figures and `augmented_vehicle.toml`; an interrupted run
+      resumes from it.
 
     **Returns:** a `Diagnosis`; `str()` is the answer as text. **Raises:** `InputError` for faults of the input.
     """

@@ -6,7 +6,7 @@ __all__ = ["effects"]
 
 
 def effects() -> list[dict[str, str]]:
-    """The library of effects: id, stage, equation, parameters with units, channels needed, where from."""
+    """The library of effects: id, stage, equation, parameters with units, channels needed, source."""
     return [
         {
             "id": c.id,

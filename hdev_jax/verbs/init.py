@@ -28,9 +28,9 @@ ONE_RATIO = 1.05  # 90th over 10th percentile of a ratio that is one number
 def init(logs: str | Path | Sequence[str | Path], adapter: str | Path | None = None, out: str | Path = Path()) -> str:
     """Write NAME.sheet.toml into the folder `out`; or, where columns have other names, NAME.adapter.toml to fill in.
 
-    Of the sheet, what the log tells is filled in or left out, with a comment; the rest has values that such vehicles
-    have, each with a standard deviation. **Returns:** what was written, and what comes next. Raises `InputError`, also
-    where the file is there already.
+    What the log itself shows is filled in or left out, with a comment. All other coefficients get values typical of
+    such vehicles, each with a standard deviation. **Returns:** what was written, and what comes next. **Raises:**
+    `InputError`, also where the file exists already.
     """
     paths = [logs] if isinstance(logs, str | Path) else list(logs) if isinstance(logs, list | tuple) else []
     if not paths or not all(isinstance(p, str | Path) for p in paths):

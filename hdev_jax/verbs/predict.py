@@ -78,17 +78,20 @@ def predict(
 ) -> Prediction:
     """One row for each row of the logs: `trip_id, time_s, predicted, lower, upper, level` in the target's unit.
 
-    The interval has the uncertainty of the coefficients (covariance from the `predictive.json` beside a fitted sheet,
-    else their sds in the sheet) and the noise of a row: by cross-validation over trips of that fit, else from this log
-    where it measures the target. The interval of a trip's total is from errors of whole trips, by a Student t with as
-    many degrees of freedom as there were trips; for a single trip, from its autocorrelation.
+    An interval adds two uncertainties. The coefficients' comes from the covariance in the `predictive.json` beside a
+    fitted sheet, else from the sds in the sheet. The noise of a row comes from cross-validation over the trips of that
+    fit, else from this log where it measures the target.
 
-    `online`: loads that switch are filtered along the log, so that each row is predicted from the rows before it; the
-    log has to measure the target, and the sheet to have such loads.
+    The interval of a trip's total comes from the errors of whole trips, by a Student t with as many degrees of freedom
+    as there were trips; with a single trip, from the autocorrelation of its errors.
 
-    **Arguments:** `vehicle`: a sheet's path, a `Sheet`, or what `diagnose` or `calibrate` returned; `out`, a file to
-    write (.csv, .csv.gz or .parquet). **Returns:** a `Prediction`: its `rows`, and as text the total of each trip with
-    its interval. **Raises:** `InputError`.
+    **Arguments:** `vehicle`: a sheet's path, a `Sheet`, or what `diagnose` or `calibrate` returned. `level`:
+    probability inside the intervals. `online`: predict each row from the rows before it, by filtering the state of
+    loads that switch; the log must measure the target and the sheet have such loads. `out`: a file to write (.csv,
+    .csv.gz or .parquet).
+
+    **Returns:** a `Prediction`: its `rows`, and as text the total of each trip with its interval. **Raises:**
+    `InputError`.
     """
     import pandas as pd
     from scipy import stats

@@ -39,12 +39,12 @@ def _kept(folder: Path) -> ReportData:
 
 
 class Result(ABC):
-    """An answer with what is behind it. `str()` is the answer as the command line prints it.
+    """An answer and the numbers behind it. `str()` is the answer as the command line prints it.
 
     - `summary`: what the JSON file of the command holds (contract, section 4).
     - `sheet`: the vehicle sheet as fitted, TOML.
-    - `predictive`: covariance and noise for the intervals of `hdev_jax.predict`, what `predictive.json` holds.
-    - `data`: rows, channels and errors that the report shows; read from the run's folder when it is first asked for.
+    - `predictive`: what `predictive.json` holds, the covariance and noise for the intervals of `hdev_jax.predict`.
+    - `data`: the rows, channels and errors that the report shows; read from the run's folder on first use.
     """
 
     json_file: ClassVar[str]
@@ -61,7 +61,7 @@ class Result(ABC):
 
     @classmethod
     def of_folder(cls: type[R], folder: Path) -> R:
-        """What `write` left in a finished folder; `data` is read when it is first asked for."""
+        """The result in a finished folder; `data` is read on first use."""
         summary, predictive = (json.loads((folder / name).read_text()) for name in (cls.json_file, PREDICTIVE))
         answer, sheet = ((folder / name).read_text() for name in (ANSWER, cls.sheet_file))
         return cls(answer, summary, sheet, predictive, partial(_kept, folder))
@@ -131,7 +131,7 @@ class Result(ABC):
     def _write_report(self, folder: Path) -> None: ...
 
     def plot_coefficients(self) -> "Figure | None":
-        """The coefficients against their tabular values; None where none was estimated."""
+        """The coefficients beside their tabular values; None where no coefficient was estimated."""
         from hdev_jax.report.figures import coefficients
 
         return self._drawn(coefficients)
@@ -150,7 +150,7 @@ class Result(ABC):
 
 
 class Diagnosis(Result):
-    """What a model lacked: effects with their sizes, the error before and after on held-out test trips."""
+    """The effects that a model lacked, with their sizes, and the error before and after on held-out test trips."""
 
     json_file = "diagnosis.json"
     sheet_file = "augmented_vehicle.toml"
@@ -204,7 +204,7 @@ class Diagnosis(Result):
         return self._drawn(lambda data: residual_by_channel(data, panels(data)[0]))
 
     def plot_energy(self) -> "Figure | None":
-        """Energy by effect over the test trips; None for a target that the battery lies behind."""
+        """Energy by effect over the test trips; None where the target lies before the battery."""
         from hdev_jax.report.figures import energy_by_effect
 
         return self._drawn(energy_by_effect)
@@ -216,8 +216,10 @@ class Diagnosis(Result):
 
 
 class CalibrationResult(Result):
-    """A sheet's coefficients with their uncertainty. `draws`: those of the posterior where it was sampled now;
-    a finished folder has them in `posterior.nc`, for ArviZ."""
+    """A sheet's coefficients with their uncertainty.
+
+    `draws`: draws of the posterior, where this call sampled it. A finished folder has them in `posterior.nc`, for
+    ArviZ."""
 
     json_file = "calibration.json"
     sheet_file = "calibrated_vehicle.toml"
@@ -241,7 +243,7 @@ class CalibrationResult(Result):
 
     @property
     def coefficients(self) -> "pd.DataFrame":
-        """One row for each coefficient: `value`, `sd`, `unit`; of its table `prior_value`, `prior_sd`, `prior_z`."""
+        """One row for each coefficient: `value`, `sd`, `unit`, and its prior: `prior_value`, `prior_sd`, `prior_z`."""
         import pandas as pd
 
         rows = pd.DataFrame(self.summary["baseline"]["parameters"]).T

@@ -25,9 +25,12 @@ def simulate(config: str | Path, *, out: str | Path) -> str: ...
 def simulate(config: str | Path | Mapping[str, Any], *, out: str | Path | None = None) -> str | Fleet:
     """A synthetic fleet with known truth, from its configuration (a TOML file).
 
-    Into the folder `out`: `log.parquet`, `truth.parquet` and `sheets` hold a file for each vehicle; `fleet.json`, a
-    report and figures say what is in them. **Returns:** a summary as text; without `out` the fleet in memory, for which
-    the configuration may be a mapping too: `simulate({"seed": 1, "routes": 60})["A"].frame`. Raises `InputError`.
+    **Arguments:** `config`: a TOML file; without `out` it may also be a mapping. `out`: a folder. In it `log.parquet`,
+    `truth.parquet` and `sheets` are folders with one file per vehicle; `fleet.json`, a report and figures describe
+    them.
+
+    **Returns:** a summary as text; without `out`, the fleet in memory:
+    `simulate({"seed": 1, "routes": 60})["A"].frame`. **Raises:** `InputError`.
     """
     if out is None and isinstance(config, str | Path | Mapping):
         return in_memory(config)

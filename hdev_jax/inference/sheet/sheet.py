@@ -31,13 +31,14 @@ class Sheet:
           driveline={"efficiency": 0.91}, battery={"auxiliary_w": 2500.0})
     ```
 
-    **Arguments:** `sections`, the keys of a sheet; a number is known, `(value, sd)` or `{"value": …, "sd": …}` a
-    tabular prior: it is estimated. `library`, the effects that `effects` may name; `path`, the file that it stands in,
-    beside which an efficiency map is looked for.
+    **Arguments:** `sections`: the keys of a sheet. A plain number is known and kept. A number with a standard
+    deviation, `(value, sd)` or `{"value": …, "sd": …}`, is a tabular prior and is estimated. `library`: the effects
+    that the section `effects` may name. `path`: the sheet's file; an efficiency map is looked for in its folder.
 
-    **Fields:** `declared` holds the coefficients by path (`road.c_rr`, `effects.headwind.scale`); `gear_ratios` count
-    from the first gear; `map_path` is where `efficiency_map` came from, `gear_model` a file of gear trees.
-    **Raises:** `InputError`, one line with key, what was found and what is accepted.
+    **Fields:** `declared`: the coefficients by path (`road.c_rr`, `effects.headwind.scale`). `gear_ratios`: from the
+    first gear up. `map_path`: the file of `efficiency_map`. `gear_model`: a file of gear trees.
+
+    **Raises:** `InputError`, one line with the key, what was found and what is accepted.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class Sheet:
         )
 
     def knowing(self, effects: Mapping[str, type[Effect]]) -> "Sheet":
-        """The same sheet, with these effects in its library besides."""
+        """The same sheet, with these effects added to its library."""
         other = copy.copy(self)
         other.library = {**self.library, **effects}
         return other
@@ -122,10 +123,12 @@ class Sheet:
 
 
 def read_sheet(path: str | Path, *, library: Mapping[str, type[Effect]] = LIBRARY) -> Sheet:
-    """Read a sheet (contract, section 2). `library`: the effects that [effects.*] may name.
+    """Read a vehicle sheet from a TOML file (contract, section 2).
 
-    **Raises:** `InputError`, one line with file, key, what was found and what is accepted, for whatever is wrong in it
-    or in the efficiency map it names.
+    **Arguments:** `library`: the effects that a section `[effects.…]` may name.
+
+    **Raises:** `InputError` for a fault in the sheet or in its efficiency map: one line with the file, the key, what
+    was found and what is accepted.
     """
     table, _ = read_toml(Path(path), "sheet")
     return sheet_of_sections(table, library=library, path=path)

@@ -35,11 +35,12 @@ def compare(
     out: str | Path | None = None,
     seed: int = 0,
 ) -> EnergyResult:
-    """Where the difference of two comes from, as differences of the ledger [kWh/100 km] that add up exactly.
+    """Why two trips, vehicles or sheets differ: the difference of each cause [kWh/100 km]. They add up exactly.
 
-    **Arguments:** `a` and `b`: two vehicle sheets on one log (files that end in .toml, sheets or results), else two
-    trips of the log, or two vehicles by their `vehicle_id`, with their `vehicle` sheet. **Returns:** an `EnergyResult`
-    with the table `causes`, and for trips `circumstances`. **Raises:** `InputError`.
+    **Arguments:** `a` and `b`: two sheets for the same log (.toml files, `Sheet`s or results); or two trips by name;
+    or two vehicles by `vehicle_id`. `vehicle`: the sheet for trips or vehicles.
+
+    **Returns:** an `EnergyResult` with the table `causes`, and for trips `circumstances`. **Raises:** `InputError`.
     """
     sheets = [not isinstance(x, str | Path) or str(x).endswith(".toml") for x in (a, b)]
     if any(sheets) and not all(sheets):

@@ -38,14 +38,16 @@ def ledger(
 ) -> EnergyResult:
     """kWh, kWh/100 km, share and cost by cause, for the whole log, each vehicle, week and trip, with 90 % intervals.
 
-    A sheet in the folder where `calibrate` or `diagnose` wrote it is taken as fitted; another is calibrated on this
-    log. Each block adds up to the measured energy: what the causes leave is the row *unexplained*. How losses that
-    multiply are shared out: `hdev_jax.energy.causes`.
+    A sheet in the folder where `calibrate` or `diagnose` wrote it counts as fitted; any other is calibrated on this
+    log. Each block adds up to the measured energy: the row *unexplained* is the rest. The docstring of
+    `hdev_jax.energy.causes` says how losses that multiply are shared out.
 
-    **Arguments:** `price` of a kWh, in any currency; `out`, a folder for `report.html`, `ledger.csv`, `.parquet`,
-    `.xlsx` and `.json`. **Returns:** an `EnergyResult` with the tables `ledger` (long: level, name, cause, kwh, lower,
-    upper, kwh_per_100km, share_percent, cost) and `about` (km, hours, regenerated and auxiliary share, energy while
-    standing and parked, by level and name). **Raises:** `InputError`.
+    **Arguments:** `price` of a kWh, in any currency. `out`: a folder for `report.html`, `ledger.csv`, `.parquet`,
+    `.xlsx` and `.json`.
+
+    **Returns:** an `EnergyResult` with two tables. `ledger` has a row for each level, name and cause: `kwh`, `lower`,
+    `upper`, `kwh_per_100km`, `share_percent`, `cost`. `about` has a row for each level and name: km, hours, regenerated
+    and auxiliary share, energy while standing and while parked. **Raises:** `InputError`.
     """
     if price is not None and not (np.isfinite(price) and price >= 0):
         raise InputError(f"--price {price}: the price of a kWh, a number of 0 or more, is expected")

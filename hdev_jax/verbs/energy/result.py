@@ -23,7 +23,7 @@ class EnergyResult:
     """An answer about energy. `str()` is the answer as the command line prints it.
 
     - `summary`: what the JSON file of the command holds.
-    - `tables`: by name, the frames that the command writes as CSV, Parquet and sheets of a workbook.
+    - `tables`: by name, the data frames that the command writes as CSV, as Parquet and into a workbook.
     """
 
     def __init__(

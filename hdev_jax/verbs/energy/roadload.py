@@ -37,14 +37,14 @@ def roadload(
 ) -> EnergyResult:
     """Road load A + B·v + C·v² [N, N/(m/s), N/(m/s)²] with 90 % intervals, and the force at 50 and 80 km/h.
 
-    From driving in service c_rr, a force linear in speed and C_d·A are estimated with the rest of the sheet, from the
-    traction force where it is measured, else through the chain from the battery. A log in which nothing drives the
-    vehicle (force or torque 0 throughout, or only time and speed) is a coast-down: `hdev_jax.energy.coastdown`. What
-    the log cannot tell is in the notes.
+    From driving in service, c_rr, a force linear in speed and C_d·A are estimated together with the rest of the sheet.
+    They come from the traction force where it is measured, else from the battery through the chain. A log in which
+    nothing drives the vehicle (force or torque 0 throughout, or only time and speed) is treated as a coast-down; see
+    `hdev_jax.energy.coastdown`. Notes say what the log cannot determine.
 
-    **Arguments:** `mass` [kg] at which the load holds, by default the log's mean or the sheet's; `coastdown`: take the
-    log as a coast-down whatever it measures. **Returns:** an `EnergyResult` with the tables `road_load` and `force`.
-    **Raises:** `InputError`.
+    **Arguments:** `mass` [kg] for which the road load is given; by default the log's mean, else the sheet's.
+    `coastdown`: treat the log as a coast-down whatever it measures. **Returns:** an `EnergyResult` with the tables
+    `road_load` and `force`. **Raises:** `InputError`.
     """
     if mass is not None and not (np.isfinite(mass) and mass > 0):
         raise InputError(f"--mass {mass}: a mass above 0 kg is expected")

@@ -35,13 +35,14 @@ def saved(
 ) -> EnergyResult:
     """Energy that a change saved, with weather, load, route and speed taken out by the kernel.
 
-    The vehicle is calibrated on the trips `before`; on those `after`, what it would have taken as it was is compared
-    with what was measured. The method: `hdev_jax.energy.saved`.
+    The vehicle is calibrated on the trips before the change. For the trips after it, the energy that the unchanged
+    vehicle would have taken is compared with what was measured. `hdev_jax.energy.saved` has the equations.
 
-    **Arguments:** `before` and `after`: dates `2024-03-01..2024-03-31` (one end may be open), trips in the order of the
-    log `T01..T08`, or names `T01,T02`. **Returns:** an `EnergyResult`: the share saved with a 90 % interval, how many
-    more trips would make it significant, the tables `trips` and `circumstances` (what else changed).
-    **Raises:** `InputError`.
+    **Arguments:** `before` and `after`: a range of dates, `2024-03-01..2024-03-31` (one end may be open); a range of
+    trips in the order of the log, `T01..T08`; or names, `T01,T02`.
+
+    **Returns:** an `EnergyResult` with the share saved, its 90 % interval, how many more trips would make it
+    significant, and the tables `trips` and `circumstances` (what else changed). **Raises:** `InputError`.
     """
     asked = Asked.of(
         "saved", logs, adapter, effects, seed, {"target": target, "before": before, "after": after, "trust": trust}

@@ -38,13 +38,15 @@ def whatif(
 ) -> EnergyResult:
     """Energy of the trips as driven with a change, by trip and by cause, with 90 % intervals.
 
-    Speeds, slopes and stops stay as they are; the vehicle, its mass or the weather is another. Both vehicles have the
-    same draws of the coefficients, so that what they have in common is certain. The log need not measure energy.
+    Speeds, slopes and stops stay as driven; the vehicle, its mass or the weather changes. Both vehicles use the same
+    draws of the coefficients, so errors that they share cancel in the difference. The log need not measure energy.
 
-    **Arguments:** `changes`, each `KEY=VALUE`: a coefficient of the sheet (`road.c_rr=-10%`, `mass_kg=+500`,
-    `battery.auxiliary_w=2000`) or a channel of the log (`ambient_temp_c=-10`); a value with a sign is a change, one
-    without is the new value. **Returns:** an `EnergyResult` with the tables `trips` and `causes`. **Raises:**
-    `InputError`; for a key that is none with the near name.
+    **Arguments:** `changes`: `KEY=VALUE` each. KEY is a coefficient of the sheet (`road.c_rr=-10%`, `mass_kg=+500`,
+    `battery.auxiliary_w=2000`) or a channel of the log (`ambient_temp_c=-10`). A value with a sign is a change, so that
+    example is 10 °C colder; a value without a sign is the new value.
+
+    **Returns:** an `EnergyResult` with the tables `trips` and `causes`. **Raises:** `InputError`; for an unknown key,
+    with the nearest name.
     """
     wanted = [changes] if isinstance(changes, str) else list(changes)
     options = {"target": target, "set": wanted, "trust": trust}

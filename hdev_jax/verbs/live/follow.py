@@ -42,18 +42,23 @@ def follow(
 ) -> str | None:
     """Follow one vehicle row by row: energy of each row before it is measured, coefficients after it, alarms.
 
-    Rows come as CSV (header first) or as JSON lines, in the columns of a log: intervals, or samples, which are used one
-    row later, when it is known how long they lasted. What a row lacks keeps its last value; rows that cannot be used
-    are counted, and told at the end.
+    Rows come as CSV (header first) or as JSON lines, in the columns of a log. A row is an interval or a sample; a
+    sample is used one row later, when its length is known. A channel that a row lacks keeps its last value. Rows that
+    cannot be used are counted and listed at the end.
 
-    **Arguments:** `vehicle`: a sheet's path or a `Sheet`; `rows`: a file, mappings, or a stream of bytes (standard
-    input by default); `state`: a file that keeps what is known, every few seconds and at the end: the same command goes
-    on from it as if it had never stopped, and rows that it has had are left out. `json`: a line of JSON for each row.
-    `watch`: name effects of the library that the sheet lacks. `mqtt`: `mqtt://HOST:PORT/TOPIC` instead of `rows`, each
-    message a row as JSON, or a list of rows; it goes on until it is stopped.
+    **Arguments:**
 
-    **Returns:** the estimates and what became of the rows, as text; None where each row was written as JSON.
-    **Raises:** `InputError`.
+    - `vehicle`: a sheet's path or a `Sheet`.
+    - `rows`: a file, mappings, or a stream of bytes; by default standard input.
+    - `state`: a file in which the estimates are saved every few seconds and at the end. The same command continues from
+      it as if it had never stopped, and skips rows that it has seen.
+    - `json`: write a line of JSON for each row.
+    - `watch`: name effects of the library that the sheet lacks.
+    - `mqtt`: `mqtt://HOST:PORT/TOPIC` instead of `rows`; a message is a row as JSON, or a list of rows. It runs until
+      it is stopped.
+
+    **Returns:** the estimates and the counts of rows as text; None where each row was written as JSON. **Raises:**
+    `InputError`.
     """
     sheet, rules = sheet_of(vehicle, known_effects(effects)), adapter_of(adapter)
     if mqtt is not None and rows is not None:

@@ -21,11 +21,17 @@ def serve(
     port: int = 8000,
     watch: bool = True,
 ) -> None:
-    """Take rows of many vehicles over HTTP and give estimates, alarms and forecasts, until it is stopped.
+    """Take rows of many vehicles over HTTP and return estimates, alarms and forecasts. Runs until it is stopped.
 
-    **Arguments:** `sheets`: a folder with VEHICLE.toml or FLEET/VEHICLE.toml, `default.toml` for the others; `state`:
-    a file of SQLite or `postgresql://…`, which keeps rows and states; `tokens`: a TOML file, `fleet = "SHA-256 of its
-    token"`; without it there is one fleet, and only this machine may call. **Raises:** `InputError`.
+    **Arguments:**
+
+    - `sheets`: a folder with VEHICLE.toml or FLEET/VEHICLE.toml; `default.toml` is the sheet of all other vehicles.
+    - `state`: where rows and states are stored, an SQLite file or `postgresql://…`.
+    - `tokens`: a TOML file with a line `fleet = "SHA-256 of its token"` for each fleet. Without it there is one fleet,
+      and only this machine may call.
+    - `watch`: name effects of the library that a sheet lacks.
+
+    **Raises:** `InputError`.
     """
     try:
         import uvicorn

@@ -43,14 +43,20 @@ def fleet(
 ) -> EnergyResult:
     """Check, calibrate and diagnose every vehicle, and say what only a fleet can tell.
 
-    **Arguments:** `logs` and `vehicles` as `hdev_jax.many.sources`; `price` of a kWh; `fdr`, the highest adjusted
-    p-value, in each vehicle and over the fleet; `trust`: search although a unit or sign is suspected; `workers`
-    processes on this machine, or the Dask cluster at `scheduler` (both need the extra `fleet`); `out`, the folder for
-    the page, `fleet.json`, tables and `vehicles/NAME.json`, from which an interrupted run goes on.
+    **Arguments:**
 
-    **Returns:** an `EnergyResult` whose `tables` are `fleet`, `effects`, `unlike`, `coefficients`, `ledger` and
-    `about`; `summary` is fleet.json. A vehicle whose log is bad is a line of it, with the reason. **Raises:**
-    `InputError` where no vehicle is there, or none could be used.
+    - `logs`: files (one vehicle each, named as the file) and folders of files or of vehicles' folders.
+    - `vehicles`: one sheet for all, a folder of sheets NAME.toml, or a CSV table with the columns `vehicle`, `sheet`
+      and, if wanted, `type`.
+    - `price` of a kWh. `fdr`: the highest adjusted p-value, within each vehicle and over the fleet.
+    - `trust`: search even where a unit or a sign seems to be wrong.
+    - `workers`: processes on this machine; or `scheduler`: the address of a Dask cluster. Both need the extra `fleet`.
+    - `out`: a folder for the page, `fleet.json`, tables and `vehicles/NAME.json`; an interrupted run resumes from it.
+
+    **Returns:** an `EnergyResult`. Its `tables` are `fleet`, `effects`, `unlike`, `coefficients`, `ledger` and `about`;
+    its `summary` is what `fleet.json` holds. A vehicle whose log is refused is listed with the reason.
+
+    **Raises:** `InputError` where there is no vehicle, or none that can be used.
     """
     if not isinstance(fdr, Real) or not 0.0 < fdr < 1.0:
         raise InputError(f"fdr {fdr!r}: a number between 0 and 1 is expected")

@@ -35,14 +35,17 @@ def export(
     *,
     out: str | Path,
 ) -> str:
-    """Write the sheet in another program's format, and `OUT.json` with its inputs, its errors and what is left out.
+    """Write the sheet in another program's format, and beside it `OUT.json`: inputs, errors and what is left out.
 
-    The chain is entered at the road and ends at the battery. `stablehlo` and `onnx` give the energy of rows [Wh],
-    `lookup` a table of the consumption at steady speeds [Wh/km], `fastsim` and `sumo` a vehicle of those programs.
+    **Arguments:**
 
-    **Arguments:** `vehicle`: a sheet's path, a `Sheet`, or what `diagnose` or `calibrate` returned; `channels`, inputs
-    beside the interval of driving (default: slope, mass and what the sheet's effects read). **Returns:** what was
-    written and what the format cannot hold, as text. **Raises:** `InputError`.
+    - `vehicle`: a sheet's path, a `Sheet`, or what `diagnose` or `calibrate` returned. It is exported from the road to
+      the battery.
+    - `to`: `stablehlo` and `onnx` are functions that give the energy of rows [Wh]; `lookup` is a table of consumption
+      at steady speeds [Wh/km]; `fastsim` and `sumo` are vehicles of those programs.
+    - `channels`: inputs beside time, distance and speeds; by default slope, mass and what the sheet's effects read.
+
+    **Returns:** what was written and what the format cannot hold, as text. **Raises:** `InputError`.
     """
     if to not in FORMATS:
         raise InputError(f"--to {to}: no such format; accepted: {', '.join(FORMATS)}")
