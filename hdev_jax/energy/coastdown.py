@@ -71,7 +71,7 @@ def coast_down(log: Log, mass_kg: float, rotating: float, *, level: float = LEVE
         gain = _gained(s.take(np.arange(r.start, r.stop)), rotating)
         if gain > GAIN_MPS:
             raise InputError(
-                f"trip '{log.trip_names[k]}' is no coast-down: it gains {gain:.1f} m/s"
+                f"trip '{log.trip_names[k]}' is not a coast-down: it gains {gain:.1f} m/s"
                 f"{' beyond what the slope gives' if s.has('grade_rad') else ''}; coast in neutral from speed, or give "
                 "a log that measures energy_wh, battery_power_w (_kw), motor_torque_nm or traction_force_n"
             )
@@ -105,25 +105,25 @@ def coast_down(log: Log, mass_kg: float, rotating: float, *, level: float = LEVE
     inside = np.interp(kmh, driven_range(fast), (1.0, 1.0), left=0.0, right=0.0) > 0
     if np.all(low[3:][inside] <= 0):
         raise InputError(
-            "this is no coast-down: no force that holds the vehicle back shows at any speed driven; coast in neutral, "
-            "or give a log that measures energy_wh, battery_power_w (_kw), motor_torque_nm or traction_force_n"
+            "this is not a coast-down: no resistance shows at any speed driven; coast in neutral, or give a log that "
+            "measures energy_wh, battery_power_w (_kw), motor_torque_nm or traction_force_n"
         )
     mass = float(np.mean(np.asarray(s.get("mass_kg", mass_kg))))
-    notes = [how] if both else ["all runs go one way: a slope is in A, a wind in A and B"]
+    notes = [how] if both else ["all runs go one way: A includes any slope, A and B any wind along the road"]
     if both and not wind:
         notes.append(f"wind along the road, from the two directions: {w:.2g} m/s (root mean square)")
     slow = len(s) - len(fast)
     if slow:
-        notes.append(f"{slow} rows below {3.6 * LEAST_MPS:.0f} km/h are no part of it")
+        notes.append(f"{slow} rows below {3.6 * LEAST_MPS:.0f} km/h are not used")
     if dropped := len(blocks) - len(kept):
-        notes.append(f"{dropped} runs are too short, of fewer than {LEAST_ROWS} rows above that speed")
+        notes.append(f"{dropped} runs are too short: they have fewer than {LEAST_ROWS} rows above that speed")
     if not s.has("ambient_temp_c"):
-        notes.append("no ambient_temp_c in the log: A and B are as on the day, not at 20 °C")
+        notes.append("no ambient_temp_c in the log: A and B are those of the day, not at 20 °C")
     if not s.has("ambient_temp_c") and not s.has("air_density_kgpm3"):
-        notes.append("no air density or temperature in the log: C takes the day's air as of the standard density")
+        notes.append("no air density or temperature in the log: for C the air is assumed to have the standard density")
     return RoadLoad(
         known[:3], low[:3], high[:3], kmh, known[3:], low[3:], high[3:], mass, driven_range(fast),
-        f"coast-down of {len(kept)} runs (SAE J1263, J2263), mass factor {rotating:g} for what turns", tuple(notes),
+        f"coast-down of {len(kept)} runs (SAE J1263, J2263), mass factor {rotating:g} of rotating parts", tuple(notes),
     )  # fmt: skip
 
 

@@ -205,7 +205,7 @@ def _left_open(
     for name, c, s in zip((c.path for c in table.free), table.free, sd, strict=True):
         letter = {"road.c_rr": "A", "road.b_n_per_mps": "B", "road.cda_m2": "C"}.get(name)
         if letter and c.sd and s > UNSAID * c.sd:
-            out.append(f"{letter}: the log says next to nothing of it; its interval is as wide as before it ({name})")
+            out.append(f"{letter}: the log does not determine it; its interval is hardly narrower than before ({name})")
     if not driven[0] < SHOWN_KMH[0] < driven[1] or not driven[0] < SHOWN_KMH[1] < driven[1]:
         out.append(
             f"90 % of the way was driven at {driven[0]:.0f} to {driven[1]:.0f} km/h: forces at other speeds are "
@@ -234,5 +234,5 @@ def _held(fitted: Fitted, mass_kg: float) -> list[str]:
         moved = -np.linalg.solve(kept.T @ kept / noise + precision, kept.T @ slopes[:, at] / noise)
         k = [c.path for c in table.free].index("road.c_rr")
         force = step * float(moved[k]) * mass_kg * GRAVITY_MPS2
-        out.append(f"{path} is held: were it {words} higher, A would be {force:+.3g} N")
+        out.append(f"{path} is not estimated: if it were {words} higher, A would change by {force:+.3g} N")
     return out

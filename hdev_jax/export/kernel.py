@@ -107,10 +107,10 @@ def kernel_of(sheet: Sheet, channels: Iterable[str] | None = None) -> Kernel:
             left.append(LeftOut(f"effects.{e.id}", "it acts across rows, and every row is computed by itself"))
     for path, d in sheet.declared.items():
         if d.per_vehicle:
-            left.append(LeftOut(path, "it is by vehicle: the first vehicle's value is used"))
+            left.append(LeftOut(path, "it differs by vehicle: the first vehicle's value is used"))
     for effect, what in ((StepChange, "the state after the change"), (ModeChange, "the mean over its modes")):
         if vehicle.has(effect.id):
-            left.append(LeftOut(f"effects.{effect.id}", f"it goes by trips: {what} is used"))
+            left.append(LeftOut(f"effects.{effect.id}", f"it differs by trip: {what} is used"))
     if free := [c.path for c in built.table.free]:
         left.append(LeftOut("sd", f"the uncertainty of {', '.join(dict.fromkeys(free))} is not in the file"))
     if (

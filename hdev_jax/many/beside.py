@@ -23,11 +23,11 @@ def looking_again(
     by_name = {t["name"]: t for t in tasks}
 
     def again(records: Sequence[Mapping[str, Any]], shown: Mapping[str, Any]) -> dict[str, Any]:
-        tell(f"{len(records)} vehicles again, beside {', '.join(shown)}")
+        tell(f"scanning {len(records)} vehicles again, with {', '.join(shown)} in their models")
         todo = [{**by_name[r["name"]], "beside": {**shown, **_loose(r["fitted"])}} for r in records]
         found = [r for _, r in computed(scanned_again, todo, where)]
         if odd := [r for r in found if r["message"]]:
-            tell(f"{len(odd)} of them cannot be fitted so and count no further; {odd[0]['name']}: {odd[0]['message']}")
+            tell(f"{len(odd)} of them cannot be fitted so and are left out; {odd[0]['name']}: {odd[0]['message']}")
         return {r["name"]: r["scan"] for r in found}
 
     return again

@@ -63,7 +63,7 @@ def fleet_result(
         )
     undated = sum((r.get("ledger") or {}).get("undated", 0) for r in each)
     if undated:
-        said.append(f"{undated} trips have no date in their logs: they are in no week, and a change has no date there")
+        said.append(f"{undated} trips have no date in their logs: no weekly table has them, and changes have no date")
     summary = {
         "schema": "hdev-vehicles/1",
         "counts": {k: Counter(r["status"] for r in each).get(k, 0) for k in ("done", "suspect", "refused", "failed")},

@@ -64,7 +64,7 @@ def sources(logs: Sequence[str | Path] | str | Path, vehicles: str | Path) -> tu
         none = None if name in sheets else f"vehicle {name}: no sheet for it in {vehicles}"
         out.append(Source(name, files, sheets.get(name), kinds.get(name), none, whole))
     for name in sorted(set(sheets) - set(found)):
-        out.append(Source(name, (), sheets[name], kinds.get(name), f"vehicle {name}: a sheet, and no log"))
+        out.append(Source(name, (), sheets[name], kinds.get(name), f"vehicle {name}: a sheet but no log"))
     return out, notes
 
 

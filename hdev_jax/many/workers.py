@@ -70,7 +70,7 @@ def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> 
         index = {f.key: i for i, f in enumerate(futures)}
         for future in distributed.as_completed(futures, loop=client.loop):
             if future.status in ("cancelled", "lost"):
-                raise InputError(f"{option}: the scheduler is gone; start it, and the same command goes on")
+                raise InputError(f"{option}: the scheduler is gone; start it, then the same command resumes")
             try:
                 record = future.result()
             except distributed.KilledWorker as e:

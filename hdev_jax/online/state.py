@@ -250,7 +250,7 @@ def start(
     if gears is not None:
         notes = [n for n in notes if "no column 'gear'" not in n]
         notes.append(
-            "the rows have no column 'gear': each is predicted in the gears that the trees say, by probability"
+            "the rows have no column 'gear': each is predicted over all gears, by the probabilities of the gear trees"
         )
     for effect_id in across:
         table, vehicle = table.minus(effect_id), vehicle.minus(effect_id)

@@ -144,7 +144,7 @@ class Watch:
     def beside(vehicle: Vehicle, form: Form, library: Mapping[str, type[Effect]] = LIBRARY) -> "Watch":
         """As `of`, from a vehicle and a form."""
         why = {k: "acts across rows" for k, c in library.items() if c.acts_across_rows(form.channels)}
-        why |= {k: "is looked for by a search of its own" for k, c in library.items() if c.searched}
+        why |= {k: "has a search of its own" for k, c in library.items() if c.searched}
         why |= {k: "has a number for each group" for k, c in library.items() if any(p.by for p in c.parameters)}
         by_trip = [k for k, c in library.items() if any(p.name == "at_trip" for p in c.parameters)]
         why |= dict.fromkeys(by_trip, "compares trips with those before them")

@@ -35,7 +35,7 @@ def without_harmful_slope(problem: Problem, split: Split) -> Problem:
     if not float(np.sum(worse)) > error:
         return problem
     rms = [f"{np.sqrt(np.sum(x) / len(segments)):.3g}" for x in (with_it, without)]
-    told = f"the slope does harm: error {rms[0]} {problem.unit} with it, {rms[1]} without; it was left out"
+    told = f"the slope makes it worse: error {rms[0]} {problem.unit} with it, {rms[1]} without; it was left out"
     log = problem.log
     ledger = log.ledger.add("noted", told, count=len(log), column="grade_rad")
     left = replace(log, segments=log.segments.without(*_SLOPE), ledger=ledger)

@@ -78,8 +78,8 @@ def implausible(problem: Problem, trips: tuple[int, ...] | None = None) -> tuple
         return found
     turned = other.factor == -1.0
     evidence = (
-        f"{'' if turned else 'in '}{other.unit} the vehicle of the sheet leaves {_percent(left)} of the measured "
-        f"power's square unexplained, as it is read {_percent(declared)} at the best mass"
+        f"{'' if turned else 'in '}{other.unit} the sheet's vehicle leaves {_percent(left)} of the measured power's "
+        f"mean square unexplained; as the log is read it leaves {_percent(declared)} even at the best mass"
     )
     mend = mended(problem.log, other.name, unit=None if turned else other.unit, sign=turned)
     what = f"{'sign' if turned else 'unit'} of {other.name}"

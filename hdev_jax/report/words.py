@@ -270,7 +270,7 @@ def answer_parts(data: ReportData) -> list[tuple[str, bool]]:
         text = f"\x02This log is suspect: {first['what']}\x03. {'. '.join(said)}."
         if more:
             text += f" Suspected too: {names.verbose_join([m['what'] for m in more])}."
-        text += " No effect was searched; --trust searches all the same."
+        text += " No effect was searched for; --trust searches nonetheless."
     elif effects:
         text = f"The declared model misses {_missing(effects)}: {_where(data)} {_errors(data)}."
         if "unexplained" in verdict:

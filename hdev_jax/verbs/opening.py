@@ -60,7 +60,7 @@ def log_of(logs: Logs, adapter: str | Path | None = None) -> Log:
 def sheet_of(vehicle: Vehicles, library: Mapping[str, type[Effect]]) -> Sheet:
     """The sheet in a file, from Python, or as a result fitted it. Raises `InputError`."""
     if isinstance(vehicle, str) and "\n" in vehicle:
-        raise InputError("vehicle: the text of a sheet; give its path, a Sheet, or the result that it is of")
+        raise InputError("vehicle: found the text of a sheet; give its path, a Sheet or a result")
     if isinstance(vehicle, Mapping):
         return sheet_of_sections(vehicle, library=library)
     if not isinstance(vehicle, str | Path | Sheet | Result):
@@ -128,7 +128,7 @@ def _malformed(effect: type[Effect]) -> str | None:
     if effect.searched:
         return f"searched is {effect.searched!r}; only effects of the library have a search of their own"
     if not any(getattr(effect, hook) is not getattr(Effect, hook) for hook in HOOKS):
-        return f"it has no hook of its own ({', '.join(HOOKS)}), so it does nothing"
+        return f"it overrides none of {', '.join(HOOKS)}, so it does nothing"
     if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
         return "parameters is something else than a tuple of Size, Switch, Shape and Choice (hdev_jax.physics)"
     return _malformed_parameters(effect, parameters)
@@ -247,7 +247,7 @@ def digest_of_effects(effects: Effects) -> str | None:
         try:
             each.append(f"{c.__qualname__} {digest(Path(inspect.getfile(c)))}")
         except (OSError, TypeError) as e:
-            why = "a run in a folder compares its source, which is not available; put it in a file: effects='mine.py'"
+            why = "with out=… its source is needed, and there is none; put the class in a file: effects='mine.py'"
             raise InputError(f"effects: class {c.__name__}: {why}") from e
     return hashlib.sha256(" ".join(each).encode()).hexdigest()
 

@@ -128,7 +128,7 @@ def predict(
         errors = [float(np.sqrt(np.mean((problem.measured - p) ** 2))) for p in (predicted, free)]
         lines.append(
             f"rows one step ahead, from the rows before: RMSE {errors[0]:.4g} {problem.unit} ({errors[1]:.4g} in the "
-            "free run, of which the totals above are)"
+            "free run, from which the totals above come)"
         )
     frame = pd.DataFrame(
         {

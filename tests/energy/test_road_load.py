@@ -95,7 +95,9 @@ def test_too_few_runs_are_refused_and_a_drive_is_no_coast_down():
     assert is_coast_down(log)
     driven = synthetic_log(seed=2, trips=8, rows_per_trip=60).frame
     assert not is_coast_down(Log.from_frame(driven))
-    with pytest.raises(InputError, match=r"trip 'T01' is no coast-down: it gains .* m/s beyond what the slope gives"):
+    with pytest.raises(
+        InputError, match=r"trip 'T01' is not a coast-down: it gains .* m/s beyond what the slope gives"
+    ):
         coast_down(Log.from_frame(driven.drop(columns=["energy_wh"])), 29e3, 1.0)
 
 
@@ -108,7 +110,7 @@ def test_a_drive_whose_mean_force_holds_it_back_is_no_coast_down():
     pushed = Segments.from_arrays(
         duration_s=np.ones(len(t)), speed_start_mps=start, speed_end_mps=end, trip=log.trip, **s.channels
     )
-    with pytest.raises(InputError, match=f"trip '{log.trip_names[1]}' is no coast-down: it gains"):
+    with pytest.raises(InputError, match=f"trip '{log.trip_names[1]}' is not a coast-down: it gains"):
         coast_down(Log(pushed, {}, log.trip_names, log.vehicle_names), MASS_KG, ROTATING)
 
 

@@ -221,7 +221,7 @@ def test_vehicles_are_files_folders_and_parts_of_a_data_set(tmp_path):
     assert [len(by[k].files) for k in "ABCD"] == [1, 2, 1, 0]
     assert [by[k].whole for k in "ABC"] == [False, False, True]
     assert by["C"].missing.startswith("vehicle C: no sheet")
-    assert by["D"].missing == "vehicle D: a sheet, and no log"
+    assert by["D"].missing == "vehicle D: a sheet but no log"
     assert "readme.md" in notes[0]
 
 

@@ -59,7 +59,7 @@ def test_a_slope_that_does_harm_is_left_out_and_said(made, sheet):
     left = without_harmful_slope(problem, split)
     assert not left.segments.has("grade_rad")
     assert not left.segments.has(GRADE_SD)
-    told = next(n for n in left.notes if "the slope does harm" in n)
+    told = next(n for n in left.notes if "the slope makes it worse" in n)
     with_it, without = (float(told.split(mark)[1].split()[0]) for mark in ("error ", "with it, "))
     assert with_it > without
     assert any(e.reason == told and e.count == len(left.log) for e in left.log.ledger)

@@ -126,7 +126,7 @@ def add_switching(training: Training, state: State, rng: np.random.Generator) ->
         new = replace(new, fit=fit, found=(*new.found, found))
     less = _without_last(training, new) if len(kept) > 1 else None
     if less is not None and len(kept) - 1 == len(held):
-        return no(Kind.OUTSCORED, "an effect that loads look like explains more beside the other load", q)
+        return no(Kind.OUTSCORED, "an effect that resembles a load explains more, together with the other load", q)
     return less or new, None
 
 

@@ -26,8 +26,8 @@ class MissingSlope:
     def words(self) -> str:
         """As a part of a sentence."""
         return (
-            f"a force that comes and goes as a slope of at least {100 * self.sd:.1f} % (standard deviation) would "
-            "make, or gusts: the log has no slope, which is the first thing to add"
+            f"a force that varies like that of a slope of at least {100 * self.sd:.1f} % (standard deviation), or of "
+            "gusts; the log has no slope: add it first"
         )
 
 

@@ -280,8 +280,8 @@ def _known(problem: Problem, state: State, last: Calibration, test: np.ndarray, 
     said = problem.predict(state.fit.vehicle)[test]
     plain = metrics(problem.measured[test], said, problem.weight()[test])["rmse"]
     return [
-        "coefficients of the model with the effects are by generalised least squares (smaller standard errors): test "
-        f"RMSE {rmse:.4g} {problem.unit}; {plain:.4g} by ordinary least squares, as in the declared model"
+        "the model with the effects is fitted by generalised least squares, which gives smaller standard errors: test "
+        f"RMSE {rmse:.4g} {problem.unit}; by ordinary least squares, as for the declared model, {plain:.4g}"
     ]
 
 

@@ -40,7 +40,7 @@ def fleet_pieces(result: FleetResult) -> list[tuple[str, bool]]:
                        "others of the type", True))  # fmt: skip
         pieces.append((f" ({_few(differ)})", False))
     if not changed and not differ:
-        pieces.append(("no vehicle changed or differs from its like", True))
+        pieces.append(("no vehicle changed or differs from its type", True))
     if found:
         shown = list(dict.fromkeys(f"{names.effect(e['id'])} ({e['type']})" for e in found))
         pieces += [("; shown by a type's vehicles together: ", False), (_few(shown), True)]
@@ -99,9 +99,9 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
     weeks = pd.DataFrame(rows[rows["level"] == "week"])
     sections = [
         Section(
-            "Vehicles that differ from their like",
-            "A coefficient of a vehicle against what the others of its type predict of it, and against itself before: "
-            "what all of a type do alike in a week is taken off first. Ranked by cost.",
+            "Vehicles that differ from their type, or changed",
+            "Each coefficient of a vehicle is compared with the prediction from the others of its type, and with its "
+            "own earlier value. What all of a type do alike in a week (a season) is removed first. Ranked by cost.",
             {"time_line": (lambda: time_line(done, s["unlike"]), "Coefficients of each vehicle week by week.",
                            "Estimates of each week alone; thick where a change was found.")},
             (_unlike(s["unlike"]),) if s["unlike"] else (),
@@ -115,7 +115,7 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
         ),
         Section(
             "Where the energy goes",
-            "Sums of the vehicles' ledgers: each adds up to what its meter measured.",
+            "Sums of the vehicles' ledgers; each of these adds up to the vehicle's measured energy.",
             {"energy_flow": (lambda: energy_flow(whole), "Energy from the battery to its causes.",
                              "The fleet's energy by cause."),
              "weeks": (lambda: by_week(weeks) if len(weeks) else None, "Stacked bars of energy by cause for each week.",
@@ -128,7 +128,7 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
                             "Each dot is a trip; lines are means of as many trips each.")},
             (),
         ),
-        Section("Coefficients by type", "Each vehicle is one estimate, taken without the sheet's table.", {},
+        Section("Coefficients by type", "Each vehicle counts as one estimate, made without the sheet's prior.", {},
                 (_pooled(s["coefficients"]),) if s["coefficients"] else ()),
         Section("Every vehicle", "", {}, (_vehicles(result.tables["fleet"]),)),
     ]  # fmt: skip

@@ -81,7 +81,7 @@ def _answer(fitted: Fitted, price: float | None, asked: Asked, command: str) -> 
     told = [n for n in fitted.notes if road is None or not n.startswith("[road] is not used")]
     notes = [*told, *said]
     if found.undated:
-        notes.append(f"{found.undated} trips have no date in the log: they are in no week")
+        notes.append(f"{found.undated} trips have no date in the log: no weekly table has them")
     summary = {
         "schema": "hdev-ledger/1",
         "target": fitted.problem.target,

@@ -153,11 +153,11 @@ def fitted_for(problem: Problem, vehicle: Vehicles, *, calibrate: bool = True) -
         fitted = calibrated_on(problem)
         return replace(fitted, notes=(*fitted.notes, *notes[len(problem.notes) :]))
     spread = Spread(**known["spread"]) if known else None
-    how = "as fitted before (predictive.json beside the sheet)" if known else "as the sheet says, give or take its sds"
+    how = "as fitted before (predictive.json beside the sheet)" if known else "the sheet's values, with its sds"
     if calibrate and (given := given_states(problem, known)) is not None:
         problem = given
         notes.append(
-            "loads that switch are on where the measured power shows it; their intervals have no error of that"
+            "loads that switch are decoded from the measured power; the intervals leave out errors of the decoding"
         )
     covariance = covariance_of(problem, known)
     freedom = max(spread.total_freedom, 2.0) if spread else KNOWN

@@ -91,7 +91,7 @@ class Journal:
     def _writing(self) -> Iterator[Run]:
         with self._told(), self._db.transaction() as run:
             if run(f"SELECT owner FROM journal{self._db.types.lock}") != [(self._owner,)]:
-                raise UnavailableError("another hdev serve uses this database since; each needs one of its own")
+                raise UnavailableError("another hdev serve now uses this database; each needs one of its own")
             yield run
 
     def _read(self, query: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
