@@ -1,13 +1,15 @@
-"""Figures of a run: the project's look, and each as PNG and PDF."""
+"""Figures of a run, and of a page of many: the project's look, PNG and PDF."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from hdev_jax.report.canvas import png, style
+from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, figure, plain_log, png, style, tidy
 from hdev_jax.rundir import Run
 
-__all__ = ["save_figure", "styled"]
+__all__ = ["LEAST_COMPARED", "against_paper", "save_figure", "styled"]
+
+LEAST_COMPARED = 3  # models beside the paper's in a figure; fewer are read from the table
 
 
 def styled(draw: Callable[..., None]) -> Callable[..., None]:
@@ -25,3 +27,44 @@ def save_figure(run: Run, fig: Any, name: str) -> None:
     """`figures/NAME.png` and `figures/NAME.pdf`, the same bytes each time."""
     run.path("figures", f"{name}.png").write_bytes(png(fig))
     fig.savefig(run.path("figures", f"{name}.pdf"), metadata={"CreationDate": None, "Creator": None, "Producer": None})
+
+
+def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
+    """The deciding error of each model over the paper's, as PNG; None where fewer than `LEAST_COMPARED` have both.
+
+    **Arguments:** `rows`: `config, name, quantity, paper, ours` (`compare.headlines`) and, over all random starts of a
+    fit, `least to most`. Accuracies, of which more is better, are left out.
+    """
+    models: dict[tuple[Any, ...], list[str]] = {}
+    spread: dict[tuple[Any, ...], Any] = {}
+    for x in rows:
+        if x["paper"] and x["ours"] and "accuracy" not in x["quantity"]:
+            key = (x["name"].replace("_", " "), x["quantity"].replace("_", " "), x["paper"], x["ours"])
+            models.setdefault(key, []).append(x["config"])
+            spread[key] = x.get("least to most")
+    if len(models) < LEAST_COMPARED:
+        return None
+    with style():
+        fig = figure(7.0, 0.9 + 0.24 * len(models))
+        ax = fig.subplots()
+        for i, key in enumerate(models):
+            paper, ours = abs(key[2]), abs(key[3])
+            if span := spread[key]:
+                ax.plot([abs(s) / paper for s in span], [i, i], color="#c3cad1", linewidth=4, solid_capstyle="butt")
+            ax.plot(ours / paper, i, "o", color=AFTER if ours <= paper else BEFORE, markersize=5)
+            ax.annotate(f"{ours / paper:.2f}", (ours / paper, i), (0, 4), textcoords="offset points", ha="center",
+                        va="bottom", fontsize=6.5, color=INK)  # fmt: skip
+        ax.axvline(1.0, color=GREY, linewidth=0.9)
+        ax.set_yticks(range(len(models)), [f"{k[0]}, {k[1]} ({', '.join(c)})" for k, c in models.items()])
+        ax.set_ylim(len(models) - 0.5, -0.7)
+        ax.set_xscale("log")
+        ends = [abs(v) / abs(k[2]) for k in models for v in (k[2], k[3], *(spread[k] or ()))]
+        low, high = min(ends) / 1.15, max(ends) * 1.15
+        ax.set_xlim(low, high)
+        ticks = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+        ax.set_xticks([t for t in ticks if low <= t <= high])
+        plain_log(ax.xaxis)
+        ax.minorticks_off()
+        ax.set_xlabel("our error over the paper's (below 1: smaller); grey: all random starts")
+        tidy(ax, grid="x")
+        return png(fig)

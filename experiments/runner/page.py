@@ -10,6 +10,7 @@ from typing import Any
 
 from experiments.runner.compare import DECIDES, comparison, findings, headlines, notes
 from experiments.runner.config import shown
+from experiments.runner.figures import against_paper
 from experiments.runner.tables import cells, markdown, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
@@ -149,6 +150,8 @@ def write_list_docs(
         first = [{"config": stem, **x} for stem, m in every for x in headlines(m)]
         with_paper = [x for x in first if x["paper"] is not None]
         alone = [x for x in first if x["paper"] is None]
+        measured = {stem for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
+        lines += _against([x for x in with_paper if x["config"] in measured], docs, home.name)
         if with_paper:
             lines += [*_open(_decides(with_paper)), ""]
         if alone:
@@ -171,6 +174,16 @@ def _decides(rows: Sequence[Mapping[str, Any]]) -> str:
     """The table of what decides, quantities in words."""
     words = [{**x, "quantity": str(x["quantity"]).replace("_", " ")} for x in rows]
     return _narrow(markdown(cells(words, 4), DECIDES))
+
+
+def _against(rows: Sequence[Mapping[str, Any]], docs: Path, name: str) -> list[str]:
+    """The figure that leads a page of many runs: the deciding errors beside the paper's; nothing where they are few."""
+    if (image := against_paper(rows)) is None:
+        return []
+    to = docs / "figures" / name / "against_paper.png"
+    to.parent.mkdir(parents=True, exist_ok=True)
+    to.write_bytes(image)
+    return [f"![The deciding error of each model over the paper's](figures/{name}/{to.name})", ""]
 
 
 def _by(arguments: str) -> str:
