@@ -10,9 +10,9 @@ Dynamic Models, 1997, section 12.2: multi-process models).
 What neighbouring rows have in common is a level l that wanders about 0 (Ornstein-Uhlenbeck: sd s, for a time τ): of two
 rows dt apart the earlier level is φ·l + N(0, s²(1 − φ²)), φ = exp(−dt/τ), given the later one.
 
-**What is approximate:** x is taken at the estimate before the row, once (extended Kalman filter); rows that have been
-used stay as they were linearised. Efficiencies and their switch between driving and braking are the non-linear ones:
-within their tables' sds the second-order term is some per cent of a step. A coefficient that is linear has no error.
+**What is approximate:** x is taken once, at the estimate before the row (extended Kalman filter); rows that have been
+used are not linearised again. Only efficiencies and their switch between driving and braking are not linear: for them
+the second-order term is neglected.
 """
 
 from typing import Any
