@@ -169,7 +169,7 @@ def through_kernel(vehicles: int, rows_each: int, draws: int, plain_draws: int) 
          f"{a['ess_bulk'] / ours.wall:.3g} /s", f"{speed[0]:.3g} /s cpu, R-hat {a['r_hat']:.3f}", "–"],
         [f"NumPyro's NUTS, {size} (compiling in its time)", "–", f"{b['ess_bulk'] / plain.wall:.3g} /s",
          f"{speed[1]:.3g} /s cpu, R-hat {b['r_hat']:.3f}", "–"],
-        ["ours over theirs, were each step of theirs an independent draw", "–", f"{speed[0] / most:.3g}",
+        ["ours over theirs, if each step of theirs were an independent draw", "–", f"{speed[0] / most:.3g}",
          "at the least", "10"],
         *([] if b["r_hat"] > CONVERGED else [
             [f"ours over NumPyro's, {size}", "–", f"{speed[0] / speed[1]:.3g}", "processor seconds", "10"],

@@ -191,7 +191,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     said = [f"Fleet: median error {np.median(every):.2f} % over {len(every)} trips"] if every else []
     shares = [100.0 * line["inside_90"] for line in lines if "inside_90" in line]
     if shares:
-        low = "; they do not cover all that the sheet lacks and that differs by trip" if min(shares) < 85.0 else ""
+        low = "; they do not cover effects that the sheet lacks and that differ by trip" if min(shares) < 85.0 else ""
         said.append(f"90 % intervals hold the true mass in {min(shares):.0f} to {max(shares):.0f} % of trips{low}")
     return {
         "artefact": config.artefact, "data": "synthetic fleet; ztbus where the row says measured", "synthetic": True,

@@ -243,8 +243,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "better_than_paper": 0, "of": 0, "logs": sum(len(next(iter(result.values()))) for _, result in results),
         "missed": [] if passed else [f"ranks that are not uniform: p {least:.2g} among {len(tests)} tests"],
         "findings": [
-            f"{'Passed' if passed else 'Not passed'}: the least p of {len(tests)} tests is {least:.2g}; below "
-            f"{LEAST_P / len(tests):.1g} it would be significant at {100 * LEAST_P:.0f} %",
+            f"{'Passed' if passed else 'Not passed'}: the smallest p-value of {len(tests)} tests is {least:.2g}; one "
+            f"below {LEAST_P / len(tests):.1g} would be significant at {100 * LEAST_P:.0f} %",
         ],
         "notes": [
             f"{DRAWS} draws of each world, {APART} apart in a chain: ranks run from 0 to {DRAWS}",

@@ -85,17 +85,17 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "that gets the two possible gears and every deciding input without noise. Bayes' accuracy is at least this",
             "equation 1, as printed in the paper, counts true negatives in the sum of every class: it is the accuracy "
             "over the number of classes (12), at most 1/12; the paper's 'over 90 %' is the usual accuracy",
-            "paper: inputs are speed, requested torque and mass, which cannot distinguish variants: the same speed is "
-            "another gear in another gearbox; sheet: motor speed by gear, power over rated power and the number of "
-            "gears besides; relative: the slope besides, and the output is the distance from the gear of rated motor "
+            "inputs: 'paper' has speed, requested torque and mass, which cannot distinguish variants (the same speed "
+            "is another gear in another gearbox); 'sheet' adds motor speed by gear, power over rated power and the "
+            "number of gears; 'relative' also adds the slope, and predicts the distance from the gear of rated motor "
             "speed",
             "filter: a hidden Markov filter over the row-by-row probabilities; previous_gear: the measured previous "
             "gear is an input; chain: the same classifier, with its own last prediction as the previous gear",
             f"searches: Optuna, {config.trials} trials, {config.folds} folds of whole routes, on at most "
             f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
-            "balanced: from the same probabilities, the likeliest gear if all gears were equally common in training "
-            "(class weights in the decision, not in the fit); gears rarer than a share chosen in the search count as "
-            f"that common; gears of fewer than {LEAST_ROWS} scored rows are left out, of bounds too; for a bound, "
+            "balanced: the same probabilities, divided by how common each gear is in training, give the likeliest gear "
+            "(class weights in the decision, not in the fit). A gear rarer than a share chosen in the search counts as "
+            f"that common. Gears with fewer than {LEAST_ROWS} scored rows are left out, of bounds too. For a bound, "
             "gears are as common as in the scored rows, which can only raise it",
         ],
     }  # fmt: skip

@@ -140,7 +140,7 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
             ours = "" if steps.rule == "ensemble" else f", ours {'among them' if ended[0] else 'not among them'}"
             said.append(f"{n}: {sum(ended)} of {len(ended)} starts converged{ours}; the others stopped after {most}")
     if config.free_run and (ahead := [n for n in found if n in PREDICTION]):
-        said.append(f"{', '.join(ahead)}: one step ahead, as the paper has it here; every other row in free run")
+        said.append(f"{', '.join(ahead)}: predicted one step ahead, as in the paper's table; all others in free run")
     for n in found:
         if settings := found[n]["settings_found"]:
             best = ", ".join(f"{k.replace('_', ' ')} {_words(x)}" for k, x in settings.items())

@@ -31,10 +31,10 @@ from hdev_jax.rundir import Run
 
 __all__ = ["coefficients", "grid", "shares", "table"]
 
-HELD = ("inputs without units include the energy of the calibrated kernel and efficiencies at its operating point: "
-        "only models called 'no kernel' are without physics")  # fmt: skip
-GIVEN = ("ours and the closed form are given the list of effects that the fleet hides; models 'as diagnosed' have the "
-         "effects that the diagnosis of training routes names")  # fmt: skip
+HELD = ("the inputs include the energy of the calibrated kernel and the efficiencies at its operating point, so only "
+        "models called 'no kernel' are without physics")  # fmt: skip
+GIVEN = ("'ours' and the closed form are told which effects the fleet hides; models 'as diagnosed' have the effects "
+         "that the diagnosis of training routes names")  # fmt: skip
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
@@ -96,11 +96,12 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
         "artefact": config.artefact, "data": data, "synthetic": config.data == "fleet", "rows": rows,
         "better_than_paper": 0, "of": 0, "headline": "rmse", "missed": _missed(config, gathered, at_bound),
         "notes": [
-            "the paper's numbers are of its own, private fleet; ours are of "
+            "the paper's numbers come from its private fleet, ours from "
             + ("measured buses" if config.data == "ztbus" else "a synthetic one with other noise"),
-            "training, validation and test by route" if config.data == "fleet" else "held-out missions, by fold",
+            "training, validation and test sets are split by route" if config.data == "fleet"
+            else "the test missions of each fold are held out",
             HELD,
-            "coefficient errors: median of predicted over true, minus one; spray counts as air drag",
+            "coefficient error: median of predicted over true, minus one; spray counts as air drag",
             *diverged(results),
             *still_better(results),
             *([GIVEN] if config.data == "fleet" else []),
@@ -245,9 +246,9 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
                   "ours": {"rmse_wh": x["RMSE [Wh]"], "pe_percent": x["PE [%]"]}} for x in lines],
         "missed": _against_black_boxes(config, curves),
         "notes": [
-            "Figure: the line is the median over seeds, the band all of them; a seed draws a network's first weights, "
-            "while routes are drawn once and LightGBM draws nothing",
-            f"{TAUGHT}: without the vehicles that have no training route",
+            "Figure: the line is the median over seeds, the band covers all of them. A seed draws a network's first "
+            "weights; routes are drawn once, and LightGBM draws nothing",
+            f"{TAUGHT}: vehicles without a training route are left out",
             HELD, GIVEN, *still_better(results), *diverged(results),
         ],
     }  # fmt: skip

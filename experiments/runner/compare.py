@@ -86,7 +86,7 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["tasks_left_out"]:
         said.append(f"Not run: {metrics['tasks_left_out']} more tasks of the config.")
     if metrics.get("skipped"):
-        said.append(f"Could not be made as the config says: {len(metrics['skipped'])}.")
+        said.append(f"Logs that could not be made as the config says: {len(metrics['skipped'])}.")
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += _sentences(metrics.get("findings", []))

@@ -44,8 +44,8 @@ class Settings:
         "collinearity: standard error 18 times that of an orthogonal column",
     )  # fmt: skip
     agreed: float = _number(
-        0.25, "share of a size by ordinary least squares that generalised least squares must not exclude", "1",
-        "chosen on seeds 1-99",
+        0.25, "least size by generalised least squares, over that by ordinary least squares, two standard errors added",
+        "1", "chosen on seeds 1-99",
     )  # fmt: skip
     placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
     placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
@@ -75,7 +75,7 @@ class Settings:
     )
 
     moved: float = _number(
-        3.0, "|prior_z| beyond which no effect may drive a declared coefficient", "sd", "0.3 %, two-sided"
+        3.0, "largest |prior_z| to which an effect may move a declared coefficient", "sd", "0.3 %, two-sided"
     )
 
     # is X still needed beside Y
@@ -87,7 +87,7 @@ class Settings:
         0.8, "least share of an effect's gain that another of its class reaches", "1", "chosen on seeds 1-99"
     )
     inexact: float = _number(
-        0.2, "share by which forms of effects are inexact: effects that differ by less are one class", "1",
+        0.2, "share by which the forms of effects are inexact; effects that differ by less are one class", "1",
         "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
     )  # fmt: skip
 
@@ -98,7 +98,7 @@ class Settings:
 
     # terms without a name
     unnamed_stricter: float = _number(
-        5.0, "times lower FDR level for a term without a name", "1", "a description is not a cause"
+        5.0, "factor by which the FDR level is lower for a term without a name", "1", "a description is not a cause"
     )
     mean_over_swing: float = _number(
         2.0, "largest mean of a load over the amplitude of its cycle", "1", "a square wave that is on for 78 % of it"
@@ -136,12 +136,12 @@ class Settings:
         0.2, "least correlation of the means of neighbouring minutes of a slow remainder", "1", "4 % of their variance"
     )
     level: float = _number(
-        1e-3, "p-value of unexplained structure (a tenth of it for change points and intercepts), of a size that joins "
-        "a found effect, of a cycle that differs between trips", "1", "a test at 0.1 %",
+        1e-3, "p-value below which structure is unexplained (a tenth of it for change points and intercepts), a size "
+        "joins a found effect, or a cycle differs between trips", "1", "a test at 0.1 %",
     )  # fmt: skip
     least_share: float = _number(
-        0.02, "least share of the variance that a found structure explains, or an effect where readings of slope or "
-        "speed have known errors", "1", "1 % of the error",
+        0.02, "least share of the variance that a structure has to explain, or an effect where slope or speed have "
+        "known errors", "1", "1 % of the error",
     )  # fmt: skip
     least_levels: float = _number(
         0.1, "least share of the variance that random intercepts of trips explain", "1", "chosen on seeds 1-99"
