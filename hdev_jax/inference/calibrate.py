@@ -255,7 +255,7 @@ def calibrate(
         )
     sigma += 1e-12
     inflation, tail, steps = 1.0, np.ones(rows), 0
-    message, converged = "left the finite numbers; start nearer or give a prior", False
+    message, converged = "values are no longer finite; start nearer or give a prior", False
     covariance = np.diag(prior_sd**2)  # of a fit that ends before it has looked
     for _ in range(8 if noise == "student_t" else 3):
         if not (np.isfinite(sigma) and point.finite):

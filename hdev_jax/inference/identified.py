@@ -52,7 +52,7 @@ def _of_one(
 ) -> list[str]:
     rows = float(data.rows) * fit.inflation
     if rows <= 0:
-        return ["there are no rows: every coefficient is the table's"]
+        return ["there are no rows: every coefficient comes from the table"]
     out = []
     if rows < FEW_ROWS:
         out.append(f"{rows:.0f} rows: the noise is mostly its prior, not measured")
@@ -69,11 +69,11 @@ def _of_one(
             continue
         which = " and ".join(names[k] for k in members)
         if not undetermined & set(members):
-            out.append(f"{which}: the tables are far more certain than this log, so the values are the tables'")
+            out.append(f"{which}: the table is far more certain than this log, so the value comes from the table")
         elif len(members) == 1:
-            out.append(f"{names[members[0]]} is not identified by this log: its value is the table's")
+            out.append(f"{names[members[0]]} is not identified by this log: its value comes from the table")
         else:
-            out.append(f"this log cannot separate {which}: their values beside each other are the tables'")
+            out.append(f"this log cannot separate {which}: how they share their effect comes from the table")
     out = list(dict.fromkeys(out))  # two directions of the same members are one sentence
     step, covariance, _ = least_squares(data)
     determined = [k for k in range(len(step)) if k not in undetermined]
@@ -89,5 +89,5 @@ def _of_one(
     others = max(float(data.square) - float(data.largest), 0.0) / max(float(data.rows) - 1.0, 1.0)
     if rows > FEW_ROWS and float(data.largest) > OUTLIER**2 * others:
         times = float(jnp.sqrt(data.largest / max(others, 1e-300)))
-        out.append(f"one row is {min(times, 1e6):.3g} times the noise of all others off: look at it, or use student_t")
+        out.append(f"one row is off by {min(times, 1e6):.3g} times the noise of all others: check it, or use student_t")
     return out

@@ -73,7 +73,7 @@ class CopperLoss(Effect):
 
 
 class IronLoss(Effect):
-    """Iron and windage of a turning motor: k₁·|ω| + k₂·ω²."""
+    """Iron and windage loss of the turning motor: k₁·|ω| + k₂·ω²."""
 
     id: ClassVar[str] = "iron_loss"
     label: ClassVar[str] = "iron loss of the motor"
@@ -97,7 +97,7 @@ class IronLoss(Effect):
 
 
 class InverterLoss(Effect):
-    """Inverter: standby while the vehicle is on, and switching loss by current, b·|τ|."""
+    """Inverter loss, standby and switching: P₀ while the vehicle is on, and b·|τ| by current."""
 
     id: ClassVar[str] = "inverter_loss"
     label: ClassVar[str] = "inverter loss"

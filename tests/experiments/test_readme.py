@@ -48,9 +48,7 @@ def test_shares_of_synthetic_logs_are_those_of_the_page():
 
 def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
     _, n, right, false, blamed, *_ = row(SIMULATORS, "any change")
-    assert f"the change is named in {round(100 * float(right))} % of {n} logs" in TEXT
-    assert (
-        f"a false name stands in {round(100 * float(false))} %, in {round(100 * float(blamed))} % an instrument" in TEXT
-    )
+    assert f"The change is named in {round(100 * float(right))} % of {n} logs" in TEXT
+    assert f"a false name is given in {round(100 * float(false))} %; in {round(100 * float(blamed))} % it is" in TEXT
     _, _, _, lasso, *_ = row(SIMULATORS, "LassoCV")
-    assert f"LassoCV has a false name in {round(100 * float(lasso))} %" in TEXT
+    assert f"LassoCV gives a false name in {round(100 * float(lasso))} %" in TEXT

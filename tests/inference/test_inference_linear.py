@@ -188,7 +188,7 @@ def test_vehicles_are_one_program_and_one_without_rows_has_its_table():
         np.testing.assert_allclose(found.sd[v], alone.sd, rtol=1e-9)
     np.testing.assert_allclose(found.values[1], PRIOR)
     np.testing.assert_allclose(found.sd[1], PRIOR_SD)
-    assert caveats(found) == ["group 1: there are no rows: every coefficient is the table's"]
+    assert caveats(found) == ["group 1: there are no rows: every coefficient comes from the table"]
 
 
 def constant_speed() -> Segments:

@@ -279,7 +279,7 @@ def _fit(posterior: _Posterior, strength: float, theta: np.ndarray, instruments:
     if len(odd := np.flatnonzero(~np.isfinite(residual))):
         row = int(np.flatnonzero(problem.moving)[odd[0]]) + 1
         raise InputError(
-            f"learning an efficiency map: the vehicle's energy in row {row} is no number; mend its channels"
+            f"learning an efficiency map: the vehicle's energy in row {row} is not finite; correct its channels"
         )
     least = 1e-6 * float(np.sqrt(np.mean(problem.measured**2))) + 1e-6  # [Wh], for energies without any noise
     noise, instruments = row_noise(residual, problem.shapes, 0.0, least)

@@ -92,7 +92,7 @@ class Draws:
         """Why these draws are no answer; none where they are one."""
         q, out = self.quality(), []
         if not all(np.all(np.isfinite(v)) for v in self.values.values()):
-            out.append("draws left the finite numbers")
+            out.append("draws are not finite")
         if q["chains"] < 2:
             out.append("one chain cannot be compared with another: at least two are expected")
         if not q["r_hat"] <= MOST_R_HAT:
