@@ -12,12 +12,16 @@ TargetName = Literal["energy_wh", "battery_power_kw", "motor_torque_nm", "tracti
 class Target:
     """A measured column that the chain predicts.
 
-    **Fields:** `label` as a thing, `axis` as a quantity by row; `weight`, what a row weighs in a sum: power by
-    duration, force and torque by distance (a torque turns with the wheels: its sum is work, of one gear), energy as is;
-    `per_kwh`, how many of that sum are a kWh, None where it is no energy, and `total`, what the sum is called;
-    `entries` of the chain that lie before it, from the road on, and the `last_stage` before it; `columns` of a log that
-    tell it, the nearest first; `follows`, what follows from it and would tell it as an input (the current is measured
-    power over voltage); `derived_from`, a channel that it can be worked out from with the sheet's ratios.
+    **Fields:**
+
+    - `label`: what it is called. `axis`: what it is called as a quantity by row.
+    - `weight`: of a row in a sum. Power is weighted by duration, force and torque by distance (a torque turns with the
+      wheels, so in one gear its sum is work); energy is summed as it is.
+    - `total`: what the sum is called. `per_kwh`: how much of it is a kWh; None where it is no energy.
+    - `entries`: the entries of the chain before it, from the road on. `last_stage`: the last stage before it.
+    - `columns`: columns of a log that measure it, the nearest first.
+    - `follows`: channels that follow from it and must not be inputs (the current is measured power over voltage).
+    - `derived_from`: a channel from which it can be computed with the sheet's ratios.
     """
 
     name: TargetName

@@ -25,22 +25,24 @@ _ROUNDING = 1e-6  # of a length: ten samples of 10 m are 100 m, whatever their s
 
 
 def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) -> Log:
-    """The log with its rows put together to `length_m` of road, and to halts.
+    """The log with its rows put together to stretches of `length_m` of road, and to halts.
 
-    A row is cut where the distance since the start of its trip passes a multiple of `length_m`. Rows of the log stay
-    whole and belong to the stretch in which they *begin*, so that a stretch is off by at most what one row covers; what
-    is left at the end of a trip is a shorter one. Rows that stand, of distance and end speeds 0, for `halt_s` together
-    are a row of their own with distance 0, and the stretch they interrupt is two shorter rows; shorter standing is part
-    of its stretch, and so are the moments in which a sampled vehicle comes to rest. `halt_s = inf` cuts at no halt.
+    **Stretches.** A new stretch begins where the distance since the start of the trip passes a multiple of `length_m`.
+    Rows of the log stay whole and belong to the stretch in which they *begin*, so the length of a stretch is off by at
+    most that of one row. The last stretch of a trip is shorter.
 
-    Time, distance and energy are sums, conserved in every trip to rounding. Powers and channels are means over time;
-    those that a metre of road has or costs (slope, altitude, curvature, mass, force, torque) over distance, where there
-    is any, the slope as arcsin of the mean of sin θ, so that the climbed height is conserved as well. Headings and wind
-    directions are mean directions [0, 2π); flags become the share of time; the gear, the kind of surface and other
-    whole numbers without a unit are the value held longest (of two held equally long, the lower).
+    **Halts.** Rows at rest (distance and end speeds 0) that last `halt_s` together become one row with distance 0, and
+    the stretch that they interrupt becomes two shorter rows. Shorter halts are part of their stretch, and so are the
+    moments in which a sampled vehicle comes to rest. With `halt_s = inf` no halt is cut out.
 
-    What varies inside a stretch is gone. The kernel has of it the speeds at its ends, so that its acceleration work
-    F·Δs is Δ(½mv²) only where distance over duration is the mean of the two.
+    **Values.** Time, distance and energy are summed, and conserved in every trip to rounding. Powers and most channels
+    are means over time. Slope, altitude, curvature, mass, force and torque are means over distance, where there is any;
+    the slope is arcsin of the mean of sin θ, so the climbed height is conserved too. Headings and wind directions are
+    mean directions [0, 2π). Flags become the share of time. The gear, the kind of surface and other whole numbers
+    without a unit take the value held longest (of two held equally long, the lower).
+
+    What varies inside a stretch is lost. The kernel knows only the speeds at its ends, so its acceleration work F·Δs is
+    Δ(½mv²) only where distance over duration is the mean of the two.
 
     **Arguments:** `log` of any rows (`[row]`, samples or intervals); `length_m` > 0 [m]; `halt_s` > 0 [s].
 

@@ -1,4 +1,4 @@
-"""One vehicle fed from Python: one compiled call for the rows that are there, and a file that keeps what is known."""
+"""One vehicle fed from Python: one compiled call for the rows that have come, and a file that stores the state."""
 
 import json
 import zipfile
@@ -55,10 +55,10 @@ class _Program:
 
 
 class Live:
-    """A state that each call takes some rows further: all that changes is one vector, which the call gives away and
-    gets back, so that a row costs little beyond its arithmetic.
+    """A state that each call updates by some rows.
 
-    `state` is what is known now; setting it begins anew from there.
+    All that changes is one vector, whose memory each call reuses, so a row costs little beyond its arithmetic. `state`:
+    the present state; setting it continues from there.
     """
 
     def __init__(self, state: State):
@@ -80,7 +80,7 @@ class Live:
         return self.rows(row[None], None if candidates is None else candidates[None]).row(0)
 
     def rows(self, rows: Float[np.ndarray, "row column"], candidates: Any = None) -> Now:
-        """Rows in order, each as `update`; what is known after each, as NumPy arrays with the row as first axis."""
+        """Takes rows `[row, column]` in order, each as `update` does; returns `Now` as NumPy arrays `[row, …]`."""
         parts = []
         for at in range(0, len(rows), CHUNK):
             n = min(CHUNK, len(rows) - at)
@@ -123,7 +123,7 @@ def _changes(state: State) -> Any:
 
 
 def keep(path: str | Path, live: Live, about: dict[str, Any]) -> None:
-    """Write what is known to a file, whole or not at all; `about`, plain values that go with it."""
+    """Write the state to a file, whole or not at all. `about`: plain values that are stored with it."""
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, numbers=live.numbers, about=np.array(json.dumps({"schema": SCHEMA} | about)))
 

@@ -135,7 +135,7 @@ def _diagnosed(
         outcome.summary.update(suspect)
         said = [s.line() for s in suspected]
         outcome.summary["notes"] = [f"suspected: {line}" for line in said] + outcome.summary["notes"]
-        text = "\n".join(["The log is suspect; no effect was searched (--trust searches all the same):", *said])
+        text = "\n".join(["The log is suspect; no effect was searched for (--trust searches nonetheless):", *said])
     sheet = _augmented(outcome, start.sheet)
     predictive, notes = predictive_of(start.problem, start.split, outcome.fit, "normal", sheet_digest(sheet))
     outcome.summary["notes"] += notes

@@ -14,9 +14,9 @@ SCHEMA = "hdev-gears/1"
 
 
 def save_gear_model(path: str | Path, classifier: Classifier) -> None:
-    """Write a fitted classifier of boosted trees: the library's model beside, and at `path` what is in it, as JSON.
+    """Write a fitted classifier of boosted trees: a JSON file at `path`, and beside it the library's own model file.
 
-    Raises `InputError` for a kind that is not boosted trees.
+    **Raises:** `InputError` for a kind that is not boosted trees.
     """
     path, ending = Path(path), {"lightgbm": ".txt", "catboost": ".model.json"}.get(classifier.kind)
     if ending is None:
@@ -31,8 +31,9 @@ def save_gear_model(path: str | Path, classifier: Classifier) -> None:
 
 
 def read_gear_model(path: str | Path) -> Trees:
-    """The trees in a file that `save_gear_model` wrote, or in a model of LightGBM, XGBoost or CatBoost (JSON) whose
-    classes are the gears from the first and whose features have the names of `FEATURES`.
+    """The trees in a file that `save_gear_model` wrote, or in a model file of LightGBM, XGBoost or CatBoost (JSON).
+
+    The classes of such a model must be the gears from the first up, and its features must have the names of `FEATURES`.
 
     **Raises:** `InputError`, one line, for a file that cannot be read or is neither.
     """
