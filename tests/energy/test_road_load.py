@@ -150,7 +150,7 @@ def test_driving_tells_the_force_within_its_interval():
             inside.append(load.force_lower[k] <= force <= load.force_upper[k])
     assert np.median(off) < 0.03
     assert np.mean(inside) > 0.75
-    assert any("driveline.efficiency is held" in note for note in load.notes)
+    assert any("driveline.efficiency is not estimated" in note for note in load.notes)
 
 
 def test_what_a_table_says_of_the_load_is_opened_and_it_is_said():

@@ -111,7 +111,7 @@ def test_a_table_has_each_model_in_the_papers_configuration(trips, tmp_path):
     for name in ("pe_trip2", "pe_positive_trip2", "pe_negative_trip2"):
         assert ahead["ours"][name.replace("pe", "energy_error", 1)] == abs(ahead["ours"][name]) > 0
     assert (absent["ours"], absent["reason"]) == (None, "not run")
-    assert any("NARXP: one step ahead" in note for note in metrics["notes"])
+    assert any("NARXP: predicted one step ahead" in note for note in metrics["notes"])
     assert metrics["of"] == 1
     assert metrics["better_than_paper"] + len(metrics["missed"]) == 1
 

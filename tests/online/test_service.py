@@ -136,7 +136,7 @@ def test_a_start_from_the_journal_is_as_if_it_had_never_stopped(fleet, rows, jou
     second.put("a", checked(named(rows[60:100], "T1")))  # in the journal alone
     third = opened(journals("again"))
     third.put("a", checked(named(rows[100:], "T1")))
-    with pytest.raises(UnavailableError, match="another hdev serve uses this database"):
+    with pytest.raises(UnavailableError, match="another hdev serve now uses this database"):
         second.put("a", checked(named(rows[:1], "T2")))  # it has not noticed, and must not lead the rows astray
     np.testing.assert_array_equal(numbers(third), numbers(fleet))
     assert third.known("a", "T1")["rows"] == fleet.known("a", "T1")["rows"]

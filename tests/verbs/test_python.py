@@ -138,7 +138,7 @@ def test_a_class_that_stands_in_no_file_is_tried_but_kept_in_no_folder(log, shee
     made = type("Typed", (Nothing,), {"__module__": "nowhere", "id": "typed"})
     options = {"only": ["auxiliary_power"], "effects": [made]}
     assert hdev_jax.diagnose(log.frame, sheet, **options).summary["excluded"]
-    with pytest.raises(InputError, match="put it in a file"):
+    with pytest.raises(InputError, match="put the class in a file"):
         hdev_jax.diagnose(log.frame, sheet, **options, out=tmp_path / "out")
 
 

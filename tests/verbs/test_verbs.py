@@ -551,7 +551,7 @@ def test_effects_that_do_not_exist(options, words, given, out, capsys):
             USER_EFFECT.replace("    w_per_s: Any\n", '    w_per_s: Any\n    mode: str = "v2"\n'),
             ["'v2'", "static=True"],
         ),
-        (USER_EFFECT.replace("def power", "def pover"), ["SlowDrift", "no hook"]),
+        (USER_EFFECT.replace("def power", "def pover"), ["SlowDrift", "overrides none of"]),
         (
             USER_EFFECT.replace("    equation", '    entries: ClassVar = ("raod",)\n    equation'),
             ["entries", "raod", "road"],
