@@ -121,14 +121,15 @@ def collect(config: Any, results: Sequence[Log], run: Run) -> dict[str, Any]:
         "findings": [*_found_sentences(planted), *_interval_sentence(planted), *_false_sentences(empty, planted),
                      *_beside_sentence(beside)],
         "notes": [
-            "Size: the power of the load over that of the noise; of samples the noise's RMS, of segments the RMS of "
-            "its energy over the median duration of a row. Samples: battery power each second, torque and motor speed "
-            "measured; segments: energy, road entry. Noise: ar1, 0.9 from row to row, unless the line says another; "
-            "random_walk: a random walk in each trip and ar1 of the same RMS",
-            "Found: all loads of the log are named. Of the loads that are found: the share whose power is within 10 % "
-            "of the true one, the share whose time on in the training trips is within 3 points of the true one; the "
-            "share of rows whose state is right, mean; the share of trips whose 90 % interval of energy holds the true "
-            "one, mean",
+            "Size: the power of the load divided by that of the noise. The noise's power is its RMS in samples; in "
+            "segments it is the RMS of its energy divided by the median duration of a row. Samples have the battery's "
+            "power each second, with torque and motor speed measured; segments have energy, and the chain is entered "
+            "at the road. The noise is ar1, 0.9 from row to row, unless the line says otherwise; random_walk is a "
+            "random walk in each trip plus ar1 of the same RMS",
+            "Found: all loads of the log are named. For the loads that are found, the table has the share whose power "
+            "is within 10 % of the true one; the share whose time on in the training trips is within 3 points of the "
+            "true one; the mean share of rows whose state is right; and the mean share of trips whose 90 % interval of "
+            "energy holds the true one",
             "False name: the share of logs in which something is named that is not planted. If a load is not found, "
             "auxiliary_power, hvac_power and periodic_load are not false names: they stand for its mean or its cycle",
         ],
