@@ -113,7 +113,7 @@ class Segments(eqx.Module):
         return eqx.tree_at(lambda s: s.channels, self, kept)
 
     def take(self, rows: np.ndarray) -> "Segments":
-        """Rows by boolean mask or index; ids are kept as they are. Host arrays only."""
+        """Some of the rows, by a boolean mask or indices `[row]`, as NumPy arrays; ids stay as they are."""
         return jax.tree.map(lambda x: np.asarray(x)[rows], self)
 
 

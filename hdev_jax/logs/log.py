@@ -80,7 +80,7 @@ class Log:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """The targets this log can give, nearest the battery first."""
+        """Names of the targets that this log measures, nearest the battery first."""
         there = {*self.measured, *self.segments.channels}
         found = [t for t in TARGETS.values() if there & {*t.columns}]
         # of the battery's that first which is measured itself
@@ -132,17 +132,17 @@ class Log:
         return ""
 
     def select(self, trips: Sequence[int]) -> "Log":
-        """The rows of these trips (by id); ids and names stay as they are."""
+        """The rows of these trips, by their ids; ids and names stay as they are."""
         return self.take(np.isin(self.trip, np.asarray(list(trips), dtype=np.int64)))
 
     def take(self, rows: np.ndarray) -> "Log":
-        """Rows by mask or index."""
+        """The log with some of its rows, by a mask or indices `[row]`."""
         measured = {k: v[rows] for k, v in self.measured.items()}
         part = None if self.part is None else self.part[rows]
         return replace(self, segments=self.segments.take(rows), measured=measured, part=part)
 
     def trip_id(self, name: str) -> int:
-        """The id of a trip by its name. Raises `InputError` with the near name."""
+        """The id of a trip by its name. Raises `InputError`, with the nearest name, if there is none."""
         if name not in self.trip_names:
             shown = ", ".join(self.trip_names[:8]) + (", …" if len(self.trip_names) > 8 else "")
             raise InputError(f"no trip '{name}' in {self._name()}{near(name, self.trip_names)}; it has {shown}")

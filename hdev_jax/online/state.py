@@ -121,13 +121,13 @@ class State(eqx.Module):
 
     @property
     def weights(self) -> Float[Array, " member"]:
-        """Probability of each model of the noise."""
+        """Probability of each model of the noise `[member]`."""
         odds = jnp.exp(self.evidence - jnp.max(self.evidence))
         return odds / jnp.sum(odds)
 
     @property
     def steps(self) -> tuple[Float[Array, " size"], Float[Array, "size size"]]:
-        """Mean and covariance of the steps from the centre, over all models of the noise."""
+        """Mean `[size]` and covariance `[size, size]` of the steps from `centre`, over all models of the noise."""
         w = self.weights
         mean = w @ self.mean
         off = self.mean - mean[None, :]
@@ -136,12 +136,12 @@ class State(eqx.Module):
 
     @property
     def values(self) -> Float[Array, " k"]:
-        """Posterior means of the coefficients, in their units."""
+        """Posterior means of the coefficients `[k]`, in their units."""
         return self.centre + self.scale * self.steps[0][: len(self.form.names)]
 
     @property
     def sd(self) -> Float[Array, " k"]:
-        """Posterior standard deviations of the coefficients, in their units."""
+        """Posterior standard deviations of the coefficients `[k]`, in their units."""
         k = len(self.form.names)
         return self.scale * jnp.sqrt(jnp.diagonal(self.steps[1])[:k])
 

@@ -67,7 +67,10 @@ class Result(ABC):
         return cls(answer, summary, sheet, predictive, partial(_kept, folder))
 
     def write(self, run: Run, out: str | Path) -> None:
-        """Everything into a run's folder, which the user calls `out`; channels in single precision."""
+        """Write all files of the result into the folder of `run`, channels in single precision.
+
+        `out`: the folder's name for the user.
+        """
         run.path(self.sheet_file).write_text(self.sheet)
         for name, content in ((PREDICTIVE, self.predictive), (self.json_file, self.summary)):
             run.path(name).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")

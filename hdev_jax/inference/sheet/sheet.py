@@ -78,7 +78,11 @@ class Sheet:
         return other
 
     def driveline(self, efficiency: Any, *, regenerating: Any = None, covers_machine: bool = False) -> Driveline:
-        """The driveline with the sheet's ratios and these efficiencies; else the kernel's default."""
+        """The driveline with these efficiencies and the sheet's ratios and wheel radius (else the kernel's defaults).
+
+        **Arguments:** `efficiency`, `regenerating`: a number in (0, 1], or an `EfficiencyMap`. `covers_machine`: they
+        cover the chain from the wheel to the battery.
+        """
         return Driveline(
             efficiency,
             None if self.gear_ratios is None else jnp.asarray(self.gear_ratios, dtype=float),
@@ -89,7 +93,7 @@ class Sheet:
         )
 
     def fail(self, key: str, why: str) -> InputError:
-        """The error for a key that is missing."""
+        """The `InputError` for a key that is missing; `why` it is needed."""
         return InputError(f"sheet {self.path}: {key} is missing; it is needed because {why}")
 
     def knows_ratio(self, segments: Segments) -> bool:
@@ -113,7 +117,7 @@ class Sheet:
             self.check_gears(segments)
 
     def check_gears(self, segments: Segments) -> None:
-        """Raise `InputError` where the log is in a gear beyond the declared ratios; one ratio holds for all."""
+        """Raise `InputError` where the log has a gear without a declared ratio; a single ratio holds for every gear."""
         ratios, most = len(self.gear_ratios or ()), most_group(segments, ("gear",))
         if 1 < ratios < most:
             raise InputError(

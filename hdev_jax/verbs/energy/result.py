@@ -41,7 +41,7 @@ class EnergyResult:
 
     @classmethod
     def of_folder(cls, verb: str, folder: Path) -> "EnergyResult":
-        """What `write` left in a finished folder."""
+        """The result in a finished folder."""
         import pandas as pd
 
         summary = json.loads((folder / f"{verb}.json").read_text())
@@ -49,7 +49,7 @@ class EnergyResult:
         return cls(verb, (folder / ANSWER).read_text(), summary, tables, folder)
 
     def write(self, run: Run, out: str | Path) -> None:
-        """Everything into a run's folder, which the user calls `out`."""
+        """Write all files of the result into the folder of `run`; `out` is the folder's name for the user."""
         run.path(f"{self.verb}.json").write_text(json.dumps(self.summary, indent=1, allow_nan=False) + "\n")
         for name, frame in self.tables.items():
             frame.to_csv(run.path(f"{name}.csv"), index=False, float_format="%.8g", lineterminator="\n")
