@@ -268,5 +268,5 @@ def test_readings_are_not_taken_for_exact(monkeypatch):
 def test_a_row_whose_speed_is_no_number_is_named():
     rows = log(300)
     rows.speed_end_mps[30] = np.nan
-    with pytest.raises(InputError, match="in row 31 is no number"):
+    with pytest.raises(InputError, match="in row 31 is not finite"):
         learn_map(car(true_map()), rows, np.ones(300), true_map())
