@@ -219,8 +219,13 @@ def start(
     probability that any of them is ever named where there is none. `gears`: what tells the gear where the sheet's
     efficiency is a map over several and rows have none (default: the trees of the sheet's `driveline.gear_model`).
 
-    **Raises:** `InputError` where the sheet lacks what is in use, or nothing in it is to be estimated.
+    **Raises:** `InputError` where the sheet lacks what is in use, nothing in it is to be estimated, or JAX computes in
+    single precision: rounding errors would add up from row to row.
     """
+    if not jax.config.read("jax_enable_x64"):
+        raise InputError(
+            'estimates row by row need double precision: call jax.config.update("jax_enable_x64", True) first'
+        )
     sample = sample_row(channels).without(*TARGETS[target].follows)
     built = build(sheet, sample, choose_entry(sample, target, sheet), target)
     across = [e.id for e in built.vehicle.effects if e.acts_across_rows(sample.channels)]
