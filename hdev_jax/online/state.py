@@ -235,9 +235,15 @@ def start(
     - `gears`: a classifier of the gear, needed where the efficiency is a map over several gears and rows have no gear;
       by default the trees of the sheet's `driveline.gear_model`.
 
-    **Returns:** the state, and notes on parts of the sheet that are not used. **Raises:** `InputError` where the sheet
-    lacks something that is needed, or has nothing to estimate.
+    **Returns:** the state, and notes on parts of the sheet that are not used.
+
+    **Raises:** `InputError` where the sheet lacks something that is needed or has nothing to estimate, or where JAX
+    computes in single precision: rounding errors would add up from row to row.
     """
+    if not jax.config.read("jax_enable_x64"):
+        raise InputError(
+            'estimates row by row need double precision: call jax.config.update("jax_enable_x64", True) first'
+        )
     sample = sample_row(channels).without(*TARGETS[target].follows)
     built = build(sheet, sample, choose_entry(sample, target, sheet), target)
     across = [e.id for e in built.vehicle.effects if e.acts_across_rows(sample.channels)]

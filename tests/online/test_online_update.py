@@ -177,6 +177,8 @@ def test_what_cannot_be_followed_is_said():
         start(sheet(), CHANNELS, memories=(1.0,))
     with pytest.raises(ValueError, match="level"):
         start(sheet(), CHANNELS, level=90.0)
+    with jax.enable_x64(False), pytest.raises(InputError, match="need double precision: call jax.config.update"):
+        start(sheet(), CHANNELS)
     with pytest.raises(InputError, match=r"unknown column 'speed'; accepted: trip, time_s"):
         packed(begun().form, {"speed": 3.0})
     _, notes = start(sheet(effects={"time_skew": {"skew_s": 0.3}}), CHANNELS)
