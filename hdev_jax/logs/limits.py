@@ -2,12 +2,14 @@
 
 __all__ = [
     "BAD_SHARE",
+    "CHARGES_W",
     "GAP_SAMPLES",
     "MANY_STEEP",
     "MAX_GRADE_RAD",
     "MAX_POWER_W",
     "MAX_SPEED_MPS",
     "REVERSE_MPS",
+    "STANDS_MPS",
 ]
 
 MAX_SPEED_MPS = 60.0  # contract §1: above, the column is in km/h or broken
@@ -19,3 +21,6 @@ MAX_POWER_W = 2e7  # no road vehicle draws it: the largest mining trucks have un
 # that no neighbour bridges.
 BAD_SHARE = 0.05
 GAP_SAMPLES = 10.0  # contract §1: a gap longer than ten samples starts a new trip
+STANDS_MPS = 0.1  # instruments at rest show a little
+# Into the battery: the slowest charger (6 A, one phase, IEC 61851-1) gives 1.4 kW; a sensor's zero is off by less.
+CHARGES_W = -1000.0

@@ -13,7 +13,7 @@ from hdev_jax.targets import TARGETS, TargetName
 __all__ = ["COUNTS", "LASTING_S", "LEVELS", "MEMORIES", "NEEDED", "Form", "packed"]
 
 NEEDED = ("trip", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "measured")
-COUNTS = ("rows", "used", "unusable", "unmeasured", "outliers", "gaps", "clock_jumps", "trips")
+COUNTS = ("rows", "used", "unusable", "unmeasured", "charging", "outliers", "gaps", "clock_jumps", "trips")
 # correlation of a row's error with the one before: from white noise to one that lasts for 30 rows
 MEMORIES = (0.0, 0.5, 0.75, 0.87, 0.93, 0.97)
 LASTING_S = (600.0, 3600.0)  # how long what a trip's rows have in common lasts: a road and its wind; a load, a payload

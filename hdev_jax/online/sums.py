@@ -62,7 +62,8 @@ def whole_posterior(state: State) -> State:
 
     before = jnp.maximum(jnp.where(state.variance > 0, state.variance, usual), TINY)
     mean, covariance, left = jax.vmap(one)(state.sums.gram, of_mean(form, before))
-    variance = before if form.known_noise else jnp.maximum((BELIEVED * usual + left) / (BELIEVED + state.worth), TINY)
+    seen = jnp.maximum((BELIEVED * usual + left) / (BELIEVED + state.worth), TINY)
+    variance = before if form.known_noise else jnp.where(n > 0, seen, state.variance)  # unknown before the first row
     return eqx.tree_at(lambda s: (s.mean, s.covariance, s.variance), state, (mean, covariance, variance))
 
 

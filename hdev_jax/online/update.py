@@ -15,6 +15,7 @@ used are not linearised again. Only efficiencies and their switch between drivin
 the second-order term is neglected.
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +26,15 @@ from scipy import stats
 
 from hdev_jax.inference.calibrate import STUDENT_DF, UNBOUNDED
 from hdev_jax.inference.parameters import insert
-from hdev_jax.logs.limits import GAP_SAMPLES, MAX_GRADE_RAD, MAX_POWER_W, MAX_SPEED_MPS, REVERSE_MPS
+from hdev_jax.logs.limits import (
+    CHARGES_W,
+    GAP_SAMPLES,
+    MAX_GRADE_RAD,
+    MAX_POWER_W,
+    MAX_SPEED_MPS,
+    REVERSE_MPS,
+    STANDS_MPS,
+)
 from hdev_jax.online.form import COUNTS, NEEDED, Form
 from hdev_jax.online.state import Now, State
 from hdev_jax.online.sums import SHARE, TINY, aged, faded, on_a_new_trip, whole_posterior
@@ -118,12 +127,22 @@ def _whole_row(state: State, row: Array) -> tuple[Array, Array, Array]:
     return whole, good, jnp.concatenate([lost[None], gone & jnp.isfinite(before)])
 
 
-def _most(form: Form, duration_s: Array) -> Array:
-    """What the target of no vehicle exceeds, in its unit."""
-    weight, of_battery = TARGETS[form.target].weight, TARGETS[form.target].of_battery
-    if not of_battery:
-        return jnp.full_like(duration_s, MOST)
-    return MAX_POWER_W * (duration_s / J_PER_WH if weight == "row" else jnp.full_like(duration_s, 1e-3))
+def _of_power(form: Form, watts: float, duration_s: Array) -> Array:
+    """What a power at the battery is in a row, in the target's unit; more than any row has where that is another."""
+    target = TARGETS[form.target]
+    if not target.of_battery:
+        return jnp.full_like(duration_s, math.copysign(MOST, watts))
+    return watts * (duration_s / J_PER_WH if target.weight == "row" else jnp.full_like(duration_s, 1e-3))
+
+
+def _charges(form: Form, row: Array, beyond: Array) -> Array:
+    """Whether the row is of charging: the vehicle stands, and more flows into the battery than a sensor's zero is off,
+    and than `beyond`, what the rows' noise can show [target's unit]."""
+    at = {name: i for i, name in enumerate(form.columns)}
+    duration = row[at["duration_s"]]
+    moves = jnp.maximum(row[at["speed_start_mps"]], row[at["speed_end_mps"]]) >= STANDS_MPS
+    moves |= row[at["distance_m"]] > STANDS_MPS * duration
+    return ~moves & (row[at["measured"]] < jnp.minimum(_of_power(form, CHARGES_W, duration), -beyond))
 
 
 def _next(state: State, at: dict[str, int]) -> Array:
@@ -162,15 +181,14 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     good &= jnp.isfinite(base) & jnp.all(
         jnp.isfinite(x)
     )  # NaN where the vehicle reads a channel that never had a value
-    heard = (jnp.abs(row[at["measured"]]) <= _most(form, whole[at["duration_s"]])) & good  # false for NaN
-    y = jnp.where(heard, row[at["measured"]], 0.0)
-    z = jnp.append(x, y - base)
     rho, n = jnp.asarray(form.memories), begun.totals[0]
     fades = jnp.where(jnp.isfinite(since), rho ** jnp.where(jnp.isfinite(since), since, 1.0), 0.0)
     q = (1.0 - fades**2) / (1.0 - rho**2)
-    white, white_c = ((new[None, :] - fades[:, None] * old[None, :]) / jnp.sqrt(q)[:, None]
-                      for new, old in ((z, begun.before), (c, begun.candidate)))  # fmt: skip
-    xs, rs = white[:, :-1], white[:, -1]
+
+    def whitened(new: Array, old: Array) -> Array:
+        return (new[None, :] - fades[:, None] * old) / jnp.sqrt(q)[:, None]
+
+    xs, white_c = whitened(x, begun.before[None, :-1]), whitened(c, begun.candidate[None, :])
     # what the rows before say of this one
     own = jnp.where(begun.variance > 0, begun.variance, jnp.maximum((SHARE * base) ** 2, TINY) * (1.0 - rho**2))
     loud, size = _loudness(begun, base + mean @ x) if form.robust else (jnp.ones(()), jnp.zeros(()))
@@ -181,6 +199,13 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     spread = weights @ (q * width + (told - predicted) ** 2)
     half = jnp.where(n > 0, _reach(form) * jnp.sqrt(spread), jnp.nan)  # of the first row the noise is not known
     # what it says of them
+    heard = (jnp.abs(row[at["measured"]]) <= _of_power(form, MAX_POWER_W, duration)) & good  # false for NaN
+    charges = heard & _charges(form, whole, jnp.where(n >= ENOUGH, FAULT * jnp.sqrt(spread), 0.0))
+    heard &= ~charges
+    y = jnp.where(heard, row[at["measured"]], 0.0)
+    z = jnp.append(x, y - base)
+    rs = whitened(z[-1:], begun.before[None, -1:])[:, 0]
+    white = jnp.concatenate([xs, rs[:, None]], axis=1)
     far = (y - predicted) ** 2 / spread
     sure = form.robust & (n > 0)  # of the first row nothing is known that it could be far from
     tail = jnp.where(sure, (STUDENT_DF + 1.0) / (STUDENT_DF + far), 1.0)
@@ -209,10 +234,11 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
         (sums.plus(white, white_c, weight), evidence - jnp.max(evidence), jnp.where(near, z, begun.before),
          jnp.where(near, c, begun.candidate), jnp.where(near, 0.0, since), running(begun.wide, clipped),
          running(begun.score, score), begun.totals + heard * squares,
-         begun.growth + (heard & (n >= ENOUGH)) * grown, begun.worth + heard / loud, begun.cost_wh + c * wh),
+         begun.growth + jnp.where(heard & (n >= ENOUGH), grown, 0.0), begun.worth + heard / loud,
+         begun.cost_wh + c * wh),
     )  # fmt: skip
-    counts = state.counts + _counted(held, good, heard, fault, gap, jumps, opens)
-    after = eqx.tree_at(lambda s: s.driven_s, whole_posterior(used), used.driven_s + duration)
+    counts = state.counts + _counted(held, good, heard, charges, fault, gap, jumps, opens)
+    after = eqx.tree_at(lambda s: s.driven_s, whole_posterior(used), used.driven_s + duration * ~charges)
     after = watched(after, (n >= WATCH_ROWS) & heard, counts[0])
     new = jax.tree.map(lambda a, b: jnp.where(good, a, b), after, state)
     lasting = jnp.where(good, whole.at[at["measured"]].set(0.0), state.last)
@@ -256,10 +282,11 @@ def wh_per_unit(form: Form, row: Array) -> Array:
     return jnp.asarray(weight * 1e3 / target.per_kwh if target.per_kwh else jnp.nan)
 
 
-def _counted(held: Any, good: Any, heard: Any, fault: Any, gap: Any, jumps: Any, opens: Any) -> Array:
+def _counted(held: Any, good: Any, heard: Any, charges: Any, fault: Any, gap: Any, jumps: Any, opens: Any) -> Array:
     """What became of the row, in the order of `Form.counts`."""
-    own = {"rows": jnp.asarray(True), "used": heard, "unusable": ~good, "unmeasured": good & ~heard,
-           "outliers": fault, "gaps": gap & good, "clock_jumps": jumps & good, "trips": opens & good}  # fmt: skip
+    own = {"rows": jnp.asarray(True), "used": heard, "unusable": ~good, "unmeasured": good & ~heard & ~charges,
+           "charging": charges, "outliers": fault, "gaps": gap & good, "clock_jumps": jumps & good,
+           "trips": opens & good}  # fmt: skip
     return jnp.concatenate([jnp.stack([own[c] for c in COUNTS]), held & good]).astype(float)
 
 

@@ -122,6 +122,27 @@ def test_faults_of_a_stream_are_survived_and_counted(log):
     assert np.all(np.abs(np.asarray(end.values - clean.values) / np.asarray(clean.sd)) < 0.5)
 
 
+@pytest.mark.parametrize("first", [0, 60])
+def test_charging_is_no_drive(log, first):
+    """Half an hour at a charger, before the first drive or between two stretches: it changes nothing and is counted."""
+    segments, y = log
+    state = begun(robust=True, noise=None)
+    good = vectors(state.form, segments, y)
+    at = {c: i for i, c in enumerate(state.form.columns)}
+    stands = np.repeat(good[first : first + 1], 30, axis=0)
+    stands[:, [at["speed_start_mps"], at["speed_end_mps"], at["distance_m"]]] = 0.0
+    stands[:, at["measured"]] = -60.0 + np.random.default_rng(0).normal(size=30)
+    loads = stands.copy()
+    loads[:, at["measured"]] = NOISE_KW * np.random.default_rng(1).normal(size=30)  # some of it is negative
+    rows = [np.concatenate([good[:first], s, good[first:]]) for s in (stands, loads)]
+    end, clean = (scan(state, r)[0] for r in (rows[0], good))
+    assert (end.counted()["charging"], end.counted()["used"]) == (30, len(good))
+    np.testing.assert_allclose(end.values, clean.values, rtol=1e-5)  # the noise is iterated at every row
+    assert float(end.driven_s) == float(clean.driven_s)
+    if first:  # once the noise is known
+        assert "charging" not in scan(state, rows[1])[0].counted()
+
+
 def test_what_a_steady_drive_does_not_excite_stays_while_the_rest_is_followed(log):
     """An hour and a half at constant speed after a mixed drive, with coefficients that wander: openpilot's drift."""
     state = begun(drift={"road.c_rr": 5e-4, "road.cda_m2": 0.3})
@@ -177,7 +198,7 @@ def test_what_cannot_be_followed_is_said():
         start(sheet(), CHANNELS, memories=(1.0,))
     with pytest.raises(ValueError, match="level"):
         start(sheet(), CHANNELS, level=90.0)
-    with jax.enable_x64(False), pytest.raises(InputError, match="need double precision: call jax.config.update"):
+    with jax.enable_x64(False), pytest.raises(InputError, match="need double precision: call jax"):
         start(sheet(), CHANNELS)
     with pytest.raises(InputError, match=r"unknown column 'speed'; accepted: trip, time_s"):
         packed(begun().form, {"speed": 3.0})

@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from hdev_jax.logs.intervals import starts
+from hdev_jax.logs.limits import CHARGES_W, STANDS_MPS
 from hdev_jax.logs.rows.gathered import Rows
 from hdev_jax.units import J_PER_WH
 
 __all__ = ["without_charging"]
 
-STANDS_MPS = 0.1  # instruments at rest show a little
-# Into the battery: the slowest charger (6 A, one phase, IEC 61851-1) gives 1.4 kW; a sensor's zero is off by less.
-CHARGES_W = -1000.0
 LASTS_S = 60.0  # regeneration is over within a sample or two after a stop; the shortest charge at a stop lasts minutes
 BEYOND = 6.0  # standard deviations of noise at standstill
 COHERENT = 8  # rows of one sign: 1 in 256 of as many rows of noise
