@@ -200,7 +200,7 @@ def update(state: State, row: Float[Any, " column"], candidates: Float[Any, " ca
     half = jnp.where(n > 0, _reach(form) * jnp.sqrt(spread), jnp.nan)  # of the first row the noise is not known
     # what it says of them
     heard = (jnp.abs(row[at["measured"]]) <= _of_power(form, MAX_POWER_W, duration)) & good  # false for NaN
-    charges = heard & _charges(form, whole, jnp.where(n >= ENOUGH, FAULT * jnp.sqrt(spread), 0.0))
+    charges = heard & _charges(form, whole, jnp.where(n > 0, FAULT * jnp.sqrt(spread), 0.0))
     heard &= ~charges
     y = jnp.where(heard, row[at["measured"]], 0.0)
     z = jnp.append(x, y - base)
