@@ -28,6 +28,7 @@ from hdev_jax.problem import Problem, Split, prepare, split_trips
 
 __all__ = [
     "ROAD_SIDE",
+    "SHORT",
     "FadingStart",
     "breaches",
     "declared",

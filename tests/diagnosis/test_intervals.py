@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted import FadingStart, declared, found_in_turn, named, opened, run, training
+from planted import SHORT, FadingStart, declared, diagnosed, found_in_turn, named, opened, training
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, columns, finer
@@ -135,9 +135,11 @@ def test_what_a_time_constant_leaves_open_is_what_refits_at_others_come_to(tmp_p
 
 
 @pytest.mark.slow
-def test_a_limit_anywhere_between_two_temperatures_leaves_the_slope_open():
+def test_a_limit_anywhere_between_two_temperatures_leaves_the_slope_open(tmp_path):
     """Six trips, most of them cold: the slope and the limit of heating trade against each other."""
-    synthetic, result = run(4186, effects={"hvac_power": {}}, ratio=4.0, trips=6)
+    made = SHORT | {"effects": {"hvac_power": {}}, "ratio": 4.0, "trips": 6, "seed": 4186}
+    synthetic, problem, split = opened(tmp_path, **made)
+    result = diagnosed(problem, split, {k: LIBRARY[k] for k in ("hvac_power", "auxiliary_power", "cabin_warmup")})
     assert named(result) == ["hvac_power"]
     told, planted = result.summary["effects"][0]["parameters"], synthetic.vehicle.effects["hvac_power"]
     sheet = result.found["hvac_power"]  # numbers that belong together

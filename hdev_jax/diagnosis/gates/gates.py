@@ -205,7 +205,7 @@ def stability(a: Asked) -> float:
         gains = []
         for s, (evidence, candidate) in zip(rivals, small, strict=True):
             if s.plain:
-                gain = replace(evidence, grams=evidence.grams[drawn]).plain_score(candidate).gain
+                gain = replace(evidence, grams=evidence.grams[drawn]).plain_gain(candidate.columns)
             else:
                 gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
             gains.append(scores.worth(replace(s, gain=gain)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special, stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.scores.normal_equations import NormalEquations, solved
@@ -125,15 +125,10 @@ class Evidence(NormalEquations):
         for places, at in self._alike([c.columns for c in candidates], g):
             k = at.shape[-1]
             likelihood, x = self._fit(totals, at)
-            full, beta = self._jackknife(at, 0), x[0, :, self.base :]
-            p = wald(beta, full[..., self.base :])
-            # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
-            statistic = np.zeros(len(places))
-            if g >= least_clusters(k):
-                statistic = np.minimum(stats.f.isf(np.maximum(p, 1e-60), k, g - k), 1e12) * k / (g - k)
+            gain, full = self._plain_gain(at, x[0])
+            beta = x[0, :, self.base :]
             better = self._base_loss(0)[:, None] - self._loss(full, self._with_base(at), 0)
             t = np.mean(better, axis=0) / (np.std(better, axis=0) + 1e-300) * np.sqrt(g)
-            gain = 0.5 * g * np.log1p(statistic)
             # as much of it as clusters keep that are left out of the fit
             whole = np.max(likelihood, axis=0) - self.base_likelihood(totals)
             kept = np.sum(better, axis=0) / np.maximum(whole, 1e-300)
@@ -146,6 +141,21 @@ class Evidence(NormalEquations):
                     self.left(candidates[j].columns), plain=True,
                 )  # fmt: skip
         return [out[k] for k in range(len(candidates))]
+
+    def plain_gain(self, columns: Sequence[int]) -> float:
+        """The gain of `plain_score` alone, for resampling."""
+        at = self.base + np.asarray(columns, dtype=int)
+        return float(self._plain_gain(at, self._fit(np.sum(self.by_cluster(0), axis=0)[None], at)[1][0])[0])
+
+    def _plain_gain(self, at: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gains of ways [*way k] with these coefficients [*way n], and the coefficients with each cluster left out."""
+        full, k, g = self._jackknife(at, 0), at.shape[-1], self.count
+        p = wald(x[..., self.base :], full[..., self.base :])
+        if g < least_clusters(k):
+            return np.zeros_like(p), full
+        # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
+        statistic = np.minimum(special.fdtri(k, g - k, 1.0 - np.maximum(p, 1e-60)), 1e12) * k / (g - k)
+        return 0.5 * g * np.log1p(statistic), full
 
     def beside(self, other: Sequence[int], own: Sequence[int]) -> float:
         """p of a candidate's columns against zero when another's are in, with jackknifed clusters."""
@@ -197,7 +207,8 @@ class Evidence(NormalEquations):
             if abs(sign @ energy) > 0.98 * energy.sum():
                 continue
             other = small.flipped(candidate, sign)
-            out[i] = other.plain_score(candidate).gain if s.plain else other.gain(other.totals(), candidate.columns)[0]
+            columns = candidate.columns
+            out[i] = other.plain_gain(columns) if s.plain else other.gain(other.totals(), columns)[0]
         return out
 
     def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:

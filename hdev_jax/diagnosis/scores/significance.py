@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
+from scipy import special, stats
 
 __all__ = ["clusters_needed", "clusters_to_tell", "effective_number", "least_clusters", "ruled_out", "wald"]
 
@@ -28,7 +28,7 @@ def wald(
     inverse = np.linalg.pinv(covariance / (d[..., :, None] * d[..., None, :]), rcond=1e-10)
     w = np.einsum("...i,...ij,...j->...", beta / d, inverse, beta / d)
     f = g - k if freedom is None else freedom
-    return np.asarray(stats.f.sf(w * f / (k * (f + k - 1)), k, f))
+    return np.asarray(special.fdtrc(k, f, np.maximum(w, 0.0) * f / (k * (f + k - 1))))  # F's upper tail
 
 
 def clusters_needed(p: float, k: int, clusters: int, level: float, rests_on: float | None = None) -> int | None:
