@@ -3,6 +3,7 @@
 import json
 import sqlite3
 import threading
+import weakref
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,12 +23,17 @@ class SqliteFile:
     def __init__(self, path: str | Path):
         self.shown: str = str(path)
         self._lock = threading.Lock()
+        db: sqlite3.Connection | None = None
         try:
-            self._db = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
-            self._db.execute("PRAGMA journal_mode = WAL")
-            self._db.execute("PRAGMA synchronous = FULL")
+            db = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = FULL")
+            self._db: sqlite3.Connection = db
         except sqlite3.Error as e:
+            if db is not None:
+                db.close()
             raise InputError(f"--state {path}: no database of hdev serve ({e}); name another file") from e
+        weakref.finalize(self, db.close)  # also where nobody closes it
 
     @contextmanager
     def transaction(self) -> Iterator[Run]:
