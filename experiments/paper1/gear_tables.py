@@ -82,7 +82,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "rows of training, of unseen routes and of unseen variants "
             f"({', '.join(config.held_variants)}): {', '.join(map(str, counts))}; single-speed vehicles are left out",
             "bound: outside the hysteresis band the gear is certain; inside it, the bound is the held-out accuracy of "
-            "a classifier that is told the two possible gears and every deciding input without noise. Bayes' accuracy "
+            "a classifier that knows the two possible gears and every deciding input without noise. Bayes' accuracy "
             "is at least this",
             "equation 1, as printed in the paper, counts true negatives in the sum of every class: it is the accuracy "
             "over the number of classes (12), at most 1/12; the paper's 'over 90 %' is the usual accuracy",

@@ -33,7 +33,7 @@ __all__ = ["coefficients", "grid", "shares", "table"]
 
 HELD = ("the inputs include the energy of the calibrated kernel and the efficiencies at its operating point, so only "
         "models called 'no kernel' are without physics")  # fmt: skip
-GIVEN = ("'ours' and the closed form are told which effects the fleet hides; models 'as diagnosed' have the effects "
+GIVEN = ("'ours' and the closed form know which effects the fleet hides; models 'as diagnosed' have the effects "
          "that the diagnosis of training routes names")  # fmt: skip
 # Names of the papers' rows in metrics.json.
 NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",

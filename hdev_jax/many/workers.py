@@ -59,8 +59,8 @@ def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> 
             cluster = distributed.LocalCluster(
                 n_workers=min(where.count, len(tasks)), threads_per_worker=1, processes=True, memory_limit=0,
                 silence_logs=50,
-                # its pages at any free port of this machine alone: by default all networks see them at 8787, and a
-                # second cluster is told off
+                # any free port, of this machine alone: by default it is 8787 on all networks, and a second cluster
+                # finds that taken
                 dashboard_address="127.0.0.1:0", scheduler_kwargs={"dashboard": False},
             )  # fmt: skip
             stack.callback(cluster.close)

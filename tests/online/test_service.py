@@ -394,7 +394,7 @@ def test_a_state_that_had_other_numbers_is_made_again_from_the_rows(tmp_path, sh
     journal.keep([("a", "T1", kept)])
     again = Fleet(journal, sheets_in(sheets), watch=False)
     assert again.known("a", "T1") == expected
-    assert again.version > 0, "who listens is told of what a start has used"
+    assert again.version > 0, "listeners hear of what a start has used"
 
 
 def test_brakes_that_drag_let_go_on_the_rest_of_the_trip(tmp_path, sheets, rows):
