@@ -179,7 +179,7 @@ RUN = (
     "paper1/table1", "paper1/fig5", "paper1/table2", "studies/pinn_buses", "studies/pinn_data",
     "studies/pinn_weights", "paper2/table2", "paper2/fig12", "paper2/selection", "paper2/table8", "paper2/pedal",
     "paper2/online", "studies/coverage", "studies/linearity", "studies/many", "studies/maps", "studies/mass",
-    "studies/ranks", "studies/switching", "studies/simulators", "studies/while_driving",
+    "studies/ranks", "studies/switching", "studies/simulators", "studies/while_driving", "studies/instruments",
 )  # fmt: skip
 
 
