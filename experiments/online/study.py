@@ -24,7 +24,7 @@ from hdev_jax.online import State, Watch, forecast, scan, start
 from hdev_jax.online.running import Running, running_channels
 from hdev_jax.rundir import Run
 
-__all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
+__all__ = ["SOURCES", "Config", "Noise", "collect", "rows_of", "run", "tasks", "watching"]
 
 SOURCES = ()
 PADDED = 128  # rows are padded to a multiple, so that few lengths are compiled; a row of NaN counts for nothing
@@ -96,7 +96,8 @@ def _fed(state: State, rows: np.ndarray, watch: Watch | None = None) -> tuple[St
     return scan(state, padded, None if watch is None else watch.columns(padded))
 
 
-def _rows(state: State, made: SyntheticLog) -> np.ndarray:
+def rows_of(state: State, made: SyntheticLog) -> np.ndarray:
+    """The rows of a log as `update` reads them."""
     frame = made.frame
     named = {"measured": frame["energy_wh"], "trip": frame["trip_id"].astype("category").cat.codes + 1.0}
     each = pd.DataFrame(Running.over(zip(frame["trip_id"], frame.to_dict("records"), strict=True)), index=frame.index)
@@ -145,13 +146,13 @@ def _estimates(task: dict[str, Any]) -> dict[str, Any]:
     """(estimate − truth)/sd of c_rr and C_dA at the end; of the mass after 10 km of each trip, with its error [%]."""
     made = _log(task)
     known, _ = start(Sheet(mass_kg=29e3, road=ROAD, driveline={"efficiency": 0.91}), ("mass_kg", "grade_rad"))
-    end, _ = _fed(known, _rows(known, made))
+    end, _ = _fed(known, rows_of(known, made))
     truth, names = {"road.c_rr": made.vehicle.c_rr, "road.cda_m2": made.vehicle.cda_m2}, list(end.form.names)
     where = [next(i for i, n in enumerate(names) if n.endswith(path.split(".")[1])) for path in truth]
     z = [(float(np.asarray(end.values)[i]) - t) / float(np.asarray(end.sd)[i])
          for i, t in zip(where, truth.values(), strict=True)]  # fmt: skip
     open_, _ = start(Sheet(mass_kg=(29e3, 8e3), road=ROAD, driveline={"efficiency": 0.91}), ("grade_rad",))
-    _, now = _fed(open_, _rows(open_, made))
+    _, now = _fed(open_, rows_of(open_, made))
     k = list(open_.form.names).index("mass_kg")
     mass, sd, true = np.asarray(now.values)[:, k], np.asarray(now.sd)[:, k], made.frame["mass_kg"].to_numpy()
     error, over = [], []
@@ -177,17 +178,22 @@ def _log(task: dict[str, Any]) -> SyntheticLog:
 def _alarms(task: dict[str, Any]) -> dict[str, Any]:
     """The effect that is named, those that are as likely, and the row from which on it is certain; None for none."""
     made = _log(task)
-    sheet = Sheet(mass_kg=29e3, road=ROAD, driveline={"efficiency": 0.91})
-    here = [c for c in CHANNELS if c in made.frame]
-    here += running_channels(here)
-    watch = Watch.of(start(sheet, here)[0])
-    state, _ = start(sheet, here, candidates=watch.candidates)
-    rows = _rows(state, made)
+    state, watch = watching(made)
+    rows = rows_of(state, made)
     end, _ = _fed(state, rows, watch)
     alarm = watch.alarm(end)
     if alarm is None:
         return {"named": None, "rows": len(rows)}
     return {"named": alarm.effect, "instead": list(alarm.instead), "certain_row": alarm.certain_row, "rows": len(rows)}
+
+
+def watching(made: SyntheticLog) -> tuple[State, Watch]:
+    """A vehicle of the log before its first row, and what is watched: every effect that its channels allow."""
+    sheet = Sheet(mass_kg=29e3, road=ROAD, driveline={"efficiency": 0.91})
+    here = [c for c in CHANNELS if c in made.frame]
+    here += running_channels(here)
+    watch = Watch.of(start(sheet, here)[0])
+    return start(sheet, here, candidates=watch.candidates)[0], watch
 
 
 def _batch(task: dict[str, Any]) -> dict[str, Any]:
