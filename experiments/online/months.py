@@ -56,7 +56,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     """The rows, and at which of them each vehicle had an alarm (0: none)."""
     made = synthetic_log(seed=task["seed"], trips=task["trips"], rows_per_trip=task["rows_per_trip"])
     state, watch = watching(made)
-    rows = rows_of(state, made)
+    rows = rows_of(state, made.frame)
     lengths = made.frame.groupby("trip_id", sort=False).size().to_numpy()
     rng = np.random.default_rng([task["seed"], 5])
     noise = [noise_of_one(rng, lengths, task["noise"], task["ar_coefficient"]) for _ in range(task["vehicles"])]

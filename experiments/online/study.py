@@ -1,8 +1,9 @@
 """Are estimates, forecasts and alarms right while a vehicle drives?
 
-Three kinds of stream, all synthetic. Routes of the fleet's models: at a quarter, half and three quarters of each trip,
-the energy of the rest is forecast from the rows so far, the first paper's table 1 at every point of a trip; with the
-sheet as declared, and with the sheet that a diagnosis of earlier routes of the same vehicle writes. Logs whose sheet
+Three kinds of stream, all synthetic. Trips of the fleet's models: at a quarter, half and three quarters of each, the
+energy of the rest is forecast from the rows so far. Trips are laps of one track, as in the first paper's table 1, or
+routes; these with the sheet as declared, and with the sheet that a diagnosis of earlier routes of the same vehicle
+writes. Logs whose sheet
 gives c_rr, C_dA and the mass by trip an sd: the estimates at the end against the truth. Logs in which an effect is
 planted, or none: which alarm comes, and after how many rows; and how many rows a diagnosis of the log needs.
 """
@@ -28,6 +29,7 @@ __all__ = ["SOURCES", "Config", "Noise", "collect", "rows_of", "run", "tasks", "
 
 SOURCES = ()
 PADDED = 128  # rows are padded to a multiple, so that few lengths are compiled; a row of NaN counts for nothing
+NOISE_WH, NOISE_SHARE = 3.0, 0.01  # of a row's energy, as in configs/paper1/table1.toml
 FAR_M = 10_000.0  # after which a trip's mass has to be known
 ROAD = {"c_rr": (0.006, 0.0008), "cda_m2": (5.6, 0.5)}
 CHANNELS = (
@@ -49,6 +51,8 @@ class Config(Strict):
     routes: int = Field(15, ge=3)
     routes_before: int = Field(12, ge=3)  # which the diagnosis has
     worlds: int = Field(4, ge=1)
+    tracks: int = Field(50, ge=1)
+    laps: int = Field(4, ge=1)  # of each track
     shares: list[float]  # of a trip, after which the rest is forecast
     noises: list[Noise]
     logs: int = Field(25, ge=1)  # of each noise
@@ -66,6 +70,8 @@ class Config(Strict):
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """A model in a world, a log of a noise, a log with an effect: each with its own seed."""
     for model in config.models:
+        yield {"kind": "laps", "model": model, "routes": config.tracks, "laps": config.laps, "shares": config.shares,
+               "seed": config.seed}  # fmt: skip
         for world in range(config.worlds):
             yield {"kind": "forecast", "model": model, "routes": config.routes,
                    "routes_before": config.routes_before, "shares": config.shares,
@@ -86,7 +92,8 @@ def tasks(config: Config) -> Iterator[dict[str, Any]]:
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
     """One stream."""
-    return {"forecast": _forecasts, "estimates": _estimates, "alarms": _alarms, "batch": _batch}[task["kind"]](task)
+    kinds = {"forecast": _forecasts, "laps": _laps, "estimates": _estimates, "alarms": _alarms, "batch": _batch}
+    return kinds[task["kind"]](task)
 
 
 def _fed(state: State, rows: np.ndarray, watch: Watch | None = None) -> tuple[State, Any]:
@@ -96,9 +103,8 @@ def _fed(state: State, rows: np.ndarray, watch: Watch | None = None) -> tuple[St
     return scan(state, padded, None if watch is None else watch.columns(padded))
 
 
-def rows_of(state: State, made: SyntheticLog) -> np.ndarray:
+def rows_of(state: State, frame: pd.DataFrame) -> np.ndarray:
     """The rows of a log as `update` reads them."""
-    frame = made.frame
     named = {"measured": frame["energy_wh"], "trip": frame["trip_id"].astype("category").cat.codes + 1.0}
     each = pd.DataFrame(Running.over(zip(frame["trip_id"], frame.to_dict("records"), strict=True)), index=frame.index)
     named |= {c: each[c] for c in each}
@@ -113,24 +119,49 @@ def _forecasts(task: dict[str, Any]) -> dict[str, Any]:
     v = fleet.vehicles[0]
     with tempfile.TemporaryDirectory() as folder:
         declared = fleet.write_sheets(folder)[v.id]
-        seen = v.frame[v.frame["trip_id"].isin(v.trip_names[:before])]
-        found = diagnose(seen, declared)
+        seen = v.frame["trip_id"].isin(v.trip_names[:before])
+        found = diagnose(v.frame[seen], declared)
         diagnosed = declared.with_name("diagnosed.toml")
         diagnosed.write_text(found.sheet)
-        states = {"declared": start(read_sheet(declared), v.segments.channels.keys(), "energy_wh")[0],
-                  "diagnosed": start(read_sheet(diagnosed), v.segments.channels.keys(), "energy_wh")[0]}  # fmt: skip
-    rests = {name: _rests(state, v, before, task["shares"]) for name, state in states.items()}
+        sheets = {"declared": read_sheet(declared), "diagnosed": read_sheet(diagnosed)}
+    trips = [pd.DataFrame(part) for _, part in v.frame[~seen].groupby("trip_id", sort=False)]
+    rests = {name: _rests(_before(sheet, v), trips, task["shares"]) for name, sheet in sheets.items()}
     return {**rests, "effects": list(found.effects["effect"])}
 
 
-def _rests(state: State, v: FleetVehicle, before: int, shares: Sequence[float]) -> dict[str, Any]:
-    """By share, of each trip after those `before`: error of the rest's energy and half its interval [%]."""
-    columns = {"measured": v.energy_wh, **v.segments.channels}
-    every = [np.asarray(columns.get(c, getattr(v.segments, c, None)), float) for c in state.form.columns]
-    rows, trip = np.stack(every, axis=1), np.asarray(v.segments.trip)
+def _laps(task: dict[str, Any]) -> dict[str, Any]:
+    """The first paper's table 1 (`experiments.paper1.table1`): each trip is laps of one track, known by none before."""
+    fleet = simulate({"seed": task["seed"] + 1, "routes": task["routes"], "variants": [task["model"]]})
+    v = fleet.vehicles[0]
+    with tempfile.TemporaryDirectory() as folder:
+        state = _before(read_sheet(fleet.write_sheets(folder)[v.id]), v)
+    out: dict[str, list[Any]] = {str(s): [] for s in task["shares"]}
+    rng = np.random.default_rng([task["seed"], 3])
+    for name, lap in v.frame.groupby("trip_id", sort=False):
+        shown = np.asarray(v.truth["energy_shown_wh"])[(v.frame["trip_id"] == name).to_numpy()]
+        once = float((lap["time_s"] + lap["duration_s"]).iloc[-1])
+        sd = np.hypot(NOISE_WH, NOISE_SHARE * shown)
+        laps = [
+            lap.assign(time_s=lap["time_s"] + k * once, energy_wh=shown + sd * rng.standard_normal(len(lap)))
+            for k in range(task["laps"])
+        ]
+        for share, each in _rests(state, [pd.concat(laps, ignore_index=True)], task["shares"]).items():
+            out[share] += each
+    return {"declared": out}
+
+
+def _before(sheet: Sheet, v: FleetVehicle) -> State:
+    """A vehicle of the fleet before its first row."""
+    here = list(v.segments.channels)
+    return start(sheet, [*here, *running_channels(here)], "energy_wh")[0]
+
+
+def _rests(state: State, trips: Sequence[pd.DataFrame], shares: Sequence[float]) -> dict[str, Any]:
+    """By share, of each trip: error of the rest's energy and half its interval [%]."""
     measured, out = state.form.columns.index("measured"), {str(s): [] for s in shares}
-    for k in np.unique(trip)[before:]:
-        own, at = rows[trip == k], 0
+    for k, trip in enumerate(trips):
+        own, at = rows_of(state, trip), 0
+        own[:, state.form.columns.index("trip")] = k + 1.0
         for share in sorted(shares):
             until = int(share * len(own))
             state, _ = _fed(state, own[at:until])
@@ -146,13 +177,13 @@ def _estimates(task: dict[str, Any]) -> dict[str, Any]:
     """(estimate − truth)/sd of c_rr and C_dA at the end; of the mass after 10 km of each trip, with its error [%]."""
     made = _log(task)
     known, _ = start(Sheet(mass_kg=29e3, road=ROAD, driveline={"efficiency": 0.91}), ("mass_kg", "grade_rad"))
-    end, _ = _fed(known, rows_of(known, made))
+    end, _ = _fed(known, rows_of(known, made.frame))
     truth, names = {"road.c_rr": made.vehicle.c_rr, "road.cda_m2": made.vehicle.cda_m2}, list(end.form.names)
     where = [next(i for i, n in enumerate(names) if n.endswith(path.split(".")[1])) for path in truth]
     z = [(float(np.asarray(end.values)[i]) - t) / float(np.asarray(end.sd)[i])
          for i, t in zip(where, truth.values(), strict=True)]  # fmt: skip
     open_, _ = start(Sheet(mass_kg=(29e3, 8e3), road=ROAD, driveline={"efficiency": 0.91}), ("grade_rad",))
-    _, now = _fed(open_, rows_of(open_, made))
+    _, now = _fed(open_, rows_of(open_, made.frame))
     k = list(open_.form.names).index("mass_kg")
     mass, sd, true = np.asarray(now.values)[:, k], np.asarray(now.sd)[:, k], made.frame["mass_kg"].to_numpy()
     error, over = [], []
@@ -179,7 +210,7 @@ def _alarms(task: dict[str, Any]) -> dict[str, Any]:
     """The effect that is named, those that are as likely, and the row from which on it is certain; None for none."""
     made = _log(task)
     state, watch = watching(made)
-    rows = rows_of(state, made)
+    rows = rows_of(state, made.frame)
     end, _ = _fed(state, rows, watch)
     alarm = watch.alarm(end)
     if alarm is None:

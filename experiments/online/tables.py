@@ -13,7 +13,8 @@ from hdev_jax.rundir import Run
 
 __all__ = ["tabulate"]
 
-SHEETS = ("declared", "diagnosed")
+SHEETS = {"laps": ("declared",), "forecast": ("declared", "diagnosed")}
+TRIPS = {"laps": "laps of a track", "forecast": "routes"}
 TWICE = 2.0  # times the rows that a diagnosis needs: an alarm should come by then
 
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
@@ -24,10 +25,12 @@ def tabulate(
     results: Results, run: Run, caption: str, held: tuple[float, float], within_percent: Mapping[str, float]
 ) -> tuple[list[str], list[str], list[Line]]:
     """Write three tables and a figure. Returns what was found, the targets missed, and the rows of all tables."""
-    kinds = ("forecast", "estimates", "alarms", "batch")
-    forecasts, ends, streams, batch = ([(t, r) for t, r in results if t["kind"] == k] for k in kinds)
+    kinds = ("laps", "forecast", "estimates", "alarms", "batch")
+    laps, forecasts, ends, streams, batch = ([(t, r) for t, r in results if t["kind"] == k] for k in kinds)
     shares = sorted(forecasts[0][0]["shares"])
-    rests = [_rest(forecasts, sheet, share) for share in shares for sheet in SHEETS]
+    lines = [(kind, sheet) for kind, sheets in SHEETS.items() for sheet in sheets]
+    rest = {(k, x): [_rest([*laps, *forecasts], k, x, share) for share in shares] for k, x in lines}
+    rests = [line for each in rest.values() for line in each]
     noises = list(dict.fromkeys(t["noise"] for t, _ in ends))
     estimates = [line for noise in noises for line in _of_noise(ends, noise)]
     quiet = [_of_alarms(streams, planted=None, noise=noise) for noise in noises]
@@ -36,7 +39,7 @@ def tabulate(
     write_tables(run, "ahead", rests, caption)
     write_tables(run, "estimates", estimates, "Estimates at the end of a log, mass after 10 km of each trip; synthetic")
     write_tables(run, "alarms", [*quiet, *alarms], "Alarms; synthetic")
-    _figure(run, forecasts, shares, alarms)
+    _figure(run, [*laps, *forecasts], shares, alarms)
     low, high = held
     missed = []
     for line in (*rests, *estimates):
@@ -51,13 +54,15 @@ def tabulate(
             missed.append(f"{line['name']}: in {late} of {line['batch_logs']} logs that a diagnosis names it in, no "
                           "alarm within twice the rows")  # fmt: skip
     false = sum(round(a["false_percent"] * a["n"] / 100.0) for a in quiet)
-    before, after = rests[len(SHEETS) * (len(shares) // 2) :][:2]
+    lap, before, after = (each[len(shares) // 2] for each in rest.values())
     named, soon = (sum(a[k] for a in alarms) for k in ("batch_logs", "within_twice"))
     found = [
-        f"After {after['share_percent']:.0f} % of a trip, the forecast of its remaining energy has a median error of "
-        f"{after['median_error_percent']:.2g} % with the sheet that a diagnosis of {forecasts[0][0]['routes_before']} "
-        f"earlier trips writes, {before['median_error_percent']:.2g} % with the declared one ({after['n']} trips); "
-        f"90 % intervals contain {after['inside_90']:.0f} and {before['inside_90']:.0f} %",
+        f"After {lap['share_percent']:.0f} % of a trip of laps on one track (the first paper's table 1), the forecast "
+        f"of its remaining energy has a median error of {lap['median_error_percent']:.2g} % ({lap['n']} trips); 90 % "
+        f"intervals contain {lap['inside_90']:.0f} %",
+        f"On routes it is {before['median_error_percent']:.2g} %, and {after['median_error_percent']:.2g} % with the "
+        f"sheet that a diagnosis of {forecasts[0][0]['routes_before']} earlier routes writes ({after['n']} trips); intervals "
+        f"contain {before['inside_90']:.0f} and {after['inside_90']:.0f} %",
         f"Nothing planted: {false} of {sum(a['n'] for a in quiet)} streams have an alarm",
         f"Of {named} logs in which a diagnosis names the planted effect, {soon} raise its alarm within twice the rows "
         "that the diagnosis needs",
@@ -65,15 +70,20 @@ def tabulate(
     return found, missed, [*rests, *estimates, *quiet, *alarms]
 
 
-def _rest(results: Results, sheet: str, share: float) -> Line:
-    every = np.array([x for _, r in results for x in r[sheet][str(share)]])
+def _rest(results: Results, kind: str, sheet: str, share: float) -> Line:
+    every = _errors(results, kind, sheet, share)
     return {
-        "name": f"rest after {100 * share:.0f} %, {sheet} sheet", "share_percent": 100.0 * share, "n": len(every),
+        "name": f"{TRIPS[kind]}, {sheet} sheet, rest after {100 * share:.0f} %", "share_percent": 100.0 * share,
+        "n": len(every),
         "median_error_percent": float(np.median(np.abs(every[:, 0]))),
         "error_90_percent": float(np.quantile(np.abs(every[:, 0]), 0.9)),
         "half_interval_percent": float(np.median(every[:, 1])),
         "inside_90": 100.0 * float(np.mean(np.abs(every[:, 0]) <= every[:, 1])),
     }  # fmt: skip
+
+
+def _errors(results: Results, kind: str, sheet: str, share: float) -> np.ndarray:
+    return np.array([x for t, r in results if t["kind"] == kind for x in r[sheet][str(share)]])
 
 
 def _of_noise(results: Results, noise: str) -> list[Line]:
@@ -125,13 +135,14 @@ def _figure(run: Run, forecasts: Results, shares: Sequence[float], alarms: Seque
     fig = figure(9.0, 3.6)
     ax = fig.add_subplot(1, 2, 1)
     at = 100.0 * np.array(shares)
-    for sheet, colour in zip(SHEETS, (BEFORE, AFTER), strict=True):
-        spread = [np.array([x for _, r in forecasts for x in r[sheet][str(s)]]) for s in shares]
+    kinds = [(kind, sheet) for kind, sheets in SHEETS.items() for sheet in sheets]
+    for (kind, sheet), colour in zip(kinds, (GREY, BEFORE, AFTER), strict=True):
+        spread = [_errors(forecasts, kind, sheet, s) for s in shares]
         ax.plot(at, [np.median(np.abs(x[:, 0])) for x in spread], color=colour, marker="o",
-                label=f"{sheet} sheet: error, median")  # fmt: skip
-        ax.plot(at, [np.median(x[:, 1]) for x in spread], "--", color=colour, marker="s",
-                label=f"{sheet} sheet: half the 90 % interval")  # fmt: skip
-    ax.set(xlabel="share of the trip behind [%]", ylabel="energy of the rest [%]", ylim=(0, None))
+                label=f"{TRIPS[kind]}, {sheet} sheet")  # fmt: skip
+        ax.plot(at, [np.median(x[:, 1]) for x in spread], "--", color=colour)
+    ax.plot([], [], "--", color="0.5", label="half the 90 % interval")
+    ax.set(xlabel="share of the trip behind [%]", ylabel="median error of the rest [%]", ylim=(0, None))
     ax.set_title("Forecast of the rest, synthetic fleet")
     ax.legend()
     tidy(ax)
