@@ -61,8 +61,8 @@ def tabulate(
         f"of its remaining energy has a median error of {lap['median_error_percent']:.2g} % ({lap['n']} trips); 90 % "
         f"intervals contain {lap['inside_90']:.0f} %",
         f"On routes it is {before['median_error_percent']:.2g} %, and {after['median_error_percent']:.2g} % with the "
-        f"sheet that a diagnosis of {forecasts[0][0]['routes_before']} earlier routes writes ({after['n']} trips); intervals "
-        f"contain {before['inside_90']:.0f} and {after['inside_90']:.0f} %",
+        f"sheet that a diagnosis of {forecasts[0][0]['routes_before']} earlier routes writes ({after['n']} trips); "
+        f"intervals contain {before['inside_90']:.0f} and {after['inside_90']:.0f} %",
         f"Nothing planted: {false} of {sum(a['n'] for a in quiet)} streams have an alarm",
         f"Of {named} logs in which a diagnosis names the planted effect, {soon} raise its alarm within twice the rows "
         "that the diagnosis needs",
