@@ -39,6 +39,7 @@ _NOT_MEASURED = {
 _SMALL = {"cell", "aux", "auxiliary", "12v", "lv", "charger", "charge"}
 _TEMPERATURE = {"temp", "temperature", "t"}
 _AIR = {"air", "conditioning", "heater", "hvac", "ac", "climate", "heating", "cooling"}
+_MOTION = {"accel", "acceleration", "acc", "velocity", "speed", "force", "g"}  # along and across the vehicle
 
 _LETTERS = {"v": ("speed_mps", "m/s"), "t": ("time_s", "s")}  # alone, as in equations
 _NUMBER = {"id", "no", "nr", "number", "name", "num"}
@@ -69,6 +70,8 @@ _COLUMNS = (
     _Words("ambient_temp_c", "degC", ({"oat"},)),
     _Words("battery_temp_c", "degC", (_BATTERY, _TEMPERATURE), {"max", "min"}),
     _Words("altitude_m", "m", ({"altitude", "elevation", "alt", "elev", "elv", "height"},)),
+    _Words("latitude_deg", "deg", ({"latitude", "lat"},), _MOTION),
+    _Words("longitude_deg", "deg", ({"longitude", "lon", "long", "lng"},), _MOTION),
     _Words("grade_rad", "%", ({"grade", "slope", "gradient", "incline", "inclination"},), {"bias"}),
     _Words("mass_kg", "kg", ({"mass", "weight", "gvw", "gcw"},)),
     _Words("gear", None, ({"gear"},), _NOT_MEASURED | {"ratio"}),
