@@ -7,6 +7,7 @@ from logs_helpers import read
 
 from hdev_jax.logs.instruments import Slope, slope_of
 from hdev_jax.logs.instruments.places import metres
+from hdev_jax.segments import GRADE_SD
 from hdev_jax.verbs.check import check
 
 LENGTH_M = 4000.0
@@ -68,17 +69,17 @@ def errors(found: Slope, frame: pd.DataFrame) -> tuple[float, float]:
     return float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean((e / found.sd_rad) ** 2)))
 
 
-@pytest.mark.parametrize(("noise", "drift"), [(NOISE_M, 0.0), (1.0, 4.0)])
-def test_ten_passes_halve_the_slopes_error_and_its_sd_says_so(noise, drift):
+def test_ten_passes_halve_the_slopes_error_and_its_sd_says_so():
     squares = []
-    for seed in range(3):
-        frame = passes(noise=noise, drift=drift, seed=seed)
+    for seed in range(2):
+        frame = passes(seed=seed)
         one, every = told(frame, place=False), told(frame)
         squares.append(np.square([errors(one, frame)[0], *errors(every, frame)]))
         assert every.repeated is not None
         assert every.repeated.cells > 0.9 * every.repeated.of
         assert every.repeated.passes == 10
         assert every.repeated.together_rad < every.repeated.alone_rad
+        assert every.course.white == pytest.approx(NOISE_M, rel=0.1)
     one, every, z = np.sqrt(np.mean(squares, axis=0))
     # of white noise the smoothed slope's variance goes with the root of the noise's: 10^(-1/4) = 0.56 of the error
     assert every < 0.7 * one
@@ -86,11 +87,12 @@ def test_ten_passes_halve_the_slopes_error_and_its_sd_says_so(noise, drift):
 
 
 def test_a_drift_that_one_pass_hides_is_found_by_many():
-    frame = passes(noise=1.0, drift=4.0, seed=0)
+    frame = passes(noise=1.0, drift=4.0)
     one, every = told(frame, place=False), told(frame)
     assert errors(one, frame)[1] > 1.5  # taken for hills
     assert 2.0 < every.course.drift < 4.5
-    assert errors(every, frame)[1] < 1.3
+    assert errors(every, frame)[0] < 0.7 * errors(one, frame)[0]
+    assert 0.8 < errors(every, frame)[1] < 1.25
 
 
 def test_a_bridge_is_not_mixed_with_the_road_under_it():
@@ -116,23 +118,18 @@ def test_a_bridge_is_not_mixed_with_the_road_under_it():
 
 
 def test_without_a_place_passed_twice_nothing_changes(tmp_path):
-    frame = passes(4)
+    frame = passes(3)
     apart = frame.assign(latitude_deg=frame.latitude_deg + frame.trip_id.str[1].astype(int))
-    one = passes(1)
     none = {"latitude_deg": np.nan, "longitude_deg": np.nan}
-    for a, b in (
-        (apart, frame),
-        (one, one),
-        (frame.assign(**none), frame),
-        (frame.assign(**dict.fromkeys(none, 0.0)), frame),
-    ):
-        with_place, without = told(a), told(b, place=False)
-        assert with_place.repeated is None
-        np.testing.assert_array_equal(with_place.grade_rad, without.grade_rad)
-        np.testing.assert_array_equal(with_place.sd_rad, without.sd_rad)
-    log = read(tmp_path, apart.drop(columns=["x", "slope"]))
-    plain = read(tmp_path, frame.drop(columns=["x", "slope", "latitude_deg", "longitude_deg"]))
-    np.testing.assert_array_equal(log.segments.channels["grade_rad"], plain.segments.channels["grade_rad"])
+    nowhere = frame.assign(latitude_deg=0.0, longitude_deg=0.0)
+    plain = frame.drop(columns=["latitude_deg", "longitude_deg"])
+    logs = [read(tmp_path, f.drop(columns=["x", "slope"])) for f in (plain, apart, nowhere)]
+    for name in ("grade_rad", GRADE_SD):
+        first, *others = (log.segments.channels[name] for log in logs)
+        for other in others:
+            np.testing.assert_array_equal(other, first)
+    one = frame[frame.trip_id == "T0"]
+    np.testing.assert_array_equal(told(one).grade_rad, told(one, place=False).grade_rad)
 
 
 def test_exact_altitudes_stay_each_passes_own():

@@ -14,6 +14,7 @@ has the spectrum 1/ω⁴, the noise of its height as slope σ²ω², so ∫ω²/
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -160,12 +161,12 @@ def _levels(v: _Visits, course: Course) -> Float[np.ndarray, " visit"]:
         return scale * (basis.T @ e + prior.T @ y[n:])
 
     shape = (n + prior.shape[0], basis.shape[1])
-    operator = LinearOperator(shape, matvec=forward, rmatvec=back, dtype=float)  # pyright: ignore[reportCallIssue]
+    operator: Any = LinearOperator(shape, matvec=forward, rmatvec=back, dtype=float)  # pyright: ignore[reportCallIssue]
     missing = np.r_[root * (v.height - height[v.place]), np.zeros(prior.shape[0])]
     return basis @ (scale * lsmr(operator, missing, atol=NEAR, btol=NEAR, maxiter=STEPS)[0])
 
 
-def _basis(v: _Visits, course: Course) -> tuple[sparse.csr_array, sparse.csr_array]:
+def _basis(v: _Visits, course: Course) -> tuple[Any, Any]:
     """Columns `[visit, unknown]` of levels of parts and of values of the drift every τ/2, linear in between; and rows
     of their prior."""
     n, parts = len(v.part), int(v.part.max()) + 1

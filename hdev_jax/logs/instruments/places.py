@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 __all__ = ["Places", "metres", "places_of"]
 
@@ -51,7 +51,7 @@ def places_of(
     if len(cells) < 2:
         return None
     where, heading, part = where[cells], heading[cells], part[cells]
-    tree = cKDTree(where)
+    tree = KDTree(where)
     sd = _noise(tree, where, heading, part)
     if sd is None:
         return None
@@ -64,7 +64,7 @@ def places_of(
             free[near[_same(where[near] - where[k], heading[k], heading[near], cell_m, reach)[0]]] = False
             chosen.append(k)
     points = np.array(chosen)
-    found = cKDTree(where[points]).query(where, k=min(NEAREST, len(points)), distance_upper_bound=radius)[1]
+    found = KDTree(where[points]).query(where, k=min(NEAREST, len(points)), distance_upper_bound=radius)[1]
     found = found.reshape(len(cells), -1)
     at = points[np.minimum(found, len(points) - 1)]
     same, ahead = _same(where[at] - where[:, None], heading[:, None], heading[at], cell_m, reach)
@@ -106,7 +106,7 @@ def _headings(part: np.ndarray, at_m: np.ndarray, where: np.ndarray) -> np.ndarr
     return out
 
 
-def _noise(tree: cKDTree, where: np.ndarray, heading: np.ndarray, part: np.ndarray) -> float | None:
+def _noise(tree: KDTree, where: np.ndarray, heading: np.ndarray, part: np.ndarray) -> float | None:
     """Standard deviation of positions across the road, by how far passes of other parts, or of this one later, lie
     aside; None where there are none."""
     some = np.unique(np.linspace(0, len(where) - 1, min(SOME, len(where))).astype(int))
