@@ -122,5 +122,5 @@ def _suffix(name: str, text: str) -> str | None:
     """The unit at the end of a header, `_time_ms`, where the column accepts it."""
     last = re.split(r"[_\s]", text)[-1].lower()
     stem = COLUMNS.get(name)
-    endings = {a.removeprefix(f"{stem}_") for a in accepted(stem)} if stem else set()
+    endings = {a.removeprefix(f"{stem}_") for a in accepted(stem) if a != stem} if stem else set()
     return last if len(words_of(text)) > 1 and last in endings else None

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from logs_helpers import read
 
+from hdev_jax.logs.guesses import guess
 from hdev_jax.logs.instruments import Slope, slope_of
 from hdev_jax.logs.instruments.places import metres
 from hdev_jax.segments import GRADE_SD
@@ -154,3 +155,22 @@ def test_positions_that_are_none_are_none():
     assert place[3, 1] - place[0, 1] == pytest.approx(111.195, abs=0.01)  # a thousandth of a degree of latitude
     both = metres(np.array([0.5, 0.5]), np.array([179.9999, -179.9999]))
     assert abs(both[1, 0] - both[0, 0]) < 30.0
+
+
+@pytest.mark.parametrize("header", ["Latitude", "lat", "GPS Latitude", "Latitude[deg]", "latitude_rad", "Lat (deg)"])
+def test_headers_of_positions_are_guessed(header):
+    found = guess(header)
+    assert found is not None
+    assert found.name == "latitude_deg"
+    assert found.unit == ("rad" if "rad" in header else "deg")
+    other = guess(
+        header.replace("Lat", "Long").replace("lat", "long").replace("Longi", "Long").replace("longi", "long")
+    )
+    assert other is not None
+    assert other.name == "longitude_deg"
+
+
+@pytest.mark.parametrize("header", ["lat_accel", "Long Acceleration", "long"])
+def test_what_is_along_or_across_the_vehicle_is_no_position(header):
+    found = guess(header)
+    assert (found is not None and found.name == "longitude_deg") == (header == "long")
