@@ -7,7 +7,7 @@ from logs_helpers import read
 
 from hdev_jax.logs.guesses import guess
 from hdev_jax.logs.instruments import Slope, slope_of
-from hdev_jax.logs.instruments.places import metres
+from hdev_jax.logs.instruments.places import metres, places_of
 from hdev_jax.segments import GRADE_SD
 from hdev_jax.verbs.check import check
 
@@ -146,6 +146,20 @@ def test_check_shows_the_passes(tmp_path):
     assert "cells passed 6 times (median)" in line
     assert "% by one pass" in line
     assert any("cells passed" in e.reason and e.column == "grade_rad" for e in log.ledger)
+
+
+def test_laps_of_one_trip_are_passes():
+    way = np.arange(0.0, 3 * 1200.0, 15.0)
+    turn = 2 * np.pi * way / 1200.0
+    ring = 1200.0 / (2 * np.pi) * np.c_[np.sin(turn), 1.0 - np.cos(turn)]
+    found = places_of(np.zeros(len(way), int), way, ring + np.random.default_rng(0).normal(0, 1.0, ring.shape), 20.0)
+    assert found is not None
+    assert found.sd_m == pytest.approx(1.0, rel=0.3)
+    assert np.all(found.place >= 0)
+    assert np.all(np.bincount(found.place) >= 3)
+    assert np.all(np.abs(found.ahead_m) <= 20.0)
+    once = slice(0, 80)
+    assert places_of(np.zeros(80, int), way[once], 5.0 * ring[once], 20.0) is None
 
 
 def test_positions_that_are_none_are_none():

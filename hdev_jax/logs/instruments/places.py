@@ -14,6 +14,7 @@ TURN = np.cos(np.radians(30.0))  # headings agree or oppose within 30°: six of 
 # Roads side by side are told apart where positions are good; two lanes in each direction of 3.5 m are one road.
 ROAD_M, WIDEST_M = 10.0, 50.0
 NEAREST = 8  # places about a cell that it may be of: neighbours on one road, and on those that cross it
+LAP_M = 4.0 * WIDEST_M  # a way that comes back to within 50 m after more than a circle about them is another pass
 SOME = 500  # cells that the positions' noise is from: a median of so many is known to 6 %
 GONE = 0.5  # positions that moved by less than half of the way, or by half more, are frozen or wrong
 
@@ -47,12 +48,13 @@ def places_of(
     """Places, `cell_m` or more apart along roads, and which cells are of each: the positions `where` [m] are no further
     aside than their noise explains, on the same way or the opposite one. None where no road was driven twice."""
     heading = _headings(part, at_m, where)
-    cells = np.flatnonzero(np.isfinite(heading[:, 0]))
+    known = np.isfinite(heading[:, 0])
+    cells = np.flatnonzero(known)
     if len(cells) < 2:
         return None
-    where, heading, part = where[cells], heading[cells], part[cells]
+    where, heading, part, at_m = where[cells], heading[cells], part[cells], at_m[cells]
     tree = KDTree(where)
-    sd = _noise(tree, where, heading, part)
+    sd = _noise(tree, where, heading, part, at_m, cell_m)
     if sd is None:
         return None
     reach = float(np.clip(3.0 * np.sqrt(2.0) * sd, ROAD_M, WIDEST_M))  # both positions have the noise
@@ -67,11 +69,12 @@ def places_of(
     found = KDTree(where[points]).query(where, k=min(NEAREST, len(points)), distance_upper_bound=radius)[1]
     found = found.reshape(len(cells), -1)
     at = points[np.minimum(found, len(points) - 1)]
-    same, ahead = _same(where[at] - where[:, None], heading[:, None], heading[at], cell_m, reach)
+    same, ahead, _ = _same(where[at] - where[:, None], heading[:, None], heading[at], cell_m, reach)
     same &= found < len(points)
     best = np.argmax(same, axis=1)  # the nearest that fits
     rows = np.arange(len(cells))
-    out, far, way = np.full(len(at_m), -1), np.zeros(len(at_m)), np.ones(len(at_m))
+    size = len(known)
+    out, far, way = np.full(size, -1), np.zeros(size), np.ones(size)
     out[cells] = np.where(same[rows, best], found[rows, best], -1)
     far[cells] = np.where(same[rows, best], ahead[rows, best], 0.0)
     way[cells] = np.where(np.sum(heading[at[rows, best]] * heading, axis=1) < 0, -1.0, 1.0)
@@ -80,11 +83,12 @@ def places_of(
 
 def _same(
     off: np.ndarray, heading: np.ndarray, other: np.ndarray, cell_m: float, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Whether what is `off` by so much [m] is on one road with a `heading`, and how far ahead it is."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether what is `off` by so much [m] is on one road with a `heading`; how far ahead and how far aside it is."""
     ahead = np.sum(off * heading, axis=-1)
     aside = np.abs(off[..., 0] * heading[..., 1] - off[..., 1] * heading[..., 0])
-    return (np.abs(np.sum(heading * other, axis=-1)) > TURN) & (aside < reach) & (np.abs(ahead) <= cell_m), ahead
+    same = (np.abs(np.sum(heading * other, axis=-1)) > TURN) & (aside < reach) & (np.abs(ahead) <= cell_m)
+    return same, ahead, aside
 
 
 def _headings(part: np.ndarray, at_m: np.ndarray, where: np.ndarray) -> np.ndarray:
@@ -106,16 +110,15 @@ def _headings(part: np.ndarray, at_m: np.ndarray, where: np.ndarray) -> np.ndarr
     return out
 
 
-def _noise(tree: KDTree, where: np.ndarray, heading: np.ndarray, part: np.ndarray) -> float | None:
-    """Standard deviation of positions across the road, by how far passes of other parts, or of this one later, lie
-    aside; None where there are none."""
+def _noise(
+    tree: KDTree, where: np.ndarray, heading: np.ndarray, part: np.ndarray, at_m: np.ndarray, cell_m: float
+) -> float | None:  # fmt: skip
+    """Standard deviation of positions across the road, by how far passes of other parts, or of this one on its way back
+    or a lap later, lie aside; None where there are none."""
     some = np.unique(np.linspace(0, len(where) - 1, min(SOME, len(where))).astype(int))
     found = tree.query_ball_point(where[some], WIDEST_M)
     k, j = np.repeat(some, [len(x) for x in found]), np.concatenate([np.asarray(x, int) for x in found])
-    agrees = np.sum(heading[k] * heading[j], axis=1)
-    other = (np.abs(agrees) > TURN) & ((part[k] != part[j]) | (agrees < 0))
-    if not other.any():
-        return None
-    off = (where[k] - where[j])[other]
-    aside = np.abs(off[:, 0] * heading[j[other], 1] - off[:, 1] * heading[j[other], 0])
-    return float(1.4826 * np.median(aside) / np.sqrt(2.0))
+    same, _, aside = _same(where[j] - where[k], heading[k], heading[j], cell_m, WIDEST_M)
+    later = np.abs(at_m[k] - at_m[j]) > LAP_M
+    same &= (part[k] != part[j]) | later | (np.sum(heading[k] * heading[j], axis=1) < 0)
+    return float(1.4826 * np.median(aside[same]) / np.sqrt(2.0)) if same.any() else None
