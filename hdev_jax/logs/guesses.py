@@ -39,6 +39,7 @@ _NOT_MEASURED = {
 _SMALL = {"cell", "aux", "auxiliary", "12v", "lv", "charger", "charge"}
 _TEMPERATURE = {"temp", "temperature", "t"}
 _AIR = {"air", "conditioning", "heater", "hvac", "ac", "climate", "heating", "cooling"}
+_MOTION = {"accel", "acceleration", "acc", "velocity", "speed", "force", "g"}  # along and across the vehicle
 
 _LETTERS = {"v": ("speed_mps", "m/s"), "t": ("time_s", "s")}  # alone, as in equations
 _NUMBER = {"id", "no", "nr", "number", "name", "num"}
@@ -69,6 +70,8 @@ _COLUMNS = (
     _Words("ambient_temp_c", "degC", ({"oat"},)),
     _Words("battery_temp_c", "degC", (_BATTERY, _TEMPERATURE), {"max", "min"}),
     _Words("altitude_m", "m", ({"altitude", "elevation", "alt", "elev", "elv", "height"},)),
+    _Words("latitude_deg", "deg", ({"latitude", "lat"},), _MOTION),
+    _Words("longitude_deg", "deg", ({"longitude", "lon", "long", "lng"},), _MOTION),
     _Words("grade_rad", "%", ({"grade", "slope", "gradient", "incline", "inclination"},), {"bias"}),
     _Words("mass_kg", "kg", ({"mass", "weight", "gvw", "gcw"},)),
     _Words("gear", None, ({"gear"},), _NOT_MEASURED | {"ratio"}),
@@ -119,5 +122,5 @@ def _suffix(name: str, text: str) -> str | None:
     """The unit at the end of a header, `_time_ms`, where the column accepts it."""
     last = re.split(r"[_\s]", text)[-1].lower()
     stem = COLUMNS.get(name)
-    endings = {a.removeprefix(f"{stem}_") for a in accepted(stem)} if stem else set()
+    endings = {a.removeprefix(f"{stem}_") for a in accepted(stem) if a != stem} if stem else set()
     return last if len(words_of(text)) > 1 and last in endings else None

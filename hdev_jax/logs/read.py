@@ -11,7 +11,7 @@ from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
-from hdev_jax.logs.instruments import Slope, instruments_of, slope_of, speed_of
+from hdev_jax.logs.instruments import Slope, instruments_of, metres, slope_of, speed_of
 from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import KINEMATICS, MEASURED, Log
@@ -27,6 +27,8 @@ from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 from hdev_jax.units import accepted
 
 __all__ = ["log_from_frame", "read_log"]
+
+POSITION = ("latitude_deg", "longitude_deg")
 
 
 def read_log(paths: str | Path | Sequence[str | Path], adapter: str | Path | Adapter | None = None) -> Log:
@@ -170,13 +172,17 @@ def _log(
         ledger = ledger.add(
             "noted", f"the sum is {ratio:.3g} times speed × duration: check its unit", column="distance_m"
         )
+    place = None
+    if all(c in data for c in POSITION):
+        place = metres(*(data[c] for c in POSITION))
+        data = {**data, **{c: np.where(np.isfinite(place[:, 0]), data[c], np.nan) for c in POSITION}}
     channels: dict[str, Any] = {k: v for k, v in data.items() if k not in KINEMATICS and k not in measured}
     channels, ledger = repair(channels, trip, time, ledger)
     soc = channels.get("soc")
     if soc is not None and soc.max() > 1.5:  # a share cannot be: this is per cent
         channels["soc"] = soc / 100.0
         ledger = ledger.add("noted", f"up to {soc.max():.4g}, read as per cent", column="soc")
-    channels, slope, ledger = _with_slope(channels, data, trip, distance, duration, ledger)
+    channels, slope, ledger = _with_slope(channels, data, trip, distance, duration, place, ledger)
     segments = Segments(
         trip=trip.astype(np.int32),
         vehicle=rows.vehicle.astype(np.int32),
@@ -216,7 +222,7 @@ def _with_speed(rows: Rows, sampled: bool) -> Rows:
 
 def _with_slope(
     channels: dict[str, Any], data: Mapping[str, np.ndarray], trip: np.ndarray, distance: np.ndarray,
-    duration: np.ndarray, ledger: Ledger,
+    duration: np.ndarray, place: np.ndarray | None, ledger: Ledger,
 ) -> tuple[dict[str, Any], tuple[str, Slope] | None, Ledger]:  # fmt: skip
     """The channels with the slope from altitudes, or smoothed where it was logged with noise, and its standard
     deviation where that matters."""
@@ -224,7 +230,7 @@ def _with_slope(
     if source is None:
         level = "neither slope nor altitude in the log: taken as level"
         return channels, None, ledger.add("noted", level, column="grade_rad")
-    slope = slope_of(trip, distance, duration, data[source], of_slope=source == "grade_rad")
+    slope = slope_of(trip, distance, duration, data[source], of_slope=source == "grade_rad", place=place)
     if slope is None:
         if source == "altitude_m":
             channels = {**channels, "grade_rad": np.zeros(len(trip))}
@@ -233,6 +239,9 @@ def _with_slope(
     (told,) = instruments_of({}, (source, slope))
     how = f"from {source}" if source == "altitude_m" else "smoothed"
     ledger = ledger.add("derived", f"{how} ({told.line()})", column="grade_rad")
+    if (r := slope.repeated) is not None and r.disagree:
+        apart = f"{r.disagree} passes of a place that disagree with most others by height: kept apart"
+        ledger = ledger.add("noted", apart, column="grade_rad")
     if slope.jumps:
         ledger = ledger.add(
             "noted", f"{source} jumps: the slope begins anew there", count=slope.jumps, column="grade_rad"

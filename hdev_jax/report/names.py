@@ -59,6 +59,8 @@ _CHANNELS = {
     "wind_speed_mps": Shown("wind speed", "m/s"),
     "wind_from_rad": Shown("wind from", "°", 180 / np.pi),
     "heading_rad": Shown("heading", "°", 180 / np.pi),
+    "latitude_deg": Shown("latitude", "°"),
+    "longitude_deg": Shown("longitude", "°"),
     "curvature_1pm": Shown("curvature", "1/km", 1e3),
     "wet_road": Shown("wet road", ""),
     "soc": Shown("state of charge", ""),

@@ -1,8 +1,9 @@
 """Instruments: the noise and the step of what was read, the slope as far as its readings tell it."""
 
 from hdev_jax.logs.instruments.instrument import Instrument, instruments_of
+from hdev_jax.logs.instruments.places import metres
 from hdev_jax.logs.instruments.slope import Slope, slope_of
 from hdev_jax.logs.instruments.speed import speed_of
 from hdev_jax.logs.instruments.steps import step_of
 
-__all__ = ["Instrument", "Slope", "instruments_of", "slope_of", "speed_of", "step_of"]
+__all__ = ["Instrument", "Slope", "instruments_of", "metres", "slope_of", "speed_of", "step_of"]

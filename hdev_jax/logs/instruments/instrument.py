@@ -43,8 +43,10 @@ def instruments_of(columns: Mapping[str, np.ndarray], slope: tuple[str, Slope] |
     if slope is not None:
         channel, s = slope
         drift = f", drifts by {s.course.drift:.2g} m within {s.course.drift_s:.2g} s" if s.course.drift > 0 else ""
-        span = f" smoothed over {s.span_m:.2g} m" if s.course.drift == 0 else " smoothed"
+        alone = s.course.drift == 0 and s.repeated is None  # else no one length says how far it is smoothed
+        span = f" smoothed over {s.span_m:.2g} m" if alone else " smoothed"
         more = f"{drift}; slope{span}, its error {100 * s.error_rad:.2g} %"
+        more += f"; {s.repeated.line()}" if s.repeated is not None else ""
         found.append(Instrument(channel, s.course.white if s.noisy else 0.0, s.step, more))
     for name in _STEPPED:
         if name in columns and (step := step_of(columns[name])) > 0:

@@ -1,15 +1,17 @@
 """The slope of every row from altitudes, or from slopes that are noisy themselves, with its standard deviation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from hdev_jax.logs.instruments.smoother import HEIGHT, SLOPE, Course, course_of, lanes_of, smoothed
+from hdev_jax.logs.instruments.passes import Cells, pooled
+from hdev_jax.logs.instruments.places import places_of
+from hdev_jax.logs.instruments.smoother import HEIGHT, SLOPE, Course, Lanes, course_of, lanes_of, smoothed
 from hdev_jax.logs.instruments.steps import step_of
 from hdev_jax.logs.limits import MAX_GRADE_RAD
 
-__all__ = ["MATTERS", "Slope", "slope_of"]
+__all__ = ["MATTERS", "Repeated", "Slope", "slope_of"]
 
 CELL_M, CELL_S = 20.0, 10.0  # rows that are one reading: a road's vertical curve is longer, standing is one place
 # Share of the slopes' variance that is error, from which it is said and carried on: what a payload would be off by if
@@ -18,11 +20,31 @@ MATTERS = 0.01
 
 
 @dataclass(frozen=True)
+class Repeated:
+    """Cells that were passed twice or more often, how often in the middle, of all cells in motion; the slope's error
+    there by one pass and by all [rad]; visits that disagree with most others of their place, and were kept apart."""
+
+    cells: int
+    passes: float
+    of: int
+    alone_rad: float
+    together_rad: float
+    disagree: int
+
+    def line(self) -> str:
+        """`2400 of 2500 cells passed 10 times (median), their slope's error 0.85 % by one pass, 0.37 % by all`."""
+        return (
+            f"{self.cells} of {self.of} cells passed {self.passes:.0f} times (median), their slope's error "
+            f"{100 * self.alone_rad:.2g} % by one pass, {100 * self.together_rad:.2g} % by all"
+        )
+
+
+@dataclass(frozen=True)
 class Slope:
     """What came of the readings: slope and its standard deviation by row [rad]; the instrument's step (0: none seen),
     the model's numbers; `error_rad`, the RMS of the standard deviation where the vehicle moves; `span_m`, the length of
     road whose line of least squares would be off by as much; `noisy`, whether the error matters; `jumps`, how often the
-    altitude began anew."""
+    altitude began anew; `repeated`, where several passes of a place were put together."""
 
     grade_rad: Float[np.ndarray, " row"]
     sd_rad: Float[np.ndarray, " row"]
@@ -32,13 +54,15 @@ class Slope:
     span_m: float
     noisy: bool
     jumps: int
+    repeated: Repeated | None = None
 
 
 def slope_of(
     trip: Int[np.ndarray, " row"], distance_m: Float[np.ndarray, " row"], duration_s: Float[np.ndarray, " row"],
-    reading: Float[np.ndarray, " row"], *, of_slope: bool = False,
+    reading: Float[np.ndarray, " row"], *, of_slope: bool = False, place: Float[np.ndarray, "row 2"] | None = None,
 ) -> Slope | None:  # fmt: skip
-    """The slope from readings by row of the altitude [m], or of the slope [rad]; NaN where there is none.
+    """The slope from readings by row of the altitude [m], or of the slope [rad]; NaN where there is none. With the
+    `place` [m] of each row, altitudes of several passes of one place are put together.
 
     **Returns:** None where slopes that were logged have no noise that matters, or there is no reading in motion.
     """
@@ -67,12 +91,22 @@ def slope_of(
     part = np.cumsum(broken | new_trip[first])
     lanes = lanes_of(part, at, mean(clock, every), height, readings.astype(float), kind=kind)
     step = step_of(z[there])
-    course = course_of(lanes, kind, least=max(step / np.sqrt(12.0), 1e-5 if of_slope else 1e-3))
+    least = max(step / np.sqrt(12.0), 1e-5 if of_slope else 1e-3)
+    course = course_of(lanes, kind, least=least)
     slope, sd = smoothed(lanes, course, kind)
+    repeated = None
+    if place is not None and not of_slope:
+        known = np.isfinite(place[:, 0])
+        where = np.stack([mean(np.where(known, x, 0.0), known.astype(float)) for x in place.T], axis=1)
+        where[np.add.reduceat(known, first) == 0] = np.nan
+        way = np.add.reduceat(distance_m, first)
+        cells = Cells(part - 1, at, mean(clock, every), height, readings.astype(float), slope)
+        found = _together(cells, where, way, lanes, course, least)
+        course, slope, sd, repeated = found or (course, slope, sd, None)
     run = np.cumsum(new_trip) - 1.0
     apart = float(middle[-1]) + 1.0  # trips on one line, further apart than any is long
-    place, places = middle + apart * run, at + apart * run[first]
-    by_row, sd_by_row = np.interp(place, places, slope), np.interp(place, places, sd)
+    line, on_line = middle + apart * run, at + apart * run[first]
+    by_row, sd_by_row = np.interp(line, on_line, slope), np.interp(line, on_line, sd)
     moves = distance_m > 0
     error = float(np.sqrt(np.mean(sd_by_row[moves] ** 2)))
     share = error**2 / max(course.slope**2, 1e-12)
@@ -80,7 +114,32 @@ def slope_of(
     span = float(np.cbrt(12.0 * course.white**2 * apart_m / max(error, 1e-9) ** 2))
     if not moves.any() or (of_slope and share < MATTERS):
         return None
-    return Slope(np.arctan(by_row), sd_by_row, step, course, error, span, share >= MATTERS, int(broken.sum()))
+    return Slope(np.arctan(by_row), sd_by_row, step, course, error, span, share >= MATTERS, int(broken.sum()), repeated)
+
+
+def _together(
+    cells: Cells, where: np.ndarray, way: np.ndarray, lanes: Lanes, course: Course, least: float
+) -> tuple[Course, np.ndarray, np.ndarray, Repeated] | None:
+    """The numbers of the model, slope and its sd by cell, from the readings of all passes of each place; None where no
+    place was passed twice."""
+    places = places_of(cells.part, cells.at_m, where, CELL_M)
+    if places is None:
+        return None
+    whole = replace(course, white=float(np.hypot(course.white, course.drift)), drift=0.0)
+    level, _ = smoothed(lanes, whole, HEIGHT, level=True)
+    them = pooled(cells, level, places, course, least=least)
+    twice = (way > 0) & (them.visits > 1) if them is not None else np.zeros(len(way), bool)
+    if them is None or not twice.any():
+        return None
+    lanes_of_all = lanes_of(
+        cells.part, cells.at_m, cells.clock_s, them.height, them.count, kind=HEIGHT, passes=them.passes
+    )
+    course = course_of(lanes_of_all, HEIGHT, least=least, errors=them.errors)
+    slope, sd = smoothed(lanes_of_all, course, HEIGHT)
+    _, alone = smoothed(lanes, course, HEIGHT)
+    one, every = (float(np.sqrt(np.mean(x[twice] ** 2))) for x in (alone, sd))
+    passes = float(np.median(them.visits[twice]))
+    return course, slope, sd, Repeated(int(twice.sum()), passes, int(np.sum(way > 0)), one, every, them.disagree)
 
 
 def _jumps(trip: np.ndarray, at: np.ndarray, height: np.ndarray, readings: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ Matérn-3/2 processes: continuous, as roads are, whose slopes change in vertical
 Methods, 2012, sections 4.3 and 4.4; Matérn processes as states: Hartikainen and Särkkä, MLSP 2010.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -62,13 +62,14 @@ class Course:
 
 class Lanes(NamedTuple):
     """Cells side by side `[lane, cell]`: steps of distance and time from the cell before, readings (means of `count`
-    independent ones; 0: none there) above the lane's `origin`. `at` is the cell's index, `mine` whether the lane
-    answers for it."""
+    independent ones; 0: none there) above the lane's `origin`, `share` of the drift that is in them: of readings of K
+    passes 1/√K. `at` is the cell's index, `mine` whether the lane answers for it."""
 
     step_m: np.ndarray
     step_s: np.ndarray
     reading: np.ndarray
     count: np.ndarray
+    share: np.ndarray
     at: np.ndarray
     mine: np.ndarray
     origin: np.ndarray
@@ -76,9 +77,10 @@ class Lanes(NamedTuple):
 
 def lanes_of(
     trip: np.ndarray, place_m: np.ndarray, time_s: np.ndarray, reading: np.ndarray, count: np.ndarray, *,
-    kind: Kind,
+    kind: Kind, passes: np.ndarray | None = None,
 ) -> Lanes:  # fmt: skip
-    """Cells of all trips cut into overlapping lanes of one length; heights less each lane's first one."""
+    """Cells of all trips cut into overlapping lanes of one length; heights less each lane's first one. `passes`: how
+    many passes each reading is the mean of."""
     at, mine = [], []
     edges = np.flatnonzero(np.r_[True, trip[1:] != trip[:-1]])
     for a, b in zip(edges, np.r_[edges[1:], len(trip)], strict=True):
@@ -96,11 +98,13 @@ def lanes_of(
     first = np.argmax(n > 0, axis=1)
     origin = np.zeros((len(z), 1)) if kind.of_slope else np.take_along_axis(z, first[:, None], axis=1)
     step_m, step_s = (np.diff(x[index], axis=1, prepend=x[index[:, :1]]) for x in (place_m, time_s))
-    return Lanes(step_m, step_s, np.where(n > 0, z - origin, 0.0), n, index, own, origin)
+    share = np.ones_like(n) if passes is None else 1.0 / np.sqrt(passes[index])
+    return Lanes(step_m, step_s, np.where(n > 0, z - origin, 0.0), n, share, index, own, origin)
 
 
-def course_of(lanes: Lanes, kind: Kind, *, least: float) -> Course:
-    """The numbers of greatest likelihood; `least` is the white noise that readings in steps have at least.
+def course_of(lanes: Lanes, kind: Kind, *, least: float, errors: Course | None = None) -> Course:
+    """The numbers of greatest likelihood; `least` is the white noise that readings in steps have at least; `errors`
+    has the numbers of the errors where they are known.
 
     A drift is there where it pays, and only of heights: of slopes it could not be distinguished from the road.
     """
@@ -111,8 +115,10 @@ def course_of(lanes: Lanes, kind: Kind, *, least: float) -> Course:
     scale = max(float(np.median(steps)) if len(steps) else 0.0, least)
 
     def course(x: np.ndarray) -> Course:
-        slope, length, *errors = (float(v) for v in np.exp(np.clip(x, -60.0, 20.0)))
-        white, *drift = errors or (0.0,)
+        slope, length, *others = (float(v) for v in np.exp(np.clip(x, -60.0, 20.0)))
+        if errors is not None:
+            return replace(errors, slope=slope, length_m=max(length, kind.shortest))
+        white, *drift = others or (0.0,)
         return Course(slope, max(length, kind.shortest), float(np.hypot(white, least)), *drift)
 
     def cost(x: np.ndarray) -> float:
@@ -127,9 +133,9 @@ def course_of(lanes: Lanes, kind: Kind, *, least: float) -> Course:
         return minimize(cost, first, method="Nelder-Mead", options=options)
 
     sd, length = kind.typical
-    whites = [[s * scale] for s in (0.03, 0.3, 1.0)] if kind.noisy else [[]]
+    whites = [[s * scale] for s in (0.03, 0.3, 1.0)] if kind.noisy and errors is None else [[]]
     found = lowest([np.log([sd, part * length, *w]) for part in (0.4, 1.3) for w in whites])
-    if kind.drifts:
+    if kind.drifts and errors is None:
         tried = [np.r_[found.x, np.log([s * scale, tau])] for s in (1.0, 4.0) for tau in (20.0, 120.0)]
         drifting = lowest(tried)
         found = drifting if drifting.fun < found.fun - DRIFTS else found
@@ -161,7 +167,7 @@ def _batches(lanes: Lanes, size: int) -> list[tuple[np.ndarray, ...]]:
     """Lanes in batches of one size, the last filled with lanes without readings, so that one program serves all."""
     out = []
     for k in range(0, len(lanes.at), size):
-        part = [x[k : k + size] for x in lanes[:4]]
+        part = [x[k : k + size] for x in lanes[:5]]
         out.append(tuple(np.concatenate([x, np.zeros((size - len(x), LANE))]) for x in part))
     return out
 
@@ -236,11 +242,12 @@ class _Cell(NamedTuple):
     var: Array
     gain: Array
     there: Array
+    sees: Array
 
 
 def _forward(cells: Any, course: Array, sees: Array, keep: bool) -> Any:
     """Kalman's filter over the cells of lanes `[lane, cell]`: each `_Cell`, or its log-likelihood."""
-    ds, dt, z, n = (jnp.swapaxes(x, 0, 1) for x in cells)  # cells lead: the scan runs over them
+    ds, dt, z, n, share = (jnp.swapaxes(x, 0, 1) for x in cells)  # cells lead: the scan runs over them
     slope, length, white, drift, tau = course
     move, new = _moves(course, ds, dt)
     there = n > 0
@@ -248,21 +255,23 @@ def _forward(cells: Any, course: Array, sees: Array, keep: bool) -> Any:
 
     def step(carry: Any, cell: Any) -> Any:
         mean, cov = carry
-        move, new, z, noise, there = cell
+        move, new, z, noise, there, sees = cell
         mean = jnp.einsum("lij,lj->li", move, mean)
         cov = move @ cov @ jnp.swapaxes(move, -1, -2) + new
-        towards = cov @ sees
-        var = towards @ sees + noise
+        towards = jnp.einsum("lij,lj->li", cov, sees)
+        var = jnp.einsum("li,li->l", towards, sees) + noise
         gain = jnp.where(there[:, None], towards / var[:, None], 0.0)
-        miss = jnp.where(there, z - mean @ sees, 0.0)
+        miss = jnp.where(there, z - jnp.einsum("li,li->l", mean, sees), 0.0)
         after = mean + gain * miss[:, None], cov - gain[:, :, None] * towards[:, None, :]
-        told = _Cell(move, mean, cov, miss, var, gain, there)
+        told = _Cell(move, mean, cov, miss, var, gain, there, sees)
         return after, told if keep else jnp.where(there, -0.5 * (miss**2 / var + jnp.log(var)), 0.0)
 
     lanes = z.shape[1]
     first = jnp.stack([UNKNOWN_M**2 * sees[0], slope**2, (slope / length) ** 2, drift**2, (drift / tau) ** 2])
     start = jnp.zeros((lanes, 5)), jnp.broadcast_to(jnp.diag(first), (lanes, 5, 5))
-    return jax.lax.scan(step, start, (move, new, z, noise, there))[1]
+    part = jnp.where((jnp.arange(5) == 3)[None, None], share[..., None], 1.0)
+    seen = sees[None, None] * part  # of a mean over passes, part of the drift
+    return jax.lax.scan(step, start, (move, new, z, noise, there, seen))[1]
 
 
 @jax.jit
@@ -278,9 +287,9 @@ def _states(cells: Any, course: Array, sees: Array, wants: Array) -> tuple[Array
     def step(carry: Any, cell: _Cell) -> Any:
         r, n = carry  # what later cells say, as it acts on this one
         told = jnp.where(cell.there, 1.0 / cell.var, 0.0)
-        left = jnp.eye(5)[None] - cell.gain[:, :, None] * sees[None, None]
-        r = sees[None] * (cell.miss * told)[:, None] + jnp.einsum("lji,lj->li", left, r)
-        n = jnp.outer(sees, sees)[None] * told[:, None, None] + jnp.swapaxes(left, -1, -2) @ n @ left
+        left = jnp.eye(5)[None] - cell.gain[:, :, None] * cell.sees[:, None]
+        r = cell.sees * (cell.miss * told)[:, None] + jnp.einsum("lji,lj->li", left, r)
+        n = cell.sees[:, :, None] * cell.sees[:, None] * told[:, None, None] + jnp.swapaxes(left, -1, -2) @ n @ left
         towards = cell.cov @ wants
         mean = cell.mean @ wants + jnp.einsum("lj,lj->l", towards, r)
         spread = towards @ wants - jnp.einsum("li,lij,lj->l", towards, n, towards)
