@@ -19,7 +19,8 @@ from hdev_jax.report.figures import WIDTH, short
 __all__ = ["CAPTION", "Band", "Flow", "energy_flow", "flow_of"]
 
 CAPTION = (
-    "Widths are in proportion to energy; percentages are shares of the measured energy. Green comes back: into the "
+    "Widths are in proportion to energy; percentages are shares of the measured energy; causes below 1 % "
+    "are one band. Green comes back: into the "
     "battery, row by row, or from a cause whose sum is negative, such as a route that leads downhill."
 )
 LEAST_SHARE = 0.01  # of what leaves the battery: a cause below it is part of "other"
