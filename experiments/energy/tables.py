@@ -17,7 +17,7 @@ __all__ = ["tabulate"]
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 Line = dict[str, Any]
 GREEN = "#009E73"  # the third of Okabe and Ito's colours
-SHEETS = {"declared": "declared sheet", "diagnosed": "diagnosed sheet", "plain": "nothing that its sheet lacks"}
+SHEETS = {"declared": "declared sheet", "diagnosed": "diagnosed sheet", "plain": "complete sheet"}
 
 
 def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[str], list[Line]]:
@@ -177,14 +177,14 @@ def _figure(run: Run, lines: Sequence[Line], service: Results, config: Any) -> N
     variants = list(dict.fromkeys(t["variant"] for t, _ in service))
     at = {v: len(variants) - 1 - k for k, v in enumerate(variants)}
     for (sheet, words), colour, aside in zip(SHEETS.items(), (BEFORE, AFTER, GREEN), (0.25, 0.0, -0.25), strict=True):
-        mine = [(at[t["variant"]] + aside, *r["force"][-1]) for t, r in service if t["sheet"] == sheet]
+        mine = [(at[t["variant"]] + aside, *r["force"][0]) for t, r in service if t["sheet"] == sheet]
         if mine:
             place, value, low, high, true = np.array(mine).T
             right.hlines(place, low / true, high / true, color=colour, lw=1.4)
             right.plot(value / true, place, "o", color=colour, ms=3, label=words)
     right.axvline(1.0, color=GREY, lw=0.8)
     right.set_yticks(list(at.values()), [v.replace("_", " ") for v in variants], fontsize=7)
-    right.set_xlabel(f"force at {SHOWN_KMH[-1]:g} km/h from driving in service, over the true one")
+    right.set_xlabel(f"estimated over true force at {SHOWN_KMH[0]:g} km/h")
     right.set_title("In service, synthetic fleet")
     fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=3)
     tidy(right, grid="x")
