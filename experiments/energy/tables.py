@@ -10,6 +10,7 @@ from experiments.runner.tables import wilson, write_tables
 from hdev_jax.energy.road_load import SHOWN_KMH
 from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
+from hdev_jax.report.words import count
 from hdev_jax.rundir import Run
 
 __all__ = ["tabulate"]
@@ -57,7 +58,8 @@ def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[s
             error, held = ([x[k] for x in mine] for k in ("median_error_percent", "inside_90"))
             found.append(
                 f"From driving in service, {words}: the force is off by {_both(error, '.2g')} % in the median at "
-                f"{_both(SHOWN_KMH, 'g')} km/h ({mine[0]['n']} vehicles), and the intervals hold {_both(held, '.0f')} %"
+                f"{_both(SHOWN_KMH, 'g')} km/h ({count(mine[0]['n'], 'vehicle')}), "
+                f"and the intervals hold {_both(held, '.0f')} %"
             )
     share = 100.0 * config.share
     shown = [f"{x['found']} of {x['n']} logs of {x['trips']} trips" for x in after if x["planted"]]
