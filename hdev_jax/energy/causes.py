@@ -9,7 +9,7 @@ predicted energy exactly.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.physics.tyres import RollingLinear
 from hdev_jax.segments import Segments, trip_slices
 
-__all__ = ["ByCause", "Change", "by_cause", "same"]
+__all__ = ["ByCause", "Change", "by_cause", "is_load", "place_of", "same"]
 
 NOTHING_KWH = 1e-9  # rounding of a loss that is none
 Change = Callable[[Vehicle, Segments], tuple[Vehicle, Segments]]
@@ -126,3 +126,21 @@ def _place(cause: str) -> tuple[int, int, str]:
     stage = "driveline" if cause == "driveline" else "machine" if cause == "machine" else "battery"
     stage = effect.stage if effect else stage
     return 1 + STAGES.index(stage), 0 if effect is None else 1, cause
+
+
+def is_load(cause: str) -> bool:
+    """Whether a cause is a consumer that draws whatever the drive does."""
+    effect = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
+    return effect is not None and effect.__module__.rpartition(".")[2] in ("loads", "states")
+
+
+def place_of(cause: str) -> Literal["load", "loss", "wheel"]:
+    """Where a cause takes its energy: a load, a loss between battery and wheels, or a force at the wheels.
+
+    Instruments of the road, and an effect that is not in the library, count at the wheels.
+    """
+    if is_load(cause):
+        return "load"
+    effect = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
+    stage = cause if effect is None else effect.stage
+    return "loss" if stage in ("driveline", "machine", "battery") else "wheel"

@@ -9,11 +9,10 @@ import numpy as np
 import pandas as pd
 from scipy import sparse
 
-from hdev_jax.energy.causes import ByCause, by_cause
+from hdev_jax.energy.causes import ByCause, by_cause, is_load
 from hdev_jax.energy.fitted import Fitted, interval
 from hdev_jax.errors import InputError
 from hdev_jax.logs import Log
-from hdev_jax.physics import DECLARED, LIBRARY
 from hdev_jax.physics.loads import STANDSTILL_MPS
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TARGETS
@@ -174,7 +173,7 @@ def _long(stands: np.ndarray, trip: np.ndarray, seconds: np.ndarray) -> np.ndarr
 def _about(sums: Mapping[str, float], block: ByCause, k: int) -> dict[str, Any]:
     """What a block says besides its sum. Regenerated: energy into the battery over energy out of it, row by row."""
     out = sums["out"]
-    loads = [j for j, c in enumerate(block.causes) if _is_load(c)]
+    loads = [j for j, c in enumerate(block.causes) if is_load(c)]
     auxiliary = float(block.value[k, loads].sum())
     low, high = (float(x) for x in interval(block.drawn[:, k, loads].sum(axis=1)))
     per = 100.0 / out if out > 0 else np.nan
@@ -187,9 +186,3 @@ def _about(sums: Mapping[str, float], block: ByCause, k: int) -> dict[str, Any]:
         "auxiliary_percent_lower": per * low, "auxiliary_percent_upper": per * high,
         "standing_kwh": sums["standing"], "parked_kwh": sums["parked"], "parked_hours": sums["parked_hours"],
     }  # fmt: skip
-
-
-def _is_load(cause: str) -> bool:
-    """Whether a cause is a consumer that draws whatever the drive does."""
-    effect = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
-    return effect is not None and effect.__module__.rpartition(".")[2] in ("loads", "states")

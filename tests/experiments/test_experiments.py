@@ -180,7 +180,7 @@ RUN = (
     "studies/pinn_weights", "paper2/table2", "paper2/fig12", "paper2/selection", "paper2/table8", "paper2/pedal",
     "paper2/online", "studies/coverage", "studies/linearity", "studies/many", "studies/maps", "studies/mass",
     "studies/ranks", "studies/switching", "studies/simulators", "studies/while_driving", "studies/instruments",
-    "studies/watch_months",
+    "studies/watch_months", "studies/energy_study",
 )  # fmt: skip
 
 

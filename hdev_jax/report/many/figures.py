@@ -5,17 +5,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
 from hdev_jax.many.evidence import heavier
 from hdev_jax.many.unlike import equations
 from hdev_jax.report import names
-from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, MEASURED, axis_label, figure, tidy
-from hdev_jax.report.energy.figures import COLOURS, label
+from hdev_jax.report.canvas import BEFORE, INK, MEASURED, axis_label, figure, tidy
+from hdev_jax.report.energy.figures import COLOURS
 from hdev_jax.report.figures import WIDTH, short
 
-__all__ = ["condition_curves", "effects_map", "energy_flow", "time_line"]
+__all__ = ["condition_curves", "effects_map", "time_line"]
 
 Record = Mapping[str, Any]
 MOST_VEHICLES, MOST_EFFECTS, MOST_TRIPS = 60, 24, 4000
@@ -132,71 +130,6 @@ def time_line(records: Sequence[Record], unlike: Sequence[Mapping[str, Any]]) ->
     axes[-1].xaxis.set_major_locator(locator)
     axes[-1].xaxis.set_major_formatter(ConciseDateFormatter(locator))
     axes[0].set_title("Coefficients week by week; thick: vehicles that changed, dotted: since when")
-    return fig
-
-
-def energy_flow(rows: pd.DataFrame) -> Any | None:
-    """What entered on the left (the battery; causes that gave energy back) as bands to what took it on the right.
-
-    **Arguments:** one block of the ledger. None where nothing was measured.
-    """
-    from matplotlib.patches import PathPatch, Rectangle
-    from matplotlib.path import Path
-
-    lines = {str(r["cause"]): float(r["kwh"]) for r in rows.to_dict("records")}
-    total = lines.pop(TOTAL, 0.0)
-    takes = [(c, v) for c, v in lines.items() if v > LEAST_KWH]
-    gives = [(c, -v) for c, v in lines.items() if v < -LEAST_KWH]
-    if total <= 0 or not takes:
-        return None
-    takes.sort(key=lambda x: (x[0] == UNEXPLAINED, -x[1]))
-    entering = [("battery", total), *sorted(gives, key=lambda x: -x[1])]
-    whole = sum(v for _, v in takes)
-    gap = 0.035 * whole
-    fig = figure(WIDTH, 4.2)
-    ax = fig.add_subplot()
-    right, y = [], 0.0
-    for k, (cause, v) in enumerate(takes):
-        right.append((cause, y, v, GREY if cause == UNEXPLAINED else COLOURS[k % len(COLOURS)]))
-        y += v + gap
-    height = y - gap
-    # left: one band for the battery, thin ones for what gave back; each takes its share of every band in order
-    start = 0.5 * (height - whole - gap * (len(entering) - 1))
-    left, at = [], start
-    for cause, v in entering:
-        left.append((cause, at, v))
-        at += v + gap
-    cursor = [b for _, b, _, _ in right]
-    rest = [v for _, _, v, _ in right]
-    for _, base, v in left:
-        here, amount = base, v
-        for j in range(len(right)):
-            part = min(amount, rest[j])
-            if part <= LEAST_KWH:
-                continue
-            x0, x1, mid = 0.06, 0.74, 0.4
-            low, high = (here, cursor[j]), (here + part, cursor[j] + part)
-            points = [(x0, low[0]), (mid, low[0]), (mid, low[1]), (x1, low[1]), (x1, high[1]), (mid, high[1]),
-                      (mid, high[0]), (x0, high[0]), (x0, low[0])]  # fmt: skip
-            codes = [Path.MOVETO, *[Path.CURVE4] * 3, Path.LINETO, *[Path.CURVE4] * 3, Path.CLOSEPOLY]
-            ax.add_patch(PathPatch(Path(points, codes), facecolor=right[j][3], alpha=0.45, linewidth=0))
-            here, amount = here + part, amount - part
-            cursor[j], rest[j] = cursor[j] + part, rest[j] - part
-    for cause, base, v in left:
-        ax.add_patch(Rectangle((0.04, base), 0.02, v, facecolor=MEASURED if cause == "battery" else AFTER))
-        words = "out of the battery" if cause == "battery" else f"given back: {label(cause)}"
-        if cause == "battery":
-            ax.text(0.03, base + v / 2, f"{words}\n{v:,.4g} kWh", ha="right", va="center", color=INK)
-        else:
-            ax.text(0.03, base + v / 2, f"{words} {v:,.3g} kWh", ha="right", va="center", color=INK, fontsize=7)
-    for cause, base, v, colour in right:
-        ax.add_patch(Rectangle((0.74, base), 0.02, v, facecolor=colour))
-        ax.text(0.77, base + v / 2, f"{short(label(cause), 34)}  {v:,.4g} kWh ({100 * v / total:.1f} %)", va="center",
-                color=INK, fontsize=8)  # fmt: skip
-    ax.set_xlim(-0.22, 1.25)
-    ax.set_ylim(height + gap, min(start, 0.0) - gap)
-    ax.set_axis_off()
-    ax.set_title("Where the fleet's energy goes")
     return fig
 
 

@@ -4,13 +4,16 @@ import datetime
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from hdev_jax.many import FleetResult
 from hdev_jax.report import names, words
 from hdev_jax.report.energy.figures import by_week, label
+from hdev_jax.report.energy.flow import CAPTION as FLOW
+from hdev_jax.report.energy.flow import energy_flow
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
-from hdev_jax.report.many.figures import condition_curves, effects_map, energy_flow, time_line
+from hdev_jax.report.many.figures import condition_curves, effects_map, time_line
 
 __all__ = ["fleet_page", "fleet_pieces", "fleet_text"]
 
@@ -97,6 +100,8 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
     rows, about = result.tables["ledger"], result.tables["about"]
     whole = pd.DataFrame(rows[rows["level"] == "fleet"])
     weeks = pd.DataFrame(rows[rows["level"] == "week"])
+    of_fleet = pd.DataFrame(about[about["level"] == "fleet"])
+    km, kwh, back = (float(np.sum(of_fleet[k].to_numpy(float))) for k in ("km", "measured_kwh", "regenerated_kwh"))
     sections = [
         Section(
             "Vehicles that differ from their type, or changed",
@@ -116,8 +121,9 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
         Section(
             "Where the energy goes",
             "Sums of the vehicles' ledgers; each of these adds up to the vehicle's measured energy.",
-            {"energy_flow": (lambda: energy_flow(whole), "Energy from the battery to its causes.",
-                             "The fleet's energy by cause."),
+            {"energy_flow": (lambda: energy_flow(whole, back, km, title="Where the fleet's energy goes"),
+                             "Bands of energy from the battery through loads and losses to the wheels, and back.",
+                             FLOW),
              "weeks": (lambda: by_week(weeks) if len(weeks) else None, "Stacked bars of energy by cause for each week.",
                        "Energy by cause, week by week (ISO 8601).")},
             (_ledger(whole, price),) if len(whole) else (),
@@ -137,8 +143,6 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
         cells = [(v["name"], v["status"], v["message"]) for v in bad]
         table = Table("Not diagnosed", ("Vehicle", "Status", "Why"), cells, 3, "fleet.csv")
         sections.insert(4, Section("Logs that could not be used", "", {}, (table,)))
-    km = float(about.loc[about["level"] == "fleet", "km"].sum()) if len(about) else 0.0
-    kwh = float(about.loc[about["level"] == "fleet", "measured_kwh"].sum()) if len(about) else 0.0
     cost = sum(e["kwh_per_day"] or 0.0 for e in s["unlike"])
     tiles = [
         ("Vehicles", str(s["counts"]["done"]), f"of {len(records)} logs"),

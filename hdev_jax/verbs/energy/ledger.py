@@ -15,6 +15,8 @@ from hdev_jax.logs import Log
 from hdev_jax.problem import prepare
 from hdev_jax.report import words
 from hdev_jax.report.energy.figures import by_week, consumption, label, waterfall
+from hdev_jax.report.energy.flow import CAPTION as FLOW
+from hdev_jax.report.energy.flow import energy_flow
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic, trusted
@@ -166,7 +168,9 @@ def _page(fitted: Fitted, found: Ledger, price: float | None, asked: Asked, note
             "Where the energy goes",
             "Forces count at the wheel; the driveline's loss follows from its efficiency and their sum. The difference "
             "to the measured energy is unexplained; its interval includes the noise of the trips.",
-            {"waterfall": (lambda: waterfall(whole, *per), "Bars of energy by cause that add up to what was measured.",
+            {"flow": (lambda: energy_flow(whole, about["regenerated_kwh"], about["km"]),
+                      "Bands of energy from the battery through loads and losses to the wheels, and back.", FLOW),
+             "waterfall": (lambda: waterfall(whole, *per), "Bars of energy by cause that add up to what was measured.",
                            "Energy by cause over the whole log.")},
             (_causes(whole, price),),
         ),

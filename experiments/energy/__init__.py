@@ -1,0 +1,3 @@
+"""What the answers about energy promise: causes, road load, savings, counted on synthetic logs."""
+
+__all__ = []
