@@ -39,7 +39,7 @@ class Config(Strict):
     drives: int = Field(ge=1)  # of each noise
     vehicles: int = Field(ge=1)  # on each drive
     trips: int = Field(ge=3)
-    rows_per_trip: int = Field(ge=50)  # of 100 m
+    rows_per_trip: int = Field(ge=60)  # of 100 m
     ar_coefficient: float = 0.85
     at_most: float = 0.01  # share of the vehicles with an alarm
 
