@@ -137,7 +137,7 @@ def is_load(cause: str) -> bool:
 def place_of(cause: str) -> Literal["load", "loss", "wheel"]:
     """Where a cause takes its energy: a load, a loss between battery and wheels, or a force at the wheels.
 
-    Instruments of the road, and an effect that is not in the library, count at the wheels.
+    Instruments, and an effect that is not in the library, count at the wheels.
     """
     if is_load(cause):
         return "load"

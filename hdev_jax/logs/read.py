@@ -175,7 +175,9 @@ def _log(
     place = None
     if all(c in data for c in POSITION):
         place = metres(*(data[c] for c in POSITION))
-        data = {**data, **{c: np.where(np.isfinite(place[:, 0]), data[c], np.nan) for c in POSITION}}
+        data = {c: x for c, x in data.items() if c not in POSITION}
+        ledger = ledger.add("noted", "positions say which rows are of one road; they are no channel of the model",
+                            count=int(np.isfinite(place[:, 0]).sum()), column=POSITION[0])  # fmt: skip
     channels: dict[str, Any] = {k: v for k, v in data.items() if k not in KINEMATICS and k not in measured}
     channels, ledger = repair(channels, trip, time, ledger)
     soc = channels.get("soc")
@@ -240,8 +242,8 @@ def _with_slope(
     how = f"from {source}" if source == "altitude_m" else "smoothed"
     ledger = ledger.add("derived", f"{how} ({told.line()})", column="grade_rad")
     if (r := slope.repeated) is not None and r.disagree:
-        apart = f"{r.disagree} passes of a place that disagree with most others by height: kept apart"
-        ledger = ledger.add("noted", apart, column="grade_rad")
+        apart = "a pass of 20 m of road that disagrees with most others by height: kept apart"
+        ledger = ledger.add("noted", apart, count=r.disagree, column="grade_rad")
     if slope.jumps:
         ledger = ledger.add(
             "noted", f"{source} jumps: the slope begins anew there", count=slope.jumps, column="grade_rad"

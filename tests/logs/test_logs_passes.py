@@ -185,3 +185,33 @@ def test_headers_of_positions_are_guessed(header):
 def test_what_is_along_or_across_the_vehicle_is_no_position(header):
     found = guess(header)
     assert (found is not None and found.name == "longitude_deg") == (header == "long")
+
+
+def test_two_passes_help_each_other():
+    frame = passes(2, seed=1)
+    alone, both = told(frame, place=False), told(frame)
+    assert both.repeated is not None
+    assert both.repeated.disagree < 0.05 * both.repeated.cells
+    assert errors(both, frame)[0] < 0.9 * errors(alone, frame)[0]
+
+
+@pytest.mark.parametrize("kind", ["one trip six times", "a map's errors"])
+def test_what_all_passes_are_off_by_is_not_taken_for_road(kind):
+    """Passes that differ by nothing are no better than one."""
+    if kind == "one trip six times":
+        once = passes(1, seed=1)
+        frame = pd.concat([once.assign(trip_id=f"T{k}") for k in range(6)], ignore_index=True)
+    else:
+        frame = passes(6, seed=1, noise=0.0)
+        at = np.arange(0.0, LENGTH_M + 1.0, 30.0)
+        frame["altitude_m"] += np.interp(frame.x, at, np.random.default_rng(4).normal(0, 1.0, len(at)))
+    alone, together = told(frame, place=False), told(frame)
+    assert errors(together, frame)[0] < 1.2 * errors(alone, frame)[0]
+    assert errors(together, frame)[1] < 1.5 * errors(alone, frame)[1]
+
+
+def test_positions_are_no_channel_of_the_model(tmp_path):
+    frame = passes(3, seed=1).drop(columns=["x", "slope"])
+    log = read(tmp_path, frame)
+    assert not log.segments.has("latitude_deg")
+    assert any("positions" in e.reason for e in log.ledger)

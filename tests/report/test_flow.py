@@ -19,7 +19,7 @@ DOWNHILL = {
     UNEXPLAINED: -1.4,
 }  # fmt: skip
 FULL = {**TRUCK, "crosswind": 1.5, "tyre_warmup": 2.0, "road_surface": 1.8, "rolling_temperature": 3.0,
-        "cabin_warmup": 1.3, "switching_load:2": 4.0, "battery_resistance": 1.9, "iron_loss": 1.6}  # fmt: skip
+        "cabin_warmup": 1.3, "second_switching_load": 4.0, "battery_resistance": 1.9, "iron_loss": 1.6}  # fmt: skip
 CASES = {
     "truck": (TRUCK, 14.0), "no regeneration": (TRUCK, 0.0), "downhill": (DOWNHILL, 30.0), "many causes": (FULL, 22.0),
     "more back than taken": ({"rolling": 30.0, "grade": -60.0, "driveline": 8.0, UNEXPLAINED: 0.5}, 40.0),

@@ -10,7 +10,12 @@ readings so levelled has the noise σ/√K and the drift s/√K, and is smoothed
 
 The slopes that single passes give are not averaged instead: half of their variance is what smoothing takes from the
 road, the same in all passes. With white noise, the variance of the smoothed slope goes with σ (a slope of Matérn-3/2
-has the spectrum 1/ω⁴, the noise of its height as slope σ²ω², so ∫ω²/(1 + (ω/ω₀)⁶), ω₀⁻³ ~ σ): K passes have 1/√K of it.
+has the spectrum 1/ω⁴, the noise of its height as slope σ²ω², so σ²·∫ω²/(1 + (ω/ω₀)⁶), ω₀⁻³ ~ σ): K passes have 1/√K
+of it.
+
+What all passes of a place are off by, as by a map's altitude or by one trip that is in the log twice, is in no
+difference of passes, and would count as road. So where one pass alone shows much larger errors than passes differ by,
+there is nothing to average.
 """
 
 from dataclasses import dataclass, replace
@@ -22,13 +27,14 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, lsmr
 
 from hdev_jax.logs.instruments.places import Places
-from hdev_jax.logs.instruments.smoother import Course
+from hdev_jax.logs.instruments.smoother import HEIGHT, Course
 
 __all__ = ["Cells", "Pooled", "pooled"]
 
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55)  # visits apart at which errors are compared: 20 m to 1 km of driving
-TIMES_S = np.geomspace(5.0, 2000.0, 40)  # that a drift may take: from one cell to a third of an hour
-ALIKE = 3.0  # standard deviations within which passes of a place agree: 0.3 % of those of one road do not
+TIMES_S = np.geomspace(5.0, 2000.0, 40)  # that a drift may take: from one cell to half an hour
+ALIKE = 3.0  # standard deviations: beyond, passes of a place do not agree, and a drift is more than chance
+MOSTLY = 0.5  # share of the error's variance by one pass that passes have to differ by; estimates are off by less
 FEW = 50  # visits that an error is estimated from: its variance is known to 20 %
 UNKNOWN_M = 1e3  # standard deviation of a trip's level
 NEAR, STEPS = 1e-4, 200  # of the least squares: changes from cell to cell are then right to a centimetre
@@ -80,7 +86,8 @@ def pooled(
     """The readings of a place by all its passes. `smooth` are readings smoothed along each pass, `course` is what
     single passes tell, `least` the noise of steps.
 
-    **Returns:** None where the passes are too few to tell their errors, or tell no cell more than its own pass does.
+    **Returns:** None where the passes are too few to tell their errors, have most of them in common, or tell no cell
+    more than its own pass does.
     """
     at = np.flatnonzero((places.place >= 0) & (cells.count > 0))
     if len(at) == 0:
@@ -102,7 +109,7 @@ def pooled(
     )  # fmt: skip
     level = _levels(v, replace(course, drift=0.0))
     errors = _errors(v, level, course, least)
-    if errors is None:
+    if errors is None or errors.white**2 + errors.drift**2 < MOSTLY * _no_road(course, cells):
         return None
     level = _levels(v, errors)
     floor, disagree = _floors(v, level)
@@ -128,6 +135,13 @@ def pooled(
     passes, visits = np.ones(len(z)), np.ones(len(z))
     passes[at], visits[at] = np.where(joint, 1.0 / weight[p], 1.0), np.where(joint, number[p], 1.0)
     return Pooled(z, count, passes, visits, errors, disagree)
+
+
+def _no_road(alone: Course, cells: Cells) -> float:
+    """Variance of the errors that one pass shows; a drift that is no faster than roads bend may be road."""
+    speed = float(np.ptp(cells.at_m)) / max(float(np.ptp(cells.clock_s)), 1e-9)
+    fast = alone.drift_s * speed < HEIGHT.shortest
+    return alone.white**2 + fast * alone.drift**2
 
 
 def _white(v: _Visits, course: Course) -> np.ndarray:
@@ -236,23 +250,25 @@ def _errors(v: _Visits, level: np.ndarray, course: Course, least: float) -> Cour
 def _floors(v: _Visits, level: np.ndarray) -> tuple[np.ndarray, int]:
     """The places with those apart that lie above or below them, as a road over another, and how many visits are there.
 
-    A visit is compared with the place's median, by the readings that were smoothed along its own pass.
+    A visit is compared with the place's median, by the readings that were smoothed along its own pass. Of one of K
+    visits, the difference to their middle has the share 1 − 1/K of its variance.
     """
-    place, moved = v.place.copy(), 0
+    place, moved = v.place.copy(), np.zeros(len(v.place), bool)
     y, places = v.smooth - level, int(v.place.max()) + 1
     for floor in (1, 2):
         order = np.lexsort((y, place))
         edge = np.flatnonzero(np.r_[True, np.diff(place[order]) != 0])
         number = np.diff(np.r_[edge, len(place)])
-        middle = np.zeros(int(place.max()) + 1)
-        middle[place[order][edge]] = y[order][edge + (number - 1) // 2]
-        off = np.abs(y - middle[place])
+        middle, left = np.zeros(int(place.max()) + 1), np.ones(int(place.max()) + 1)
+        middle[place[order][edge]] = 0.5 * (y[order][edge + (number - 1) // 2] + y[order][edge + number // 2])
+        left[place[order][edge]] = np.sqrt(1.0 - 1.0 / np.maximum(number, 2))
+        off = np.abs(y - middle[place]) / left[place]
         many = np.bincount(place)[place] > 1
         usual = 1.4826 * float(np.median(off[many])) if many.any() else 0.0
         apart = many & (off > ALIKE * usual)
-        moved += int(apart.sum())
+        moved |= apart
         if floor == 1:
             place = np.where(apart, place + places, place)
         else:  # of neither: alone
             place = np.where(apart, place.max() + np.cumsum(apart), place)
-    return place, moved
+    return place, int(moved.sum())

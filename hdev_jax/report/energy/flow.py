@@ -56,14 +56,14 @@ class Flow:
 
 
 def flow_of(rows: pd.DataFrame, regenerated_kwh: float) -> Flow | None:
-    """The flows of one block of the ledger. None where nothing leaves the battery.
+    """The flows of one block of the ledger. None where nothing leaves the battery, or a cause is not known.
 
     Small causes are one band, "other", their sum; places in the order of the chain, the wheels last, and of a place
     the largest first.
     """
     kwh = {str(r["cause"]): float(r["kwh"]) for r in rows.to_dict("records")}
     out = kwh.pop(TOTAL, 0.0) + regenerated_kwh
-    if out <= NOTHING_KWH:
+    if not np.isfinite([out, *kwh.values()]).all() or out <= NOTHING_KWH:
         return None
     small = [c for c, x in kwh.items() if abs(x) < LEAST_SHARE * out and c != UNEXPLAINED]
     if len(small) > 1:  # one alone keeps its name
@@ -207,7 +207,8 @@ class _Drawing:
         inside = [(self.x0, foot), *_arc(x_left, foot + r, r, 270, 180), *_arc(x_left, lane - r, r, 180, 90), *inner]
         self._polygon([*outside, *inside], BACK)
         share = 100 * self.flow.back_kwh / self.flow.out_kwh
-        words = f"regenerated, back into the battery: {self.amount(self.flow.back_kwh)} ({share:.1f} % of what left it)"
+        of = f" ({share:.1f} % of what left it)" if share <= 100 else ""
+        words = f"regenerated, back into the battery: {self.amount(self.flow.back_kwh)}{of}"
         self.ax.text(0.5 * (self.x0 + X_CAUSE), lane + back + 0.18, words, ha="center", va="center", fontsize=8)
 
     def _band(self, x0: float, y0: float, x1: float, y1: float, tall: float, colour: str) -> None:
