@@ -132,7 +132,7 @@ def _beside(streams: Results, batch: Results, planted: str) -> Line:
 
 @styled
 def _figure(run: Run, forecasts: Results, shares: Sequence[float], alarms: Sequence[Line]) -> None:
-    fig = figure(9.0, 3.6)
+    fig = figure(9.0, 4.0)
     ax = fig.add_subplot(1, 2, 1)
     at = 100.0 * np.array(shares)
     kinds = [(kind, sheet) for kind, sheets in SHEETS.items() for sheet in sheets]
@@ -144,7 +144,7 @@ def _figure(run: Run, forecasts: Results, shares: Sequence[float], alarms: Seque
     ax.plot([], [], "--", color="0.5", label="half the 90 % interval")
     ax.set(xlabel="share of the trip behind [%]", ylabel="median error of the rest [%]", ylim=(0, None))
     ax.set_title("Forecast of the rest, synthetic fleet")
-    ax.legend()
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     tidy(ax)
     ax = fig.add_subplot(1, 2, 2)
     place = np.arange(len(alarms))
