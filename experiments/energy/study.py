@@ -33,7 +33,7 @@ from hdev_jax.verbs.energy.result import EnergyResult
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ()
+SOURCES = ("coasting.py",)
 Noise = Literal["white", "ar1", "ar1_white", "trip_levels", "student_t", "trip_variance"]
 
 # What the sheet says of each cause, value and sd; what is planted is drawn from it, as c_rr and C_dA are

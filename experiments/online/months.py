@@ -25,7 +25,7 @@ from hdev_jax.rundir import Run
 
 __all__ = ["SOURCES", "Config", "collect", "run", "tasks"]
 
-SOURCES = ()
+SOURCES = ("study.py",)
 
 
 class Config(Strict):
