@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from hdev_jax.energy.fitted import Fitted
 from hdev_jax.inference import Shapes, chunks_of_fit, insert, padded
 from hdev_jax.physics import DECLARED, LIBRARY, Vehicle
-from hdev_jax.physics.effect import STAGES
+from hdev_jax.physics.effect import STAGES, Effect
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.physics.tyres import RollingLinear
 from hdev_jax.segments import Segments, trip_slices
@@ -119,10 +119,14 @@ def by_cause(fitted: Fitted, thetas: Float[np.ndarray, "draw free"], change: Cha
     return ByCause(causes, whole[0], whole[1:] if len(whole) > 1 else whole)
 
 
+def _effect(cause: str) -> type[Effect] | None:
+    return {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
+
+
 def _place(cause: str) -> tuple[int, int, str]:
     if cause in _FIRST:
         return 0, _FIRST.index(cause), cause
-    effect = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
+    effect = _effect(cause)
     stage = "driveline" if cause == "driveline" else "machine" if cause == "machine" else "battery"
     stage = effect.stage if effect else stage
     return 1 + STAGES.index(stage), 0 if effect is None else 1, cause
@@ -130,7 +134,7 @@ def _place(cause: str) -> tuple[int, int, str]:
 
 def is_load(cause: str) -> bool:
     """Whether a cause is a consumer that draws whatever the drive does."""
-    effect = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
+    effect = _effect(cause)
     return effect is not None and effect.__module__.rpartition(".")[2] in ("loads", "states")
 
 
@@ -141,6 +145,6 @@ def place_of(cause: str) -> Literal["load", "loss", "wheel"]:
     """
     if is_load(cause):
         return "load"
-    effect = {c.id: c for c in (*LIBRARY.values(), *DECLARED)}.get(cause)
+    effect = _effect(cause)
     stage = cause if effect is None else effect.stage
     return "loss" if stage in ("driveline", "machine", "battery") else "wheel"

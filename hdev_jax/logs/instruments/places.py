@@ -11,7 +11,7 @@ __all__ = ["Places", "metres", "places_of"]
 EARTH_M = 6_371_008.8  # mean radius of the Earth, IUGG
 AHEAD_M = 30.0  # a heading is from so far behind to so far ahead: 4 m of noise at both ends turn it by 5°
 TURN = np.cos(np.radians(30.0))  # headings agree or oppose within 30°: six of their standard deviations
-# Roads side by side are told apart where positions are good; two lanes in each direction of 3.5 m are one road.
+# Roads side by side are separate places where positions are good; two lanes in each direction of 3.5 m are one road.
 ROAD_M, WIDEST_M = 10.0, 50.0
 NEAREST = 8  # places about a cell that it may be of: neighbours on one road, and on those that cross it
 LAP_M = 4.0 * WIDEST_M  # a way that comes back to within 50 m after more than a circle about them is another pass

@@ -12,10 +12,11 @@ from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, MEASURED, figure, tidy
 from hdev_jax.report.figures import WIDTH, short
 
-__all__ = ["by_week", "consumption", "differences", "forces", "label", "trip_intervals", "waterfall"]
+__all__ = ["BACK", "by_week", "consumption", "differences", "forces", "label", "trip_intervals", "waterfall"]
 
 # Okabe and Ito (2008), as the other figures
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#F0E442", "#7F7F7F")
+BACK = COLOURS[2]  # green: energy that comes back
 MOST_TRIPS = 40
 NOTHING = 1e-9  # of a bar that is left out
 
@@ -40,7 +41,7 @@ def waterfall(rows: pd.DataFrame, per: str, unit: str) -> Any:
     y = np.arange(len(causes) + 1)[::-1].astype(float)
     fig = figure(WIDTH, 1.3 + 0.38 * len(y))
     ax = fig.add_subplot()
-    colours = [GREY if c == UNEXPLAINED else AFTER if v >= 0 else "#009E73"
+    colours = [GREY if c == UNEXPLAINED else AFTER if v >= 0 else BACK
                for c, v in zip(causes, value, strict=True)]  # fmt: skip
     ax.barh(y[:-1], value, left=starts, color=colours, height=0.62)
     ax.barh(y[-1], total, color=MEASURED, height=0.62)

@@ -13,7 +13,7 @@ import pandas as pd
 from hdev_jax.energy.causes import place_of
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, MEASURED, figure
-from hdev_jax.report.energy.figures import label
+from hdev_jax.report.energy.figures import BACK, label
 from hdev_jax.report.figures import WIDTH, short
 
 __all__ = ["CAPTION", "Band", "Flow", "energy_flow", "flow_of"]
@@ -26,7 +26,6 @@ CAPTION = (
 LEAST_SHARE = 0.01  # of what leaves the battery: a cause below it is part of "other"
 NOTHING_KWH = 1e-6  # of a flow that is drawn
 OTHER = "other"
-BACK = "#009E73"  # Okabe and Ito's green: what comes back
 PLACES = {"load": "electrical loads", "loss": "losses", OTHER: "", UNEXPLAINED: "", "wheel": "at the wheels"}
 COLOURS = {"load": "#E69F00", "loss": BEFORE, OTHER: "#56B4E9", UNEXPLAINED: GREY, "wheel": AFTER}
 TALL, SLOT, GAP = 2.8, 0.2, 0.09  # height of all that enters; least height of a label's line; between bands
