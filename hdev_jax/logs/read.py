@@ -11,7 +11,7 @@ from hdev_jax.errors import InputError, MissingColumnError
 from hdev_jax.logs.adapter import Adapter, near
 from hdev_jax.logs.columns import ColumnInfo, Piece, translate
 from hdev_jax.logs.columns.clocks import FIRST_DATE_S, LAST_DATE_S
-from hdev_jax.logs.instruments import Slope, instruments_of, metres, slope_of, speed_of
+from hdev_jax.logs.instruments import Slope, end_speeds, instruments_of, metres, slope_of, speed_of
 from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import KINEMATICS, MEASURED, Log
@@ -210,16 +210,24 @@ def _log(
 
 
 def _with_speed(rows: Rows, sampled: bool) -> Rows:
-    """Speeds of samples that are read in coarse steps, smoothed."""
-    if not (sampled and "time_s" in rows.data):
-        return rows
-    if (found := speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])) is None:
-        return rows
-    speed, sd, step = found
-    changed = int(np.sum(speed != rows.data["speed_mps"]))
-    why = f"read in steps of {3.6 * step:.2g} km/h: smoothed, by at most half a step"
-    ledger = rows.ledger.add("derived", why, count=changed, column="speed_mps")
-    return replace(rows, data={**rows.data, "speed_mps": speed, ACCEL_SD: sd}, ledger=ledger)
+    """Speeds that are read in coarse steps, smoothed: of samples, or at the ends of intervals."""
+    if sampled:
+        if "time_s" not in rows.data:
+            return rows
+        found = speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])
+        if found is None:
+            return rows
+        made, step = {"speed_mps": found.mps, ACCEL_SD: np.full(len(rows.trip), found.acceleration_sd)}, found.step
+    else:
+        ends = end_speeds(rows.trip, *_intervals(rows, sampled))
+        if ends is None:
+            return rows
+        made, step = dict(zip(("speed_start_mps", "speed_end_mps", ACCEL_SD), ends[:3], strict=True)), ends[3]
+    why, ledger = f"read in steps of {3.6 * step:.2g} km/h: smoothed, by at most half a step", rows.ledger
+    for column in (c for c in made if c != ACCEL_SD):
+        changed = int(np.sum(made[column] != rows.data[column]))
+        ledger = ledger.add("derived", why, count=changed, column=column)
+    return replace(rows, data={**rows.data, **made}, ledger=ledger)
 
 
 def _with_slope(

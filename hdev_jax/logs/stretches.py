@@ -73,7 +73,8 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
             channels[name], how = _held_longest(x, duration, row), "the value held longest"
         elif name == ACCEL_SD:  # of the difference of a stretch's end speeds, whatever lies between
             usual = _mean(x, duration, first)
-            channels[name], how = usual * np.minimum(2.0 / (last - first + 1), 1.0), "the error of the end speeds"
+            spans = 2.0 if log.sampled else 1.0  # the rows between the readings of a row's acceleration
+            channels[name], how = usual * np.minimum(spans / (last - first + 1), 1.0), "the error of the end speeds"
         elif name in _OF_THE_ROAD:
             weight = np.where(way[row] > 0, distance, duration)
             channels[name], how = _mean(x, weight, first, slope=name == "grade_rad"), "mean over distance"

@@ -7,7 +7,7 @@ from logs_helpers import read
 
 from hdev_jax.logs.instruments import slope_of, speed_of, step_of
 from hdev_jax.logs.instruments.smoother import HEIGHT, Course, lanes_of, smoothed
-from hdev_jax.segments import GRADE_SD
+from hdev_jax.segments import ACCEL_SD, GRADE_SD
 from hdev_jax.verbs.check import check
 
 ROWS = 2400
@@ -135,9 +135,10 @@ def test_speed_in_steps_is_smoothed_within_half_a_step(tmp_path):
     frame = road(standing=False)
     true = frame.speed_mps.to_numpy()
     read_ = np.round(true * 3.6) / 3.6
-    speed, _, step = speed_of(np.repeat(np.arange(3), ROWS // 3), frame.time_s.to_numpy(), read_) or (read_, read_, 0.0)
-    assert step == pytest.approx(1 / 3.6)
-    assert np.abs(speed - read_).max() <= 0.5 * step + 1e-12
+    found = speed_of(np.repeat(np.arange(3), ROWS // 3), frame.time_s.to_numpy(), read_)
+    assert found is not None and found.step == pytest.approx(1 / 3.6)
+    speed = found.mps
+    assert np.abs(speed - read_).max() <= 0.5 * found.step + 1e-12
     inner = np.arange(ROWS)[1:-1] % (ROWS // 3)
     inner = (inner > 0) & (inner < ROWS // 3 - 1)
     rough, smooth = (np.std((x[2:] - x[:-2] - true[2:] + true[:-2])[inner]) for x in (read_, speed))
@@ -145,6 +146,46 @@ def test_speed_in_steps_is_smoothed_within_half_a_step(tmp_path):
     log = read(tmp_path, frame.drop(columns=["slope", "altitude_m"]).assign(speed_mps=read_))
     assert any(e.kind == "derived" and e.column == "speed_mps" and e.count for e in log.ledger)
     np.testing.assert_allclose(log.segments.distance_m, speed)
+
+
+def segments_in_steps(rng, trips=6, rows=200):
+    """Segments of 5 s or so whose speed wanders gently, joined end to start within a trip; the true end speeds."""
+    parts = []
+    for k in range(trips):
+        duration = rng.uniform(3.0, 8.0, rows)
+        pull = np.convolve(rng.normal(0, 1.0, rows + 4), np.ones(5) / 5, mode="valid")
+        speed = np.clip(18.0 + np.cumsum(np.r_[0.0, 0.6 * pull]), 5.0, 30.0)
+        ends = {"speed_start_mps": speed[:-1], "speed_end_mps": speed[1:]}
+        time = np.r_[0.0, np.cumsum(duration)[:-1]]
+        parts.append(pd.DataFrame({"trip_id": f"t{k}", "time_s": time, "duration_s": duration, **ends,
+                                   "energy_wh": 100.0}))  # fmt: skip
+    true = pd.concat(parts, ignore_index=True)
+    coarse = {c: np.round(true[c] * 3.6) / 3.6 for c in ("speed_start_mps", "speed_end_mps")}
+    return true, true.assign(**coarse)
+
+
+def test_end_speeds_of_segments_in_steps_are_smoothed_and_stay_joined(tmp_path):
+    true, coarse = segments_in_steps(np.random.default_rng(8))
+    s = read(tmp_path, coarse).segments
+    same = coarse.trip_id.eq(coarse.trip_id.shift(-1))[:-1]
+    np.testing.assert_array_equal(s.speed_end_mps[:-1][same], s.speed_start_mps[1:][same])
+    for side in ("speed_start_mps", "speed_end_mps"):
+        assert np.abs(getattr(s, side) - coarse[side]).max() <= 0.5 / 3.6 + 1e-12
+    change = np.diff([s.speed_start_mps, s.speed_end_mps], axis=0)[0]
+    truth, rough = (x.speed_end_mps - x.speed_start_mps for x in (true, coarse))
+    assert np.std(change - truth) < 0.9 * np.std(rough - truth)
+    slope = np.sum(truth * change) / np.sum(change**2)
+    attenuated = np.sum(truth * rough) / np.sum(rough**2)
+    assert abs(slope - 1.0) < 0.03 and attenuated < 0.9
+    z = (change - truth) / (s.channels[ACCEL_SD] * s.duration_s)
+    assert 0.7 < np.std(z) < 1.3
+
+
+def test_rows_that_are_not_joined_are_smoothed_by_themselves(tmp_path):
+    true, coarse = segments_in_steps(np.random.default_rng(9))
+    coarse.loc[100, "speed_start_mps"] += 3.0  # the row before ends at another speed
+    s = read(tmp_path, coarse).segments
+    assert abs(s.speed_start_mps[100] - s.speed_end_mps[99] - 3.0) <= 1.0 / 3.6 + 1e-9
 
 
 def test_check_shows_the_instruments(tmp_path):
