@@ -30,9 +30,11 @@ def speed_of(
     """Speeds [m/s] as what is read in steps tells of them, none further off than half a step.
 
     A speed in steps of 1 km/h, read each second, has accelerations of 0.06 m/s² that are none: an inertia of a truck's
-    5 kN. A reading of 0 is standing. `span`: how many readings on a row's acceleration is, 2 between the neighbours of
-    a sample and 1 between the ends of an interval. **Returns:** None where there is no step, or too small a one to matter beside the
-    gentle accelerations: where noise grows with power, they weigh most in a calibration.
+    5 kN. A reading of 0 is standing. `span`: over how many steps in time a row's acceleration is taken, 2 between the
+    neighbours of a sample, 1 between the ends of an interval.
+
+    **Returns:** None where there is no step, or too small a one to matter beside the gentle accelerations, which weigh
+    most in a calibration where noise grows with power.
     """
     step = step_of(reading)
     first = np.flatnonzero((trip[span:] == trip[:-span]) & (reading[span:] + reading[:-span] > 0))
