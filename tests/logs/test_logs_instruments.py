@@ -184,7 +184,7 @@ def test_end_speeds_of_segments_in_steps_are_smoothed_and_stay_joined(tmp_path):
 
 
 def test_rows_that_are_not_joined_are_smoothed_by_themselves(tmp_path):
-    true, coarse = segments_in_steps(np.random.default_rng(9))
+    _, coarse = segments_in_steps(np.random.default_rng(9))
     coarse.loc[100, "speed_start_mps"] += 3.0  # the row before ends at another speed
     s = read(tmp_path, coarse).segments
     assert abs(s.speed_start_mps[100] - s.speed_end_mps[99] - 3.0) <= 1.0 / 3.6 + 1e-9
