@@ -12,6 +12,7 @@ from hdev_jax.segments import Segments
 __all__ = [
     "distance_since_start",
     "later_slope",
+    "less_noise",
     "low_pass",
     "neighbours",
     "shifted",
@@ -26,6 +27,7 @@ FIRST, LAST = "derived:first_row_of_trip", "derived:last_row_of_trip"
 DISTANCE_SINCE_START = "derived:distance_since_start_m"
 TIME_SINCE_BRAKING = "derived:time_since_braking_s"
 BRAKING_PA = 2e3  # pressure from which on a brake is on
+ALIKE = 1e-5  # of their size: values that differ by less differ by their rounding in single precision
 STANDS = 0.05  # m: a way that says nothing of a slope
 
 
@@ -101,6 +103,32 @@ def _lagged(carry: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
     keep, x = row
     y = keep * carry + (1 - keep) * x
     return y, y
+
+
+def less_noise(column: Any, segments: Segments, sd: Any) -> Float[Array, " row"]:
+    """What a column is in truth where its readings have independent errors of standard deviation `sd`: the best linear
+    guess from a row and the mean of its two neighbours, by the moments of its trip; where the vehicle stands, as read.
+
+    With r what of a reading the neighbours do not say (the residual of its regression on them), the error is expected
+    to be sd²·r/Var r: cov(error, r) is sd², as the neighbours have errors of their own. At most all of r.
+    """
+    x, (first, last) = jnp.asarray(column), trip_bounds(segments)
+    index = jnp.arange(x.shape[0])
+    before, after = jnp.where(index > first, index - 1, index + 1), jnp.where(index < last, index + 1, index - 1)
+    near = 0.5 * (x[jnp.clip(before, first, last)] + x[jnp.clip(after, first, last)])
+    moves = jnp.where(jnp.asarray(segments.distance_m) > 0, 1.0, 0.0)
+
+    def mean(y: Array) -> Array:
+        sums = jnp.zeros((2, x.shape[0])).at[:, first].add(jnp.stack([moves * y, moves]))
+        return (sums[0] / jnp.maximum(sums[1], 1.0))[first]
+
+    own, others = x - mean(x), near - mean(near)
+    square = mean(others**2)
+    differ = square > ALIKE**2 * mean(x**2)
+    told = jnp.where(differ, mean(own * others) / jnp.where(differ, square, 1.0), 0.0)
+    rest = own - told * others
+    left = mean(rest**2)
+    return x - moves * jnp.minimum(sd**2 / jnp.where(left > 0, left, jnp.inf), 1.0) * rest
 
 
 def later_slope(segments: Segments, ahead_s: Any) -> Float[Array, " row"]:

@@ -5,15 +5,16 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from hdev_jax.physics.across import later_slope, low_pass, neighbours, shifted
+from hdev_jax.physics.across import later_slope, less_noise, low_pass, neighbours, shifted
 from hdev_jax.physics.effect import Car, Effect, Names, Parameters, Row, Signal, Stage
 from hdev_jax.physics.parameter import Choice, Size, Switch
-from hdev_jax.segments import ACCEL_SD, Segments
+from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
 
 __all__ = [
     "AccelerometerBias",
     "GradeBias",
     "GradeLag",
+    "GradeNoise",
     "GradeScale",
     "MassScale",
     "PowerGain",
@@ -105,6 +106,31 @@ class GradeLag(Effect):
 
     def across(self, segments: Segments) -> Segments:
         return segments.with_channels(grade_rad=later_slope(segments, self.lag_s))
+
+
+class GradeNoise(Effect):
+    """The slope's noise counts as slope: the road is flatter than read, most where a row differs from its neighbours."""
+
+    id: ClassVar[str] = "grade_noise"
+    label: ClassVar[str] = "noise of the slope"
+    stage: ClassVar[Stage] = "sensors"
+    instrument: ClassVar[bool] = True
+    equation: ClassVar[str] = "θ → θ − σ²·r/Var r, r what the neighbours do not say of θ"
+    source: ClassVar[str] = "Carroll et al., Measurement Error in Nonlinear Models, chapter 4 (regression calibration)"
+    needs: ClassVar[Names] = ("grade_rad",)
+    lacks: ClassVar[Names] = (GRADE_SD,)
+    instead: ClassVar[str] = "the noise of the slope was seen in the log itself, and smoothed"
+    entries: ClassVar[Names] = ("road",)
+    parameters: ClassVar[Parameters] = (
+        Switch("sd_rad", "rad", 0.0, 0.01, 0.0, 0.1, grid=(0.0025, 0.005, 0.01, 0.02, 0.04), least=5e-4),
+    )
+    mistaken_for: ClassVar[Names] = ("grade_scale", "mass_scale")
+    separated_by: ClassVar[str] = "the same roads again, and the spectrum of the slope"
+    order: ClassVar[int] = 1  # of the slope as it is once its lag is out
+    sd_rad: Any
+
+    def across(self, segments: Segments) -> Segments:
+        return segments.with_channels(grade_rad=less_noise(segments.channels["grade_rad"], segments, self.sd_rad))
 
 
 class SpeedScale(Effect):

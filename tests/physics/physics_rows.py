@@ -21,6 +21,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "accelerometer_bias": {"bias_mps2": 0.07},
     "grade_bias": {"bias_rad": 2e-3},
     "grade_lag": {"lag_s": 1.3},
+    "grade_noise": {"sd_rad": 0.01},
     "grade_scale": {"scale": 0.15},
     "mass_scale": {"scale": 0.08},
     "power_gain": {"gain": 0.03, "offset_w": 400.0},

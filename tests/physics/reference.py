@@ -6,6 +6,8 @@ papers (paper 1, equations 3-5; paper 2, equations 2-12) and from the equations 
 
 import math
 
+import numpy as np
+
 G = 9.80665
 RHO0 = 1.225
 
@@ -31,6 +33,8 @@ def prepare(trip: list[dict], effects: dict) -> None:
         later = [later_slope(trip, k, effects["grade_lag"]["lag_s"]) for k in range(len(trip))]
         for r, slope in zip(trip, later, strict=True):
             r["grade_rad"] = slope
+    if "grade_noise" in effects:
+        with_less_noise(trip, effects["grade_noise"]["sd_rad"])
     gone, released = 0.0, None
     for r in trip:
         r["gone_m"] = gone + r["distance_m"] / 2
@@ -40,6 +44,23 @@ def prepare(trip: list[dict], effects: dict) -> None:
             r["since_s"] = None
         else:
             r["since_s"] = None if released is None else r["time_s"] + r["duration_s"] / 2 - released
+
+
+def with_less_noise(trip: list[dict], sd_rad: float) -> None:
+    """Slopes less what is expected of their error, given what a line on the neighbours' mean leaves of them."""
+    moving = [k for k, r in enumerate(trip) if r["distance_m"] > 0]
+    if len(trip) < 2 or not moving:
+        return
+    x = np.array([r["grade_rad"] for r in trip])
+    near = np.convolve(np.r_[x[1], x, x[-2]], [0.5, 0.0, 0.5], mode="valid")
+    own, others = x - np.mean(x[moving]), near - np.mean(near[moving])
+    differ = np.std(near[moving]) > 1e-5 * np.sqrt(np.mean(x[moving] ** 2))
+    told = np.linalg.lstsq(others[moving, None], own[moving], rcond=None)[0][0] if differ else 0.0
+    rest = own - told * others
+    if np.max(np.abs(rest[moving])) > 1e-12:
+        share = min(sd_rad**2 / np.mean(rest[moving] ** 2), 1.0)
+        for k in moving:
+            trip[k]["grade_rad"] -= share * rest[k]
 
 
 def later_slope(trip: list[dict], k: int, lag_s: float) -> float:

@@ -29,7 +29,7 @@ CAR = {
     "regenerating": 0.88,
 }
 REFERENCED = (
-    "grade_lag", "grade_bias", "mass_scale", "speed_scale", "time_skew", "sampling_filter", "power_gain",
+    "grade_lag", "grade_noise", "grade_bias", "mass_scale", "speed_scale", "time_skew", "sampling_filter", "power_gain",
     "headwind", "rolling_temperature", "tyre_warmup", "road_surface", "cornering", "brake_drag",
     "driveline_drag", "gear_efficiency",
     "copper_loss", "iron_loss", "auxiliary_power", "hvac_power", "passenger_heat", "cabin_warmup", "friction_blending",
