@@ -6,7 +6,7 @@ from itertools import cycle
 import numpy as np
 
 from experiments.planted.rivals import comparable
-from experiments.planted.rivals_table import outcome
+from experiments.planted.rivals_table import LABELS, outcome
 from experiments.planted.scores import Group, names
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import wilson
@@ -23,8 +23,6 @@ COLOURS = {
     "lasso_cv": "#3d8a5f",
     "forward_bic": "#8a3d6f",
 }
-LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, classes set aside", "stlsq": "STLSQ (PySINDy)",
-          "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}  # fmt: skip
 NOISES = {"white": "white", "ar1": "AR(1)", "ar1_white": "AR(1)\n+ white", "trip_levels": "random\nintercepts",
           "student_t": "Student's t", "trip_variance": "variance\nby trip"}  # fmt: skip
 LEVEL = 5.0  # per cent of logs with nothing planted that may be given a name

@@ -8,8 +8,12 @@ import numpy as np
 from experiments.planted import scores as scores
 from experiments.planted.rivals import comparable
 from experiments.planted.scores import Group
+from experiments.runner.tables import readable
 
-__all__ = ["outcome", "rival_rows"]
+__all__ = ["LABELS", "outcome", "rival_rows"]
+
+LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, classes set aside", "stlsq": "STLSQ (PySINDy)",
+          "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}  # fmt: skip
 
 
 def outcome(planted: Sequence[str], result: dict[str, Any], method: str) -> tuple[bool, bool]:
@@ -39,7 +43,7 @@ def rival_rows(groups: Sequence[tuple[str, Group]], rivals: Sequence[str]) -> li
             ]
             took = [r["seconds"] if ours else r["rivals"][method]["seconds"] for _, r in group]
             rows.append({
-                "name": f"{setting}: {method}", "n": len(group),
+                "name": f"{setting}: {LABELS.get(method, readable(method))}", "n": len(group),
                 "exactly": float(np.mean([h for h, _ in hits])) if names else None,
                 "false": float(np.mean([f for _, f in hits])) if names else None,
                 "test_over_oracle": float(np.median(error)), "seconds": float(np.median(took)),

@@ -65,16 +65,16 @@ LEGEND = {  # of each table that is there; the first of every page
         "logs in which structure is left (random intercepts of trips count, although they are noise in these logs)",
     ),
     "planted_errors": (
-        "Within 5 percent of oracle: share of logs whose test RMSE is that close to a fit on the same training trips "
-        "that knows the cause. After over noise: test RMSE divided by the RMS of the noise, median. Sizes: of effects "
-        "named by their own id. Seconds: median time of one diagnosis, with others running on the same machine; the "
-        "first logs of each kind include compiling",
+        "Within 5 % of a refit: share of logs whose test RMSE is at most 5 % above that of a fit on the same training "
+        "trips that knows the cause. Test RMSE over noise: test RMSE divided by the RMS of the noise, median. Sizes: "
+        "of effects named by their own id. Seconds: of one diagnosis, median, with others running on the same machine; "
+        "the first logs of each kind include compiling",
     ),
     "planted_names": (
-        "Named first: share of logs in which the first name of each entry is the planted effect. No class: share in "
-        "which each entry is a single name. Separable: share in which, judged by the true effect, no other effect "
-        "explains as much under this noise. Redrawn: number of logs drawn again because the effect acted in only one "
-        "training trip, or the noise was beyond what the reader takes",
+        "Named first: share of logs in which the first name of each entry is the planted effect. Named alone: share "
+        "in which each entry is a single name. Separable: share in which, judged by the true effect, no other effect "
+        "explains as much under this noise. Drawn anew: number of logs drawn again because the effect acted in only "
+        "one training trip, or the noise was beyond what the reader takes",
     ),
     "planted_names_by_twin": (
         "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "
@@ -83,10 +83,10 @@ LEGEND = {  # of each table that is there; the first of every page
         "the wanted one, and so is the share with no class, if one is wanted",
     ),
     "planted_rivals": (
-        "Ours is right if an entry (a name or a class) contains the planted effect; ours_first, if the first name of "
-        "each entry is the planted effect, so a twin named first is false. A rival's name is right if it is the "
-        "planted effect, its twin, an effect that this log cannot distinguish from it, or in our class. Our seconds "
-        "include compiling, which weighs more where there are few logs of a kind",
+        "Ours is right if an entry (a name or a class) contains the planted effect; with classes set aside, if the "
+        "first name of each entry is the planted effect, so a twin named first is false. A rival's name is right if it "
+        "is the planted effect, its twin, an effect that this log cannot distinguish from it, or in our class. Our "
+        "seconds include compiling, which weighs more where there are few logs of a kind",
     ),
 }
 

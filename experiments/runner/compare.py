@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any
 
+from experiments.runner.tables import readable
+
 __all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "notes", "numbers"]
 
 DECIDES = "The number that decides for each model; median and range are over all random starts of its fit"
@@ -38,8 +40,8 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
                 reason = None if own is not None else row.get("reason", "not computed")
                 lines.append(
                     {
-                        "name": row["name"],
-                        "quantity": quantity,
+                        "name": readable(row["name"]),
+                        "quantity": readable(quantity),
                         "paper": paper,
                         "ours": own,
                         "ratio": ratio,
@@ -61,7 +63,7 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         spread = (row["ours"] or {}).get("spread", {})
         lines.append(
             {
-                "name": row["name"], "quantity": quantity, "paper": paper, "ours": own,
+                "name": readable(row["name"]), "quantity": readable(quantity), "paper": paper, "ours": own,
                 "ratio": own / paper if own is not None and paper else None,
                 "median": spread.get("median"),
                 "least to most": [spread["least"], spread["most"]] if spread else None, "why_not": row.get("reason"),

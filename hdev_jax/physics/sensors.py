@@ -109,7 +109,7 @@ class GradeLag(Effect):
 
 
 class GradeNoise(Effect):
-    """The slope's noise counts as slope: the road is flatter than read, most where a row differs from its neighbours."""
+    """The slope's noise counts as slope: the road is flatter where a row differs from its neighbours."""
 
     id: ClassVar[str] = "grade_noise"
     label: ClassVar[str] = "noise of the slope"

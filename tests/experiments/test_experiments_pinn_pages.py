@@ -131,7 +131,7 @@ def test_the_table_counts_rows_once_and_bounds_over_all_trainings(run, no_figure
     said = "diverged trainings, left out of all errors: paper 1 of 4, network without physics 1 of 1"
     assert said in out["notes"]
     (bounds,) = written(run, "bounds")
-    assert [float(bounds[k]) for k in ("c rr", "C d·A")] == pytest.approx([100 * 3 / 9, 100 * 1 / 9], abs=0.1)
+    assert [float(bounds[k]) for k in ("c_rr", "C_d·A")] == pytest.approx([100 * 3 / 9, 100 * 1 / 9], abs=0.1)
 
 
 def test_missed_targets_are_listed(run, no_figures):

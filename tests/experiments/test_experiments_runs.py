@@ -269,7 +269,7 @@ def test_metrics_are_checked():
     check(good)
     lines = comparison(good)
     assert [(x["quantity"], x["ratio"], x["why_not"]) for x in lines] == [
-        ("rmse", 0.5, None), ("pe", None, "not computed"),
+        ("RMSE", 0.5, None), ("PE", None, "not computed"),
     ]  # fmt: skip
     with pytest.raises(ValueError, match="lack data"):
         check({k: v for k, v in good.items() if k != "data"})

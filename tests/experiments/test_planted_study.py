@@ -10,7 +10,7 @@ from experiments.planted import rivals
 from experiments.planted import scores as scores
 from experiments.planted.oracle import confusable, noise_rmse, oracle_rmse
 from experiments.planted.rivals import comparable
-from experiments.planted.rivals_table import outcome, rival_rows
+from experiments.planted.rivals_table import LABELS, outcome, rival_rows
 from experiments.planted.study import Config, acts_in, run, tasks
 from experiments.planted.tables import collect
 from experiments.runner.config import resolve, typed
@@ -137,9 +137,9 @@ def test_what_has_no_column_is_not_compared():
         ({"effects": ["periodic_load"]}, result(["periodic_load"])),
     ]
     rows = {r["name"]: r for r in rival_rows([("one", logs)], ["stlsq"])}
-    assert set(rows) == {"one: ours", "one: ours_first", "one: stlsq"}
+    assert set(rows) == {f"one: {LABELS[k]}" for k in ("ours", "ours_first", "stlsq")}
     assert all(r["n"] == 1 and r["exactly"] == 1.0 for r in rows.values())
-    assert rows["one: stlsq"]["test_over_oracle"] == 1.2
+    assert rows[f"one: {LABELS['stlsq']}"]["test_over_oracle"] == 1.2
 
 
 def told(tmp_path, logs) -> dict[str, dict]:
@@ -256,7 +256,7 @@ def test_a_page_explains_the_tables_that_it_has(tmp_path):
     assert "Called unexplained" in undecided
     assert "Named first" not in undecided, "what cannot be decided is not asked for its name"
     assert "Twins:" not in undecided
-    assert "ours_first" not in single + undecided
+    assert LABELS["ours_first"] not in single + undecided
 
 
 def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):
