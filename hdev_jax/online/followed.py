@@ -61,6 +61,9 @@ class Followed:
             if len(_BEGUN) >= MOST_BEGUN:
                 _BEGUN.pop(next(iter(_BEGUN)))
             state, self.watch, self.notes = _BEGUN[key] = self._begun()
+        if (trim := self.stream.rules.edge_trim_s) > 0:
+            said = f"edge_trim_s: {trim:g} s at the start of each trip are left out; where a trip ends is not known"
+            self.notes = [*self.notes, said]
         self.live = Live(state)
         self.began()
 
@@ -110,7 +113,7 @@ class Followed:
     def counted(self) -> dict[str, int]:
         """What became of the rows; what never happened is left out."""
         every = {} if self.live is None else self.live.state.counted()
-        every = every | {"repeated": self.stream.repeated, "unreadable": self.stream.unreadable}
+        every = every | {k: getattr(self.stream, k) for k in ("repeated", "unreadable", "trimmed", "alone")}
         return {name: n for name, n in every.items() if n}
 
     # --- kept between two starts -------------------------------------------------------------------------------------

@@ -22,7 +22,19 @@ from hdev_jax.units import J_PER_WH
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
 # in the file of the state
-KEPT = ("trips", "origin_s", "held", "before", "last_s", "so_far", "running", "repeated", "unreadable")
+KEPT = (
+    "trips",
+    "origin_s",
+    "held",
+    "before",
+    "last_s",
+    "so_far",
+    "running",
+    "repeated",
+    "unreadable",
+    "trimmed",
+    "alone",
+)
 Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")
 READ = ("mass_kg", "grade_rad", "air_density_kgpm3", "gear", "motor_torque_nm", "motor_speed_radps", "traction_force_n",
@@ -36,8 +48,8 @@ class Stream:
     `held`, rows that wait for the next one, and `before`, the row before them: a sample stands for half of the way to
     each neighbour. `continued`: it began again, and may send what it had sent; `understood`: some row has been read.
     `so_far` is of the trip that is the `running`-th.
-    `repeated` counts rows that were there already when a stream began again, `unreadable` those that do
-    not read.
+    `repeated` counts rows that were there already when a stream began again, `unreadable` those that do not read,
+    `trimmed` those within `edge_trim_s` of their trip's start, `alone` samples without a neighbour, which have no length.
     """
 
     rules: Adapter = field(default_factory=Adapter)
@@ -52,6 +64,8 @@ class Stream:
     understood: bool = False
     repeated: int = 0
     unreadable: int = 0
+    trimmed: int = 0
+    alone: int = 0
 
     def __post_init__(self) -> None:
         a = self.rules
@@ -140,6 +154,9 @@ class Stream:
                 self.trips.append(trip)
                 self.origin_s = time
             self.last_s = time if np.isfinite(time) else self.last_s
+            if time - self.origin_s < self.rules.edge_trim_s:
+                self.trimmed += 1
+                continue
             row = row | {"time_s": time - self.origin_s} if "time_s" in row else row
             if "speed_mps" not in row and np.isfinite(row.get("duration_s", np.nan)):
                 if self.held is not None and "speed_mps" not in self.held:
@@ -155,6 +172,7 @@ class Stream:
     def _flushed(self) -> Iterator[tuple[int, dict[str, float]]]:
         if self.held is not None and self.before is not None:
             yield len(self.trips), _interval(self.before, self.held, None)
+        self.alone += self.held is not None and self.before is None
         self.held = self.before = None
 
     def _breaks(self, row: dict[str, float]) -> bool:

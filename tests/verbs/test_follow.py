@@ -165,6 +165,28 @@ def test_an_interval_without_its_length_ends_where_the_next_begins(frame):
     assert "30 rows, 30 used" in summed_up(rows.to_dict("records"))
 
 
+def test_rows_at_the_start_of_a_trip_are_trimmed_as_the_adapter_says(frame, tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("edge_trim_s = 30.0\n")
+    since = frame.time_s - frame.groupby("trip_id").time_s.transform("first")
+    assert 0 < (since < 30.0).sum() < len(frame)
+    rows = told(text(frame), adapter=path)
+    assert [r["time_s"] for r in rows] == pytest.approx(since[since >= 30.0].tolist())
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        said = follow(SHEET, frame.to_dict("records"), watch=False, adapter=path)
+    assert f"{(since < 30.0).sum()} trimmed" in (said or "")
+    assert "note: edge_trim_s: 30 s at the start" in out.getvalue()
+
+
+def test_a_sample_without_a_neighbour_is_counted(frame):
+    rows = frame.assign(speed_mps=frame.speed_start_mps).drop(columns=["speed_start_mps", "speed_end_mps"])
+    rows = rows.drop(columns=["duration_s", "distance_m"], errors="ignore").to_dict("records")
+    lone = {**rows[0], "trip_id": "lone"}
+    assert "alone" not in summed_up(rows)
+    assert "1 alone" in summed_up([*rows, lone])
+    assert "1 alone" in summed_up([lone, *rows])
+
+
 def test_what_does_not_read_is_counted_and_the_rest_used(frame):
     lines = text(frame).splitlines()
     lines[30] = lines[30].replace(lines[30].split(",")[6], "n/a")
