@@ -49,7 +49,7 @@ class Stream:
     each neighbour. `continued`: it began again, and may send what it had sent; `understood`: some row has been read.
     `so_far` is of the trip that is the `running`-th.
     `repeated` counts rows that were there already when a stream began again, `unreadable` those that do not read,
-    `trimmed` those within `edge_trim_s` of their trip's start, `alone` samples without a neighbour (they have no length).
+    `trimmed` those within `edge_trim_s` of a trip's start, `alone` samples without a neighbour: they have no length.
     """
 
     rules: Adapter = field(default_factory=Adapter)
