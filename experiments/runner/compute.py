@@ -16,6 +16,8 @@ from hdev_jax import progress
 
 __all__ = ["Asked", "Where", "compute"]
 
+IN_TURN = 10  # tasks of a few seconds: what a run that is stopped loses
+
 
 @dataclass(frozen=True)
 class Where:
@@ -113,13 +115,14 @@ def compute(
 
 def _groups(every: Collection[Todo], workers: int) -> list[list[Todo]]:
     """The tasks that an experiment runs in one call; the others by themselves. No group is more than a worker's share,
-    so that a study that is one group has work for all of them."""
+    so that a study that is one group has work for all of them; tasks that run in turn are kept every few."""
     groups: dict[Any, list[Todo]] = {}
     for t in every:
         key = t.says("together")
         groups.setdefault(t.at if key is None else (t.module.__name__, key), []).append(t)
-    most = -(-len(every) // workers)
-    return [g[i : i + most] for g in groups.values() for i in range(0, len(g), most)]
+    share = -(-len(every) // workers)
+    sizes = [(g, share if hasattr(g[0].module, "run_together") else min(share, IN_TURN)) for g in groups.values()]
+    return [g[i : i + most] for g, most in sizes for i in range(0, len(g), most)]
 
 
 def _outcomes(where: Where, groups: list[list[Todo]]) -> Generator[tuple[list[Todo], Outcome], None, None]:
