@@ -125,10 +125,17 @@ def two(tmp_path_factory) -> tuple[Problem, Training]:
     return problem, training(problem, LIKELY)
 
 
-@pytest.mark.parametrize("wrong", ["auxiliary_power", "cabin_warmup"])
-def test_what_does_more_takes_the_place_of_what_was_found(wrong, two):
+@pytest.fixture(scope="module")
+def wrongly(two):
+    """The states in which a load that is not there was found first, by its name."""
     problem, rows = two
-    state = replace(found_in_turn(rows, problem, (wrong, "headwind")), refused=("rolling_speed",))
+    return {k: found_in_turn(rows, problem, (k, "headwind")) for k in ("auxiliary_power", "cabin_warmup")}
+
+
+@pytest.mark.parametrize("wrong", ["auxiliary_power", "cabin_warmup"])
+def test_what_does_more_takes_the_place_of_what_was_found(wrong, two, wrongly):
+    _, rows = two
+    state = replace(wrongly[wrong], refused=("rolling_speed",))
     new = one_exchanged(round_of(rows, state))
     assert new is not None
     assert new.ids == ("headwind", "standstill_load")
@@ -142,9 +149,9 @@ def test_what_does_more_takes_the_place_of_what_was_found(wrong, two):
 
 
 @pytest.mark.parametrize("why", ["newest", "told by trips", "out already", "at no level"])
-def test_what_may_not_be_exchanged_is_not(why, two):
-    problem, rows = two
-    state = found_in_turn(rows, problem, ("cabin_warmup", "headwind"))
+def test_what_may_not_be_exchanged_is_not(why, two, wrongly):
+    _, rows = two
+    state = wrongly["cabin_warmup"]
     first = state.found[0]
     if why == "newest":
         state = replace(state, found=state.found[::-1])

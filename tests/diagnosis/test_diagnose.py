@@ -72,12 +72,17 @@ def test_a_run_that_was_killed_goes_on_where_it_stood(at, log, whole, tmp_path):
     np.testing.assert_array_equal(result.predicted_after, whole.predicted_after)
 
 
+@pytest.fixture(scope="module")
+def competed(log):
+    """The whole log as training rows, and where the competition ends."""
+    rows = training(log[0], FEW)
+    return rows, compete(rows, log[0].vehicle, log[0].table, seed=0)
+
+
 @pytest.mark.parametrize("through", ["memory", "disk"])
-def test_a_state_is_kept_and_comes_back(through, log, tmp_path):
+def test_a_state_is_kept_and_comes_back(through, log, competed, tmp_path):
     """With sizes by gear, a shape, a term without a name, and what was turned down and taken out."""
-    problem, _ = log
-    rows = training(problem, FEW)
-    state = compete(rows, problem.vehicle, problem.table, seed=0)
+    problem, (rows, state) = log[0], competed
     assert len(state.found) >= 2
     term = Term((Factor("humidity_pct", above=70.0), Factor("speed_mps", 2)), 41.5)
     rows = rows.with_channel(TERM, term.column(rows.rows.segments)[: rows.rows.rows])
@@ -150,7 +155,9 @@ def test_the_summary_adds_up(log, whole):
 def test_an_effect_of_the_sheet_is_declared(log):
     problem, split = log
     car = problem.vehicle.plus(LIBRARY["standstill_load"](power_w=np.asarray(500.0), by_door=np.asarray(0.0)))
-    summary = diagnosed(replace(problem, vehicle=car), split, FEW).summary
+    summary = diagnosed(
+        replace(problem, vehicle=car), split, {k: FEW[k] for k in ("standstill_load", "headwind")}
+    ).summary
     assert {c["id"]: c["kind"] for c in summary["candidates"]}["standstill_load"] == "declared"
     assert "standstill_load" not in [e["id"] for e in summary["effects"]]
 

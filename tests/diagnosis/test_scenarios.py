@@ -16,7 +16,7 @@ from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.fleet import SyntheticLog
 
-SHAFT = {"entry": "shaft", "mode": "samples", "rows_per_trip": 400}
+SHAFT = {"entry": "shaft", "mode": "samples"}
 OUTSIDE = {"outside_humidity_load": {}}
 # a constant power a trip, under levels of the trips as large as it
 BETWEEN = {
@@ -44,13 +44,13 @@ def one(seed: int, effect: str, *alike: str, **options) -> Scenario:
 
 SCENARIOS = {
     "nothing": Scenario(7101, {}, ()),
-    "road": one(7101, "headwind"),
     "driveline": one(7102, "driveline_drag"),
     "battery": one(7102, "battery_resistance", "part_load"),
     "machine": one(7101, "copper_loss", **SHAFT),
     "sensor": one(7102, "time_skew", "sampling_filter", **SHAFT),
     "cycle": one(7102, "periodic_load", ratio=0.7),
     "mode": one(7101, "mode_change", ratio=0.7),
+    # one of them on the road, which stands for that stage as well
     "two": Scenario(7101, {"headwind": {}, "standstill_load": {}}, ("headwind", "standstill_load"), {"ratio": 1.0}),
     "class": Scenario(
         7103,

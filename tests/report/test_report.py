@@ -228,7 +228,6 @@ def test_a_strong_suspect_is_named_as_one(verdict):
     assert "No missing effect found" not in said
 
 
-@pytest.mark.drawn
 @pytest.mark.parametrize("verdict", VERDICTS)
 def test_page_leads_with_the_answer(verdict, tmp_path):
     data = fake(verdict)
@@ -249,6 +248,7 @@ def test_page_leads_with_the_answer(verdict, tmp_path):
     )
     assert "constant headwind" in text  # what the drag area may have absorbed
     assert "12 more candidates" in text or "13 more candidates" in text
+    assert "what drifts" not in text
 
 
 @pytest.mark.parametrize(
@@ -315,11 +315,10 @@ def test_what_drifts_is_shown_with_its_energy(tmp_path):
         "time_s": (60.0 * minute + 30.0).tolist(), "left_w": (2e3 * np.sin(minute)).tolist(),
         **{k: (1.5e3 * np.sin(minute) + x).tolist() for k, x in (("power_w", 0), ("lower_w", -400), ("upper_w", 400))},
     }  # fmt: skip
-    text = written(data, tmp_path / "drifts")
+    text = written(data, tmp_path)
     assert "kWh of what drifts" in text
     assert plain(text).count("1.23") == len(data.summary["split"]["test_trips"])
-    assert (tmp_path / "drifts" / "figures" / "drift_course.png").stat().st_size > 5_000
-    assert "what drifts" not in written(fake("nothing_missing"), tmp_path / "bare")
+    assert (tmp_path / "figures" / "drift_course.png").stat().st_size > 5_000
 
 
 @pytest.mark.parametrize(
@@ -374,7 +373,7 @@ def test_what_is_null_or_not_a_number(tmp_path):
 
 
 @pytest.mark.drawn
-@pytest.mark.parametrize(("trips", "rows"), [(1, 90), (2, 30), (3, 1), (40, 30)])
+@pytest.mark.parametrize(("trips", "rows"), [(1, 90), (3, 1), (40, 30)])
 def test_few_and_many_trips(trips, rows, tmp_path):
     data = fake(trips=trips, rows=max(rows, 3))
     if rows == 1:
@@ -410,7 +409,8 @@ def test_other_targets(unit, tmp_path):
 @pytest.mark.drawn
 def test_same_data_same_bytes_and_no_trace_left(tmp_path):
     settings = dict(mpl.rcParams)
-    assert written(fake(), tmp_path / "a") == written(fake(), tmp_path / "b")
+    one, other = (written(fake(trips=2, rows=30), tmp_path / k) for k in "ab")  # few rows: two pages are drawn
+    assert one == other
     assert dict(mpl.rcParams) == settings
 
 
@@ -533,13 +533,13 @@ def test_numbers_as_a_reader_wants_them(made, expected):
 def test_the_report_of_a_large_log_is_no_larger_than_its_figures(tmp_path):
     def bytes_of(rows: int) -> int:
         rng = np.random.default_rng(0)
-        channels = {f"channel_{k}": rng.normal(size=24 * rows) for k in range(20)}
+        channels = {f"channel_{k}": rng.normal(size=3 * rows) for k in range(20)}
         folder = tmp_path / str(rows)
         folder.mkdir()
-        written(fake(trips=24, rows=rows, **channels), folder)
+        written(fake(trips=3, rows=rows, **channels), folder)
         return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file())
 
-    assert bytes_of(5_000) < 1.5 * bytes_of(500)
+    assert bytes_of(12_000) < 1.5 * bytes_of(1_200)
 
 
 @pytest.mark.parametrize("path", sorted(Path(report.__file__).parent.glob("*.py")), ids=lambda p: p.stem)
