@@ -79,7 +79,8 @@ def _jacobian(drive: Drive, truth: Truth, entry: str) -> np.ndarray:
     for name in names:
         value = getattr(truth, name)
         up, down = (_target(drive, replace(truth, **{name: value * f}), entry, {}) for f in (1.0001, 0.9999))
-        columns.append((up - down) / root_mean_square(up - down))
+        size = root_mean_square(up - down)  # 0 where no row regenerates
+        columns.append((up - down) / size if size > 0 else up - down)
     return np.stack(columns, axis=1)
 
 
