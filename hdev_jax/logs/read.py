@@ -1,6 +1,6 @@
 """`read_log`: files, adapter and checks put together."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -205,8 +205,16 @@ def _log(
         sampled=sampled,
         files=files,
         started_s=_started(rows) if "time_s" in data else {},
-        instruments=instruments_of({c: read[c] for c in ("speed_mps", *measured, *channels) if c in read}, slope),
+        instruments=instruments_of(_read_values(read, (*measured, *channels)), slope),
     )
+
+
+def _read_values(read: Mapping[str, np.ndarray], channels: Iterable[str]) -> dict[str, np.ndarray]:
+    """Channels as they were read; the speeds at both ends of intervals are of one instrument."""
+    found = {c: read[c] for c in ("speed_mps", *channels) if c in read}
+    if "speed_mps" not in read:
+        found["speed_mps"] = np.r_[read["speed_start_mps"], read["speed_end_mps"]]
+    return found
 
 
 def _with_speed(rows: Rows, sampled: bool) -> Rows:
@@ -217,7 +225,7 @@ def _with_speed(rows: Rows, sampled: bool) -> Rows:
         found = speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])
         if found is None:
             return rows
-        made, step = {"speed_mps": found.mps, ACCEL_SD: np.full(len(rows.trip), found.acceleration_sd)}, found.step
+        made, step = dict(zip(("speed_mps", ACCEL_SD), found[:2], strict=True)), found[2]
     else:
         ends = end_speeds(rows.trip, *_intervals(rows, sampled))
         if ends is None:
