@@ -22,19 +22,9 @@ from hdev_jax.units import J_PER_WH
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
 # in the file of the state
-KEPT = (
-    "trips",
-    "origin_s",
-    "held",
-    "before",
-    "last_s",
-    "so_far",
-    "running",
-    "repeated",
-    "unreadable",
-    "trimmed",
-    "alone",
-)
+KEPT = ("trips", "origin_s", "held", "before", "last_s", "so_far", "running", "repeated", "unreadable", "trimmed", "alone",
+        "gone_s")  # fmt: skip
+LATER = {"trimmed", "alone", "gone_s"}  # that a file of an older version lacks
 Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")
 READ = ("mass_kg", "grade_rad", "air_density_kgpm3", "gear", "motor_torque_nm", "motor_speed_radps", "traction_force_n",
@@ -47,7 +37,7 @@ class Stream:
 
     `held`, rows that wait for the next one, and `before`, the row before them: a sample stands for half of the way to
     each neighbour. `continued`: it began again, and may send what it had sent; `understood`: some row has been read.
-    `so_far` is of the trip that is the `running`-th.
+    `so_far` is of the trip that is the `running`-th, whose rows with a duration last `gone_s`.
     `repeated` counts rows that were there already when a stream began again, `unreadable` those that do not read,
     `trimmed` those within `edge_trim_s` of a trip's start, `alone` samples without a neighbour: they have no length.
     """
@@ -66,6 +56,7 @@ class Stream:
     unreadable: int = 0
     trimmed: int = 0
     alone: int = 0
+    gone_s: float = 0.0
 
     def __post_init__(self) -> None:
         a = self.rules
@@ -90,7 +81,7 @@ class Stream:
     @staticmethod
     def again(about: Mapping[str, Any], rules: Adapter) -> "Stream":
         """The stream that goes on from there. Raises `KeyError` or `TypeError` for what `about` did not give."""
-        known = {k: about[k] for k in KEPT}
+        known = {k: about[k] for k in KEPT if k in about or k not in LATER}
         known["so_far"] = Running(*known["so_far"])
         return Stream(rules, **known, continued=True, understood=True)
 
@@ -120,7 +111,10 @@ class Stream:
         piece = translate(Raw("standard input", table, "stream"), self.rules)
         names = list(piece.data)
         values = np.stack([piece.data[c] for c in names], axis=1) if names else np.zeros((len(table), 0))
-        trips = [piece.trip_names[k] if k >= 0 else (self.trips[-1] if self.trips else "stream") for k in piece.trip]
+        trips, trip = [], self.trips[-1] if self.trips else "stream"
+        for k in piece.trip:  # a blank one is the trip before
+            trip = piece.trip_names[k] if k >= 0 and piece.trip_names[k].strip() else trip
+            trips.append(trip)
         return [(trip, dict(zip(names, map(float, row), strict=True))) for trip, row in zip(trips, values, strict=True)]
 
     # --- intervals ---------------------------------------------------------------------------------------------------
@@ -152,16 +146,20 @@ class Stream:
             if opens:
                 yield from self._flushed()
                 self.trips.append(trip)
-                self.origin_s = time
+                self.origin_s, self.gone_s = time, 0.0
+            self.origin_s = time if np.isnan(self.origin_s) else self.origin_s
             self.last_s = time if np.isfinite(time) else self.last_s
-            if time - self.origin_s < self.rules.edge_trim_s:
+            row = row | {"time_s": time - self.origin_s} if "time_s" in row else row
+            since = row["time_s"] if np.isfinite(time) else self.gone_s
+            self.gone_s += np.nan_to_num(row.get("duration_s", 0.0))
+            if 0.0 <= since < self.rules.edge_trim_s:  # a clock that goes back is no start of a trip
                 self.trimmed += 1
                 continue
-            row = row | {"time_s": time - self.origin_s} if "time_s" in row else row
             if "speed_mps" not in row and np.isfinite(row.get("duration_s", np.nan)):
                 if self.held is not None and "speed_mps" not in self.held:
                     yield len(self.trips), _interval(self.before, self.held, row)
-                self.before = self.held = None
+                    self.before = self.held = None
+                yield from self._flushed()
                 yield len(self.trips), row  # whole by itself
             elif self.held is None:
                 self.held = row
@@ -170,9 +168,10 @@ class Stream:
                 self.before, self.held = self.held, row
 
     def _flushed(self) -> Iterator[tuple[int, dict[str, float]]]:
-        if self.held is not None and self.before is not None:
+        if self.held is not None and (self.before is not None or np.isfinite(self.held.get("duration_s", np.nan))):
             yield len(self.trips), _interval(self.before, self.held, None)
-        self.alone += self.held is not None and self.before is None
+        elif self.held is not None:
+            self.alone += 1
         self.held = self.before = None
 
     def _breaks(self, row: dict[str, float]) -> bool:
@@ -209,6 +208,7 @@ def _interval(
     first = 0.5 * (_speed(before) + v) if before is not None else np.nan
     last = 0.5 * (v + _speed(after)) if after is not None else np.nan
     first, last = (2.0 * v - last if before is None else first), (2.0 * v - first if after is None else last)
+    first, last = (v, v) if before is None and after is None else (first, last)
     duration = row.get("duration_s", np.nan)
     duration = duration if np.isfinite(duration) else 0.5 * (back + ahead)
     # a speed that is none, or backwards, makes its own row unusable

@@ -15,6 +15,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.logs import log_from_frame
+from hdev_jax.logs.adapter import Adapter
 from hdev_jax.online import Watch
 from hdev_jax.online.stream import Stream
 from hdev_jax.physics import LIBRARY
@@ -178,9 +179,55 @@ def test_rows_at_the_start_of_a_trip_are_trimmed_as_the_adapter_says(frame, tmp_
     assert "note: edge_trim_s: 30 s at the start" in out.getvalue()
 
 
-def test_a_sample_without_a_neighbour_is_counted(frame):
+def test_where_no_row_has_a_time_the_trim_counts_durations(frame, tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("edge_trim_s = 30.0\n")
+    timeless = frame.drop(columns="time_s")
+    since = timeless.groupby("trip_id").duration_s.cumsum() - timeless.duration_s
+    assert len(told(text(timeless), adapter=path)) == (since >= 30.0).sum()
+
+
+def test_a_clock_that_starts_anew_within_a_trip_loses_no_row(frame):
+    half = len(frame) // 4
+    time = np.where(np.arange(len(frame)) < half, 86_000.0 + frame.time_s, frame.time_s)
+    said = summed_up(frame.assign(time_s=time, trip_id="one").to_dict("records"))
+    assert f"{len(frame)} rows, {len(frame)} used, 2 clock_jumps, 1 trips" in said
+    assert "trimmed" not in said
+
+
+@pytest.mark.parametrize("batches", [1, 12])
+def test_a_blank_trip_belongs_to_the_trip_before(frame, batches):
+    blank = frame.assign(trip_id=frame.trip_id.where(np.arange(len(frame)) % 7 != 3, ""))
+    stream = Stream()
+    rows = blank.to_dict("records")
+    trips = []
+    for part in np.array_split(np.arange(len(rows)), batches):
+        read = stream.read([rows[i] for i in part])
+        trips += [t for t, _ in read]
+        list(stream.intervals(read))
+    assert trips == frame.trip_id.tolist()
+
+
+def test_a_state_of_before_a_count_was_kept_goes_on():
+    about = Stream().about()
+    for later in ("trimmed", "alone", "gone_s"):
+        about.pop(later)
+    assert Stream.again(about | {"so_far": [0.0, 0.0]}, Adapter()).trimmed == 0
+
+
+def _samples(frame) -> list[dict]:
     rows = frame.assign(speed_mps=frame.speed_start_mps).drop(columns=["speed_start_mps", "speed_end_mps"])
-    rows = rows.drop(columns=["duration_s", "distance_m"], errors="ignore").to_dict("records")
+    return rows.drop(columns=["duration_s", "distance_m"]).to_dict("records")
+
+
+def test_samples_before_a_whole_row_are_used(frame):
+    stream = Stream()
+    rows = stream.read(_samples(frame.head(2))) + stream.read(frame[2:4].to_dict("records"))
+    assert len(list(stream.intervals(rows))) == 4
+
+
+def test_a_sample_without_a_neighbour_is_counted(frame):
+    rows = _samples(frame)
     lone = {**rows[0], "trip_id": "lone"}
     assert "alone" not in summed_up(rows)
     assert "1 alone" in summed_up([*rows, lone])
