@@ -169,7 +169,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             far = km >= 10.0 if np.any(km >= 10.0) else km > 0
             error = 100.0 * (mass / against - 1.0)[far]
             logged = 100.0 * (np.array(r["logged"]) / against - 1.0)[far]
-            inside = float(np.mean(np.abs(mass - against)[far] < 1.645 * sd[far]))
+            inside = 100.0 * float(np.mean(np.abs(mass - against)[far] < 1.645 * sd[far]))
             ours = {"trips": int(far.sum()), "median_error_percent": float(np.median(np.abs(error))),
                     "logged_error_percent": float(np.median(np.abs(logged))), "inside_90": inside}  # fmt: skip
             every += np.abs(error).tolist()
@@ -189,7 +189,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     write_tables(run, "mass", lines, config.caption)
     _figure(run, results, drawn)
     said = [f"Fleet: median error {np.median(every):.2f} % over {len(every)} trips"] if every else []
-    shares = [100.0 * line["inside_90"] for line in lines if "inside_90" in line]
+    shares = [line["inside_90"] for line in lines if "inside_90" in line]
     if shares:
         low = "; they do not cover effects that the sheet lacks and that differ by trip" if min(shares) < 85.0 else ""
         said.append(f"90 % intervals hold the true mass in {min(shares):.0f} to {max(shares):.0f} % of trips{low}")

@@ -12,7 +12,7 @@ from experiments.paper2.drawings import prediction_figure
 from experiments.paper2.fits import Mean, evaluated, fitted
 from experiments.paper2.models import Settings
 from experiments.runner.config import Strict
-from experiments.runner.tables import write_tables
+from experiments.runner.tables import readable, write_tables
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run
 
@@ -80,7 +80,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     }  # fmt: skip
     paper = config.paper.get(config.model, {})
     lines = [
-        {"number": k.replace("_", " "), "paper": paper.get(k), "ours": x, "ratio": x / paper[k] if k in paper else None}
+        {"number": readable(k), "paper": paper.get(k), "ours": x, "ratio": x / paper[k] if k in paper else None}
         for k, x in ours.items()
     ]
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)

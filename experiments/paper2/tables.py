@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.runner.tables import write_tables
+from experiments.runner.tables import readable, write_tables
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run
 
@@ -98,7 +98,7 @@ def _line(
     several = spread if spread.get("starts", 0) > 1 else {}
     theirs, own = paper.get(key), ours.get(key)
     return {
-        "model": name, "number": key.replace("_", " "), "paper": _digits(theirs), "ours": _digits(own),
+        "model": name, "number": readable(key), "paper": _digits(theirs), "ours": _digits(own),
         "ratio": own / theirs if theirs and own is not None else None,
         "median": _digits(several.get("median")),
         "least to most": f"{_digits(several['least'])}–{_digits(several['most'])}" if several else None,

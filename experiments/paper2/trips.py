@@ -9,7 +9,7 @@ from pydantic import Field
 from experiments.paper2.data import MPH, TripName, kia_fingerprint, kia_trips
 from experiments.paper2.drawings import signals_figure, speeds_figure
 from experiments.runner.config import Strict
-from experiments.runner.tables import write_tables
+from experiments.runner.tables import readable, write_tables
 from hdev_jax.learn.sequences import energy_kwh
 from hdev_jax.rundir import Run
 
@@ -67,11 +67,11 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         if name in config.reasons:
             rows.append({"name": name, "paper": paper, "ours": None, "reason": config.reasons[name]})
             beside = _beside({}, paper or {})
-            lines.append({"quantity": name.replace("_", " "), **beside, "why not": config.reasons[name]})
+            lines.append({"quantity": readable(name), **beside, "why not": config.reasons[name]})
             continue
         ours = {f"trip{t}": found[t][name] for t in found}
         rows.append({"name": name, "paper": paper, "ours": ours})
-        lines.append({"quantity": name.replace("_", " "), **_beside(ours, paper or {})})
+        lines.append({"quantity": readable(name), **_beside(ours, paper or {})})
     if config.figure == "speeds":
         speeds_figure(run, {t: kia_trips(config.rows or None)[t] for t in found})
         rows = [{"name": f"trip{t}", "paper": None, "ours": {"speed_quartiles_mph": r["speed_quartiles_mph"]}}
@@ -82,7 +82,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         signals_figure(run, kia_trips(config.rows or None)[config.trip])
         own = found[config.trip]
         rows = [{"name": f"trip{config.trip}", "paper": None, "ours": own}]
-        lines = [{"quantity": k.replace("_", " "), "value": x} for k, x in own.items() if k != "speed_quartiles_mph"]
+        lines = [{"quantity": readable(k), "value": x} for k, x in own.items() if k != "speed_quartiles_mph"]
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     return {
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,

@@ -56,7 +56,7 @@ def _line(
         "RMSE [Wh]": p["rmse_wh"], "paper RMSE": paper.get("rmse"),
         "PE [%]": p["pe_percent"], "paper PE": paper.get("pe"), "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
-        "C_d·A error, median of vehicles [%]": p.get("cda_m2_error_percent"), "in 90 %": p.get("inside_90"),
+        "C_d·A error, median of vehicles [%]": p.get("cda_m2_error_percent"), "in 90 %": p.get("share_inside_90"),
         "PE of a trip, mean [%]": p["trip_pe_mean"], "n": of[0], "trips": of[1],
     }  # fmt: skip
 

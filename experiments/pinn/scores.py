@@ -49,7 +49,7 @@ def scores(
                         if np.isfinite(x)],
         }  # fmt: skip
         if sd_wh is not None and np.all(np.isfinite(sd_wh[at])):
-            out[name]["inside_90"] = float(np.mean(np.abs(error) < 1.645 * sd_wh[at]))
+            out[name]["share_inside_90"] = float(np.mean(np.abs(error) < 1.645 * sd_wh[at]))
         if c_rr is not None and cda_m2 is not None:
             out[name]["coefficients"] = _coefficients(members, at, c_rr, cda_m2)
     return out
@@ -85,9 +85,9 @@ def pooled(found: list[dict[str, Any]]) -> dict[str, float]:
         "trip_pe_median": float(np.median(np.abs(trips))), "trip_pe_mean": float(np.mean(trips)),
         "rows": rows, "trips": sum(f["trips"] for f in found),
     }  # fmt: skip
-    inside = [(f["inside_90"], f["rows"]) for f in found if "inside_90" in f]
+    inside = [(f["share_inside_90"], f["rows"]) for f in found if "share_inside_90" in f]
     if inside:
-        out["inside_90"] = float(np.average([a for a, _ in inside], weights=[b for _, b in inside]))
+        out["share_inside_90"] = float(np.average([a for a, _ in inside], weights=[b for _, b in inside]))
     for name in ("c_rr", "cda_m2"):
         errors = [c[f"{name}_error"] for f in found for c in f.get("coefficients", {}).values() if f"{name}_error" in c]
         if errors:

@@ -39,7 +39,7 @@ def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
     spread: dict[tuple[Any, ...], Any] = {}
     for x in rows:
         if x["paper"] and x["ours"] and "accuracy" not in x["quantity"]:
-            key = (x["name"].replace("_", " "), x["quantity"].replace("_", " "), x["paper"], x["ours"])
+            key = (x["name"], x["quantity"], x["paper"], x["ours"])
             models.setdefault(key, []).append(x["config"])
             spread[key] = x.get("least to most")
     if len(models) < LEAST_COMPARED:

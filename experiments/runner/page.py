@@ -171,9 +171,8 @@ def write_list_docs(
 
 
 def _decides(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The table of what decides, quantities in words."""
-    words = [{**x, "quantity": str(x["quantity"]).replace("_", " ")} for x in rows]
-    return _narrow(markdown(cells(words, 4), DECIDES))
+    """The table of what decides."""
+    return _narrow(markdown(cells(rows, 4), DECIDES))
 
 
 def _against(rows: Sequence[Mapping[str, Any]], docs: Path, name: str) -> list[str]:

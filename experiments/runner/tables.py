@@ -21,26 +21,26 @@ _TEX = {
 
 # What readers see of a key, a column's, a quantity's or a model's, where the key's own words and unit do not say it.
 _WORDS = {
-    "inside_90": "90 % interval holds [%]", "size_covered_90": "90 % interval holds the size",
-    "nodes_in_90": "90 % interval holds", "interval_95": "95 % interval", "false_95": "95 % interval",
+    "inside_90": "90 % interval holds [%]", "size_covered_90": "share of sizes in 90 % intervals",
+    "nodes_in_90": "share of nodes in 90 % intervals", "interval_95": "95 % interval", "false_95": "95 % interval",
     "false_percent": "falsely named [%]", "c_rr": "c_rr", "c_rr_bias_percent": "bias of c_rr [%]",
     "null_logs": "logs, nothing planted", "payload_logs": "logs, payload error",
     "error_90_percent": "error, 90th percentile [%]", "median_half_interval_percent": "half of the interval [%]",
-    "half_interval_percent": "half of the interval [%]", "share_percent": "driven [%]",
+    "half_interval_percent": "half of the interval [%]", "share_percent": "driven so far [%]",
     "median_row": "row of the alarm, median", "batch_logs": "named by a diagnosis",
-    "batch_median_row": "rows that this takes, median", "within_twice": "alarm within twice",
+    "batch_median_row": "rows that this takes, median", "within_twice": "alarm within twice those rows",
     "after_over_noise": "test RMSE over noise", "within_5_percent_of_oracle": "within 5 % of a refit",
     "test_over_oracle": "test RMSE over a refit", "error_over_refit": "test RMSE over a refit",
     "named_exactly": "named, or its class", "named_exactly_no_class": "named alone", "mean_class": "names in a class",
-    "no_class_of_separable": "named alone, of the separable", "no_class_interval_95": "named alone, 95 % interval",
+    "no_class_of_separable": "named alone, of the separable ones", "no_class_interval_95": "named alone, 95 % interval",
     "no_class_wanted": "named alone, wanted", "redrawn": "drawn anew", "worst_percent": "largest error [%]",
-    "worst_at_kw": "there [kW]", "test_mean": "test MSE, mean [kW²]", "physics_tabular": "physics, tables",
+    "worst_at_kw": "at a power of [kW]", "test_mean": "test MSE, mean [kW²]", "physics_tabular": "physics, tables",
     "physics_predicted": "physics, predicted coefficients", "step_worst_energy_percent": "energy of a step, worst [%]",
     "duration_min": "duration [min]",
 }  # fmt: skip
 _UNITS = {
     "percent": "%", "wh": "Wh", "kw": "kW", "kwh": "kWh", "kg": "kg", "mrad": "mrad", "seconds": "s", "mph": "mph",
-    "miles": "miles", "mps2": "m/s²", "mps3": "m/s³", "c": "°C",
+    "miles": "miles", "mps2": "m/s²", "mps3": "m/s³", "ms": "ms", "c": "°C",
 }  # fmt: skip
 _SHORT = {"mse": "MSE", "pe": "PE", "rmse": "RMSE", "narx": "NARX", "arx": "ARX", "lightgbm": "LightGBM"}
 
@@ -72,9 +72,15 @@ def write_tables(run: Run, name: str, rows: Sequence[Mapping[str, Any]], caption
 
 
 def cells(rows: Sequence[Mapping[str, Any]], digits: int = 3) -> list[list[str]]:
-    """The head and the rows as text, numbers to so many digits; a row that lacks a column has nothing there."""
+    """The head and the rows as text, numbers to so many digits; a row that lacks a column has nothing there. Raises
+    `ValueError` where two keys have one head."""
     keys = [k for k in dict.fromkeys(k for r in rows for k in r) if any(r.get(k) is not None for r in rows)]
-    return [[readable(k) for k in keys], *([_cell(r.get(k), digits) for k in keys] for r in rows)]
+    if len(heads := [readable(k) for k in keys]) > len(set(heads)):
+        raise ValueError(f"two columns of a table would have one head: {heads}")
+    return [
+        heads,
+        *([_cell(readable(r[k]) if k == "model" and k in r else r.get(k), digits) for k in keys] for r in rows),
+    ]
 
 
 def markdown(lines: Sequence[Sequence[str]], caption: str) -> str:

@@ -18,6 +18,7 @@ Entry = Mapping[str, Any]  # `id`, `class` (as printed), `class_size`, `paramete
 PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "mass_scale.scale": (-0.33, 0.33), "power_gain.gain": (-0.05, 0.05), "torque_offset.gain": (-0.05, 0.05),
     "speed_scale.scale": (-0.05, 0.05), "grade_scale.scale": (-0.3, 0.3), "grade_bias.bias_rad": (-0.01, 0.01),
+    "grade_noise.sd_rad": (0.0, 0.05),
     "constant_headwind.speed_mps": (-15.0, 15.0), "regen_efficiency.share": (-0.3, 1.0),
     "regen_cutoff.speed_mps": (0.0, 10.0), "rotating_mass.factor": (-0.05, 0.15), "time_skew.skew_s": (-5.0, 5.0),
     "rolling_speed.per_mps2": (0.0, 2e-5),

@@ -22,8 +22,8 @@ from hdev_jax.units import J_PER_WH
 __all__ = ["Arrived", "Stream", "channels_of", "target_in"]
 
 # in the file of the state
-KEPT = ("trips", "origin_s", "held", "before", "last_s", "so_far", "running", "repeated", "unreadable", "trimmed", "alone",
-        "gone_s")  # fmt: skip
+KEPT = ("trips", "origin_s", "held", "before", "last_s", "so_far", "running", "repeated", "unreadable", "trimmed",
+        "alone", "gone_s")  # fmt: skip
 LATER = {"trimmed", "alone", "gone_s"}  # that a file of an older version lacks
 Row = dict[str, float]
 ENDS = ("speed_start_mps", "speed_end_mps")

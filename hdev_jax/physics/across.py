@@ -111,6 +111,7 @@ def less_noise(column: Any, segments: Segments, sd: Any) -> Float[Array, " row"]
 
     With r what of a reading the neighbours do not say (the residual of its regression on them), the error is expected
     to be sd²·r/Var r: cov(error, r) is sd², as the neighbours have errors of their own. At most all of r.
+    Of few rows the moments are hardly known, and little is taken away.
     """
     x, (first, last) = jnp.asarray(column), trip_bounds(segments)
     index = jnp.arange(x.shape[0])
@@ -118,17 +119,19 @@ def less_noise(column: Any, segments: Segments, sd: Any) -> Float[Array, " row"]
     near = 0.5 * (x[jnp.clip(before, first, last)] + x[jnp.clip(after, first, last)])
     moves = jnp.where(jnp.asarray(segments.distance_m) > 0, 1.0, 0.0)
 
-    def mean(y: Array) -> Array:
-        sums = jnp.zeros((2, x.shape[0])).at[:, first].add(jnp.stack([moves * y, moves]))
-        return (sums[0] / jnp.maximum(sums[1], 1.0))[first]
+    def total(y: Array) -> Array:
+        return jnp.zeros(x.shape[0]).at[first].add(moves * y)[first]
 
-    own, others = x - mean(x), near - mean(near)
-    square = mean(others**2)
-    differ = square > ALIKE**2 * mean(x**2)
-    told = jnp.where(differ, mean(own * others) / jnp.where(differ, square, 1.0), 0.0)
+    rows = jnp.maximum(total(jnp.ones_like(moves)), 1.0)
+    own, others = x - total(x) / rows, near - total(near) / rows
+    square, rounding = total(others**2), ALIKE**2 * total(x**2)
+    differ = square > rounding
+    told = jnp.where(differ, total(own * others) / jnp.where(differ, square, 1.0), 0.0)
     rest = own - told * others
-    left = mean(rest**2)
-    return x - moves * jnp.minimum(sd**2 / jnp.where(left > 0, left, jnp.inf), 1.0) * rest
+    left = total(rest**2)
+    there = (left > rounding) & (rows > 2)
+    variance = jnp.where(there, left, 1.0) / jnp.maximum(rows - 2.0, 1.0)  # two numbers of the line are fitted
+    return x - moves * jnp.where(there, jnp.minimum(sd**2 / variance, 1.0), 0.0) * rest
 
 
 def later_slope(segments: Segments, ahead_s: Any) -> Float[Array, " row"]:

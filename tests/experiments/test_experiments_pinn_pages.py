@@ -69,7 +69,7 @@ def test_scores_of_four_rows():
     assert (test["rows"], test["trips"], unseen["rows"], unseen["trips"]) == (3, 2, 1, 1)
     assert (test["squares"], test["error_wh"], test["energy_wh"]) == (141.0, 1.0, 350.0)
     assert test["trip_pe"] == [2.0, -10.0]  # 6 of 300 Wh, −5 of 50 Wh
-    assert test["inside_90"] == pytest.approx(1 / 3)  # 4 Wh is within 1.645 · 3 Wh; 5 Wh is not
+    assert test["share_inside_90"] == pytest.approx(1 / 3)  # 4 Wh is within 1.645 · 3 Wh; 5 Wh is not
     assert unseen["squares"] == 400.0
     assert unseen["trip_pe"] == pytest.approx([100 * 20 / 150], abs=1e-4)
     c = test["coefficients"]["A"]
@@ -83,7 +83,7 @@ def test_scores_of_four_rows():
 
 def test_scores_without_finite_deviations_or_coefficients_have_none():
     test = scored(sd_wh=np.array([3.0, np.nan, 3.0, 3.0]), c_rr=C_RR)["test"]
-    assert "inside_90" not in test
+    assert "share_inside_90" not in test
     assert "coefficients" not in test
 
 
@@ -95,7 +95,7 @@ def test_pooled_scores_by_hand():
     assert p["trip_pe_mean"] == pytest.approx((2 - 10 + 40 / 3) / 3, abs=1e-4)
     assert p["trip_pe_median"] == pytest.approx(10.0)
     assert (p["rows"], p["trips"]) == (4, 3)
-    assert p["inside_90"] == pytest.approx(1 / 4)  # one of three rows, and none of one
+    assert p["share_inside_90"] == pytest.approx(1 / 4)  # one of three rows, and none of one
     assert p["c_rr_error_percent"] == pytest.approx(7.5)  # of 15 and 0
     assert p["c_rr_error_worst"] == pytest.approx(15.0)
     assert p["cda_m2_error_worst"] == pytest.approx(20.0)

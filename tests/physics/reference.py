@@ -29,12 +29,12 @@ def energy_wh(rows: list[dict], car: dict, effects: dict[str, dict]) -> list[flo
 
 def prepare(trip: list[dict], effects: dict) -> None:
     """What needs the rows before: slope that came late, distance since the start, time since braking."""
+    if "grade_noise" in effects:
+        with_less_noise(trip, effects["grade_noise"]["sd_rad"])
     if "grade_lag" in effects:
         later = [later_slope(trip, k, effects["grade_lag"]["lag_s"]) for k in range(len(trip))]
         for r, slope in zip(trip, later, strict=True):
             r["grade_rad"] = slope
-    if "grade_noise" in effects:
-        with_less_noise(trip, effects["grade_noise"]["sd_rad"])
     gone, released = 0.0, None
     for r in trip:
         r["gone_m"] = gone + r["distance_m"] / 2
@@ -49,7 +49,7 @@ def prepare(trip: list[dict], effects: dict) -> None:
 def with_less_noise(trip: list[dict], sd_rad: float) -> None:
     """Slopes less what is expected of their error, given what a line on the neighbours' mean leaves of them."""
     moving = [k for k, r in enumerate(trip) if r["distance_m"] > 0]
-    if len(trip) < 2 or not moving:
+    if len(moving) < 3:
         return
     x = np.array([r["grade_rad"] for r in trip])
     near = np.convolve(np.r_[x[1], x, x[-2]], [0.5, 0.0, 0.5], mode="valid")
@@ -57,8 +57,8 @@ def with_less_noise(trip: list[dict], sd_rad: float) -> None:
     differ = np.std(near[moving]) > 1e-5 * np.sqrt(np.mean(x[moving] ** 2))
     told = np.linalg.lstsq(others[moving, None], own[moving], rcond=None)[0][0] if differ else 0.0
     rest = own - told * others
-    if np.max(np.abs(rest[moving])) > 1e-12:
-        share = min(sd_rad**2 / np.mean(rest[moving] ** 2), 1.0)
+    if (left := np.sum(rest[moving] ** 2)) > 1e-10 * np.sum(x[moving] ** 2):
+        share = min(sd_rad**2 * (len(moving) - 2) / left, 1.0)
         for k in moving:
             trip[k]["grade_rad"] -= share * rest[k]
 

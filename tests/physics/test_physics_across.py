@@ -11,6 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from hdev_jax.physics import across
+from hdev_jax.physics.across import less_noise
 from hdev_jax.physics.library import derived
 from hdev_jax.segments import Segments
 
@@ -239,3 +240,37 @@ def test_time_since_braking(seed: int) -> None:
             expected.append(0.0 if released is None else log.time_s[k] + log.duration_s[k] / 2 - released)
     np.testing.assert_allclose(across.time_since_braking(log), expected, rtol=1e-12, atol=1e-12)
     assert np.max(expected) > 0
+
+
+@pytest.mark.parametrize("length_m", [5.0, 100.0, 400.0])
+def test_a_slope_less_its_noise_is_what_the_road_is_expected_to_be(length_m: float) -> None:
+    """Regressed on the corrected slope, the true one has a slope of 1; on what was read, less."""
+    rng = np.random.default_rng(3)
+    near = np.exp(-length_m / 150.0)  # of an AR(1) road that forgets itself within 150 m
+    truth = lfilter([0.015 * np.sqrt(1.0 - near**2)], [1.0, -near], rng.normal(0, 1, 8000))
+    read = truth + rng.normal(0, 0.008, 8000)
+    speed = np.full(8000, 15.0)
+    log = Segments.from_arrays(trip=np.repeat(np.arange(40), 200), duration_s=length_m / speed, speed_start_mps=speed,
+                               speed_end_mps=speed)  # fmt: skip
+    corrected = np.asarray(less_noise(read, log, 0.008))
+
+    def told_by(x: np.ndarray) -> float:
+        x = x - np.mean(x)
+        return float(np.sum(x * (truth - np.mean(truth))) / np.sum(x**2))
+
+    assert told_by(read) < 0.85
+    assert told_by(corrected) == pytest.approx(1.0, abs=0.04)
+    assert np.std(corrected - truth) < np.std(read - truth)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 30])
+def test_less_noise_has_finite_gradients_in_single_precision(rows: int) -> None:
+    rng = np.random.default_rng(4)
+    n = 20 * rows
+    speed = np.full(n, 10.0, np.float32)
+    log = Segments.from_arrays(trip=np.repeat(np.arange(20), rows), duration_s=np.ones(n, np.float32),
+                               speed_start_mps=speed, speed_end_mps=speed)  # fmt: skip
+    slope = jnp.asarray(rng.normal(0, 0.02, n), jnp.float32)
+    for sd in (0.0, 1e-4, 0.01):
+        gradient = jax.grad(lambda x, s: jnp.sum(less_noise(x, log, s) ** 2), argnums=(0, 1))(slope, jnp.float32(sd))
+        assert all(bool(jnp.all(jnp.isfinite(g))) for g in gradient)
