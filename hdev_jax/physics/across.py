@@ -120,7 +120,7 @@ def less_noise(column: Any, segments: Segments, sd: Any) -> Float[Array, " row"]
     moves = jnp.where(jnp.asarray(segments.distance_m) > 0, 1.0, 0.0)
 
     def total(y: Array) -> Array:
-        return jnp.zeros(x.shape[0]).at[first].add(moves * y)[first]
+        return jnp.zeros_like(x).at[first].add(moves * y)[first]
 
     rows = jnp.maximum(total(jnp.ones_like(moves)), 1.0)
     own, others = x - total(x) / rows, near - total(near) / rows

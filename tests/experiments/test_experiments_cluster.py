@@ -65,10 +65,11 @@ def test_a_sweep_outlives_a_worker_and_its_numbers_are_those_of_one_process(tmp_
         workers = [processes.start(f"worker{k}", "dask", "worker", *quiet, *alone) for k in range(2)]
         until(lambda: processes.told("scheduler").count("Register worker") == 2, "two workers")
         sweep = processes.start(
-            "sweep", "experiments", tmp_path / "c.toml", "--set", f"diary={diary}",
+            "sweep", "experiments", tmp_path / "c.toml", "--set", f"diary={diary}", "--set", "wait_s=1.0",
             "--out", tmp_path / "cluster", "--scheduler", address,
         )  # fmt: skip
 
+        # a task takes a second there: a worker that starts later than the other finds some left
         def of(worker):
             return [p.name.partition("-")[0] for p in diary.glob(f"*-{worker.pid}")]
 
