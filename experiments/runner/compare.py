@@ -56,9 +56,10 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     With the spread over starts, where the row has one (`spread`: least, median, most).
     """
-    quantity = metrics.get("headline")
-    lines = []
-    for row in metrics["rows"] if quantity else ():
+    quantity, lines = metrics.get("headline"), []
+    if quantity is None:
+        return lines
+    for row in metrics["rows"]:
         paper, own = _number((row["paper"] or {}).get(quantity)), _number((row["ours"] or {}).get(quantity))
         spread = (row["ours"] or {}).get("spread", {})
         lines.append(

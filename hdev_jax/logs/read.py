@@ -219,18 +219,21 @@ def _read_values(read: Mapping[str, np.ndarray], channels: Iterable[str]) -> dic
 
 def _with_speed(rows: Rows, sampled: bool) -> Rows:
     """Speeds that are read in coarse steps, smoothed: of samples, or at the ends of intervals."""
+    made: dict[str, np.ndarray]
     if sampled:
         if "time_s" not in rows.data:
             return rows
         found = speed_of(rows.trip, rows.data["time_s"], rows.data["speed_mps"])
         if found is None:
             return rows
-        made, step = dict(zip(("speed_mps", ACCEL_SD), found[:2], strict=True)), found[2]
+        speed, sd, step = found
+        made = {"speed_mps": speed, ACCEL_SD: sd}
     else:
         ends = end_speeds(rows.trip, *_intervals(rows, sampled))
         if ends is None:
             return rows
-        made, step = dict(zip(("speed_start_mps", "speed_end_mps", ACCEL_SD), ends[:3], strict=True)), ends[3]
+        start, end, sd, step = ends
+        made = {"speed_start_mps": start, "speed_end_mps": end, ACCEL_SD: sd}
     why, ledger = f"read in steps of {3.6 * step:.2g} km/h: smoothed, by at most half a step", rows.ledger
     for column in (c for c in made if c != ACCEL_SD):
         changed = int(np.sum(made[column] != rows.data[column]))
