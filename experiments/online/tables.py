@@ -57,9 +57,9 @@ def tabulate(
     lap, before, after = (each[len(shares) // 2] for each in rest.values())
     named, soon = (sum(a[k] for a in alarms) for k in ("batch_logs", "within_twice"))
     found = [
-        f"After {lap['share_percent']:.0f} % of a trip of laps on one track (the first paper's table 1), the forecast "
-        f"of its remaining energy has a median error of {lap['median_error_percent']:.2g} % ({lap['n']} trips); 90 % "
-        f"intervals contain {lap['inside_90']:.0f} %",
+        f"After {lap['driven_so_far_percent']:.0f} % of a trip of laps on one track (the first paper's table 1), the "
+        f"forecast of its remaining energy has a median error of {lap['median_error_percent']:.2g} % ({lap['n']} "
+        f"trips); 90 % intervals contain {lap['inside_90']:.0f} %",
         f"On routes it is {before['median_error_percent']:.2g} %, and {after['median_error_percent']:.2g} % with the "
         f"sheet that a diagnosis of {forecasts[0][0]['routes_before']} earlier routes writes ({after['n']} trips); "
         f"intervals contain {before['inside_90']:.0f} and {after['inside_90']:.0f} %",
@@ -73,7 +73,7 @@ def tabulate(
 def _rest(results: Results, kind: str, sheet: str, share: float) -> Line:
     every = _errors(results, kind, sheet, share)
     return {
-        "name": f"{TRIPS[kind]}, {sheet} sheet, rest after {100 * share:.0f} %", "share_percent": 100.0 * share,
+        "name": f"{TRIPS[kind]}, {sheet} sheet, rest after {100 * share:.0f} %", "driven_so_far_percent": 100.0 * share,
         "n": len(every),
         "median_error_percent": float(np.median(np.abs(every[:, 0]))),
         "error_90_percent": float(np.quantile(np.abs(every[:, 0]), 0.9)),

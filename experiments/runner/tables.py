@@ -26,7 +26,7 @@ _WORDS = {
     "false_percent": "falsely named [%]", "c_rr": "c_rr", "c_rr_bias_percent": "bias of c_rr [%]",
     "null_logs": "logs, nothing planted", "payload_logs": "logs, payload error",
     "error_90_percent": "error, 90th percentile [%]", "median_half_interval_percent": "half of the interval [%]",
-    "half_interval_percent": "half of the interval [%]", "share_percent": "driven so far [%]",
+    "half_interval_percent": "half of the interval [%]",
     "median_row": "row of the alarm, median", "batch_logs": "named by a diagnosis",
     "batch_median_row": "rows that this takes, median", "within_twice": "alarm within twice those rows",
     "after_over_noise": "test RMSE over noise", "within_5_percent_of_oracle": "within 5 % of a refit",
