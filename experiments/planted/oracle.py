@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hdev_jax.diagnosis.candidates.candidate import plan_of
+from hdev_jax.diagnosis.candidates.plan import plan_of
 from hdev_jax.diagnosis.noise.noise import Noise
 from hdev_jax.diagnosis.scores.evidence import Evidence
 from hdev_jax.diagnosis.scores.gls import generalised

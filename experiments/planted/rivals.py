@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.candidates.plan import columns
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.inference import calibrate, cluster_rows, jacobian, padded
 from hdev_jax.physics import LIBRARY

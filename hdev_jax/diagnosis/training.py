@@ -1,6 +1,6 @@
 """What stays the same through a search: the training rows, the target, the library, the settings."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hdev_jax.diagnosis.candidates.candidate import Grids
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
+from hdev_jax.diagnosis.candidates.plan import Plan, plan_of
 from hdev_jax.diagnosis.noise.noise import Noise, estimate_noise
 from hdev_jax.diagnosis.scores.passes import Baseline
 from hdev_jax.diagnosis.settings import SETTINGS, Settings
@@ -68,6 +70,13 @@ class Training:
         """The rows in chunks of whole trips."""
         longest = max(s.stop - s.start for s in self.slices)
         return list(chunks_of_fit(self.rows, Shapes(self.rows.rows, longest, self.chunk_rows)))
+
+    def plan(
+        self, vehicle: Vehicle, effects: Sequence[type[Effect]], grids: Grids | None = None, *, searched: bool = False
+    ) -> Plan:
+        """The candidates among `effects` beside the vehicle, by the programs that all vehicles of this search share."""
+        library = self.library.values()
+        return plan_of(vehicle, effects, self.facts, self.target, grids, searched=searched, library=library)
 
     def calibrate(self, vehicle: Vehicle, table: ParameterTable) -> Calibration:
         """The vehicle fitted to these rows by least squares."""

@@ -110,9 +110,15 @@ def linearised(
     """The prediction and its derivative in the free coefficients, at their present values or at `theta`."""
     if not table.free:
         return np.asarray(predict(vehicle, segments, target)), np.zeros((len(segments), 0))
-    at = table.values(vehicle) if theta is None else theta
-    value, slope = _linearised(vehicle, table.structure, target, segments, jnp.asarray(at))
-    return np.asarray(value), np.asarray(slope)
+    at = np.asarray(table.values(vehicle) if theta is None else theta)
+    # in an order of their own, so that tables of the same coefficients share a program
+    places = [(c.path, c.group) for c in table.free]
+    order = np.array(sorted(range(len(places)), key=lambda k: (places[k][0], places[k][1] or 0)))
+    structure = tuple((*places[k], -np.inf, np.inf) for k in order)
+    value, slope = _linearised(vehicle, structure, target, segments, jnp.asarray(at[order]))
+    out = np.empty(slope.shape, slope.dtype)
+    out[:, order] = slope
+    return np.asarray(value), out
 
 
 def jacobian(

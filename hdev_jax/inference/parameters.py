@@ -110,15 +110,18 @@ def _pick(leaf: Any, group: int | None) -> Any:
 
 def insert(vehicle: Vehicle, structure: Any, values: Any) -> Vehicle:
     """`ParameterTable.insert` from the table's static structure."""
+    new: dict[str, Any] = {}
     for k, (path, group, _, _) in enumerate(structure):
-        where = lambda v, p=path: leaf_of(v, p)  # noqa: E731
         if group is None:
-            new: Any = values[k]
+            new[path] = values[k]
         else:
-            old = leaf_of(vehicle, path)
-            new = Grouped(jnp.asarray(old.values).at[group].set(values[k]), old.by)
-        vehicle = eqx.tree_at(where, vehicle, new, is_leaf=lambda x: isinstance(x, Grouped))
-    return vehicle
+            old = new.get(path, leaf_of(vehicle, path))
+            new[path] = Grouped(jnp.asarray(old.values).at[group].set(values[k]), old.by)
+    if not new:
+        return vehicle
+    return eqx.tree_at(  # all at once: one at a time takes longer than the trace of the kernel
+        lambda v: [leaf_of(v, path) for path in new], vehicle, [*new.values()], is_leaf=lambda x: isinstance(x, Grouped)
+    )
 
 
 def insert_by(vehicle: Vehicle, structure: Any, values: Any, by: str) -> Vehicle:

@@ -25,8 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, Plan, plan_of
+from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.candidates.facts import facts_of
+from hdev_jax.diagnosis.candidates.plan import Plan, plan_of
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.inference import padded
 from hdev_jax.online.form import Form

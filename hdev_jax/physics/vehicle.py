@@ -37,7 +37,7 @@ class Vehicle(eqx.Module):
 
     **Arguments:**
 
-    - `effects`: in any order; they are kept by stage.
+    - `effects`: in any order; they are kept by stage, so that vehicles with the same effects share compiled programs.
     - `mass_kg`, `nominal_voltage_v`: used where the log has no `mass_kg` or no `voltage_v`.
     - `driveline`, `machine`: the efficiencies of the chain; by default no losses. A driveline's efficiency covers the
       chain from the wheel to the battery unless its `covers_machine` is False.
@@ -66,7 +66,7 @@ class Vehicle(eqx.Module):
         ids = [e.id for e in effects]
         if len(set(ids)) < len(ids):
             raise ValueError(f"each effect once in a vehicle, found {ids}; use minus() before plus() to replace one")
-        self.effects = tuple(sorted(effects, key=lambda e: (STAGES.index(e.stage), e.order)))
+        self.effects = tuple(sorted(effects, key=_place))
         self.mass_kg = mass_kg
         self.driveline = Driveline() if driveline is None else driveline
         self.machine = Machine() if machine is None else machine
@@ -278,6 +278,11 @@ class Vehicle(eqx.Module):
                 parts[e.id] = after - before
                 before = after
         return parts
+
+
+def _place(effect: Effect) -> tuple[int, int, str]:
+    """Declared terms of a stage come first, as they were given."""
+    return STAGES.index(effect.stage), effect.order, "" if effect.declared else effect.id
 
 
 def _in_motion(row: Segments, x: Any) -> Any:

@@ -16,8 +16,9 @@ import jax
 import numpy as np
 
 from hdev_jax import progress
-from hdev_jax.diagnosis.candidates.candidate import as_seen, plan_of
+from hdev_jax.diagnosis.candidates.candidate import as_seen
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
+from hdev_jax.diagnosis.candidates.plan import plan_of
 from hdev_jax.diagnosis.candidates.programs import computed
 from hdev_jax.errors import InputError
 from hdev_jax.inference import padded

@@ -3,11 +3,14 @@
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import jax
 import numpy as np
 import pytest
 from planted import opened
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, columns, finer, realised
+from hdev_jax.diagnosis.candidates.candidate import Candidate, finer, realised
+from hdev_jax.diagnosis.candidates.facts import facts_of
+from hdev_jax.diagnosis.candidates.plan import columns, plan_of
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
 from hdev_jax.diagnosis.settings import SETTINGS
@@ -95,6 +98,38 @@ def test_columns_of_switches_are_differences(effect_id, problem, rows, gathered)
         at = dict(c.shapes)[c.sizes[0]]
         assert at != c.parameter(c.sizes[0]).null
     assert {dict(c.shapes)[c.sizes[0]] for c in every} == {dict(c.shapes)[c.sizes[0]] for c in set(every)}
+
+
+def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
+    """Of one-row effects and across rows, beside found effects that lack a size or a switch; whatever was found, the
+    programs are the same, those of the effects across rows also where one of them was found."""
+    facts = facts_of(rows.segments, rows.rows)
+    effects = [LIBRARY[k] for k in (*SIZES, *LIMITS, "sampling_filter", "power_gain", "cornering")]
+    found = [
+        with_values(LIBRARY["auxiliary_power"], facts.gears, power_w=900.0),
+        with_values(LIBRARY["hvac_power"], facts.gears, above_w_per_k=60.0, cool_c=20.0),
+        with_values(LIBRARY["gear_efficiency"], facts.gears, delta=(1, -0.01)),
+    ]
+    lag = LIBRARY["sampling_filter"](tap_1=np.asarray(0.1), tap_2=np.asarray(0.0), tau_s=None)
+    programs = []
+    for has in (found[:1], found, [*found, lag]):
+        vehicle = problem.vehicle.plus(*has)
+        apart = plan_of(vehicle, effects, facts, problem.target)
+        shared = plan_of(vehicle, effects, facts, problem.target, library=effects)
+        assert shared.left_out == apart.left_out
+        a, b = (np.zeros((len(rows.segments), p.width)) for p in (apart, shared))
+        apart.write(a, rows.segments)
+        shared.write(b, rows.segments)
+        by_way = {replace(c, columns=()): b[:, c.columns] for c in shared.candidates}
+        assert len(by_way) == len(apart.candidates) == len(shared.candidates)
+        for c in apart.candidates:
+            expected = a[: rows.rows, c.columns]
+            scale = np.max(np.abs(expected)) + 1e-300
+            np.testing.assert_allclose(by_way[replace(c, columns=())][: rows.rows], expected, atol=1e-9 * scale)
+        each = {id(r.program): r.program for r in shared.recipes}.values()
+        programs.append({(p.structure, jax.tree.structure(p.car)) for p in each})
+    assert programs[0] == programs[1]
+    assert len(programs[0] & programs[2]) == 1
 
 
 @pytest.mark.parametrize("effect_id", SIZES)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from planted import declared, diagnosed, found_in_turn, named, opened, training
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, columns
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.candidates.plan import columns
 from hdev_jax.diagnosis.competition.compete import compete
 from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from planted import SHORT, FadingStart, declared, diagnosed, found_in_turn, named, opened, training
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, columns, finer
+from hdev_jax.diagnosis.candidates.candidate import Candidate, finer
+from hdev_jax.diagnosis.candidates.plan import columns
 from hdev_jax.diagnosis.result.intervals import Open, _wide, left_open, other_size, shapes_of
 from hdev_jax.diagnosis.result.summary import _opened, _sized
 from hdev_jax.inference import jacobian

@@ -11,7 +11,7 @@ from planted import opened
 from experiments.planted.scores import TWINS
 from experiments.planted.study import Config
 from experiments.runner.config import resolve, typed
-from hdev_jax.diagnosis.candidates.candidate import columns
+from hdev_jax.diagnosis.candidates.plan import columns
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.fleet.truth import power_w
 from hdev_jax.inference import jacobian

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hdev_jax.diagnosis.candidates.candidate import columns
 from hdev_jax.diagnosis.candidates.facts import facts_of
+from hdev_jax.diagnosis.candidates.plan import columns
 from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded, predict

@@ -1,36 +1,28 @@
-"""Candidates: what each effect that the vehicle lacks would add to every row, without refitting anything."""
+"""Candidates: the ways to have each effect that the vehicle lacks, its sizes, groups and shapes."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
-from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
-from hdev_jax.physics import Choice, Effect, Grouped, Parameter, Switch, Vehicle, at_null, unavailable
-from hdev_jax.segments import Segments
-from hdev_jax.targets import TargetName
+from hdev_jax.diagnosis.candidates.facts import Facts
+from hdev_jax.physics import Choice, Effect, Grouped, Parameter, Switch, at_null
 
 __all__ = [
     "Candidate",
-    "Column",
     "Grids",
-    "Plan",
-    "Source",
     "as_seen",
     "beyond",
-    "columns",
     "finer",
     "in_order",
-    "plan_of",
+    "own_shapes",
     "realised",
+    "ways_of",
 ]
-
-TOGETHER = 6  # effects in one program: more of them run slower, fewer take longer to compile
 
 
 @dataclass(frozen=True)
@@ -95,17 +87,6 @@ class Candidate:
         return next(p for p in self.effect.parameters if p.name == name)
 
 
-@dataclass(frozen=True)
-class Column:
-    """One column to compute: an effect's size (and group) at given shapes, or the difference a limit makes."""
-
-    effect_id: str
-    name: str
-    group: int | None
-    shapes: tuple[tuple[str, float], ...]
-    kind: str
-
-
 def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
     """Whether a shape acts on these sizes."""
     return not shape.of or shape.of in sizes
@@ -114,7 +95,7 @@ def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:
 Grids = Mapping[str, tuple[float, ...]]
 
 
-def _own(effect: Effect, size: str, shapes: tuple[tuple[str, float], ...]) -> tuple[tuple[str, float], ...]:
+def own_shapes(effect: Effect, size: str, shapes: tuple[tuple[str, float], ...]) -> tuple[tuple[str, float], ...]:
     """The shapes that act on one size: two sizes with a shape each need a column each, not one for every pair."""
     by_name = {p.name: p for p in effect.parameters}
     return tuple((n, v) for n, v in shapes if n == size or _matters(by_name[n], (size,)))
@@ -128,7 +109,7 @@ def _grid(p: Parameter, facts: Facts, grids: Grids) -> tuple[float, ...]:
     return (facts.means[p.mean_of],) if p.mean_of else tuple(g * facts.row_s if p.in_rows else g for g in p.grid)
 
 
-def _of_effect(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tuple[Any, ...]]:
+def ways_of(effect: type[Effect], facts: Facts, grids: Grids) -> Iterable[tuple[Any, ...]]:
     """`(sizes, groups, shapes, kind)` for each way to have the effect."""
     by_name = {p.name: p for p in effect.parameters}
     sizes = tuple(p.name for p in effect.parameters if p.has_column)
@@ -183,121 +164,6 @@ def finer(candidate: Candidate, row_s: float, *, reach: float = 0.5, points: int
 def beyond(from_: float, at: float) -> float:
     """One more step in the same direction; by ratio where both are positive, since a time constant stays so."""
     return at * at / from_ if min(from_, at) > 0 else 2.0 * at - from_
-
-
-@runtime_checkable
-class Source(Protocol):
-    """What makes candidates' columns of any rows: the library's `Plan`, or the terms of a formula.
-
-    `candidates` hold places among `width` columns; `left_out` says by id why other effects are no candidates.
-    """
-
-    @property
-    def candidates(self) -> Sequence[Candidate]: ...
-
-    @property
-    def left_out(self) -> Mapping[str, str]: ...
-
-    @property
-    def width(self) -> int: ...
-
-    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
-        """Write the columns `at` (all by default) of padded segments into `out` [row, column]."""
-        ...
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The candidates that a log allows, and how each of their columns is made of any of its rows.
-
-    Made once from the facts of the whole log; whole trips are then evaluated a chunk at a time.
-    """
-
-    candidates: tuple[Candidate, ...]
-    left_out: Mapping[str, str]
-    target: TargetName
-    programs: tuple[Program, ...]
-    recipes: tuple[Recipe, ...]
-
-    @property
-    def width(self) -> int:
-        """How many columns there are."""
-        return len(self.recipes)
-
-    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
-        """Write the columns `at` (all by default) of padded segments into `out` [row, column], in the target's unit."""
-        written(out, [self.recipes[k] for k in (range(self.width) if at is None else at)], segments, self.target)
-
-
-def plan_of(
-    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: TargetName, grids: Grids | None = None,
-    *, searched: bool = False,
-) -> Plan:  # fmt: skip
-    """Every candidate that a log of these facts allows beside what the vehicle has.
-
-    Effects of one row share a vehicle, a few with all of them at their null value, so that one compiled `jvp` serves
-    them all; what acts across rows has a vehicle of its own. `grids` replaces the grids of parameters by name;
-    `searched` takes effects with a search of their own too.
-    """
-    left_out: dict[str, str] = {}
-    nulls: list[Effect] = []
-    for c in effects:
-        if vehicle.has(c.id) or (c.searched and not searched):
-            continue
-        if why := unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in):
-            left_out[c.id] = why
-        else:
-            nulls.append(as_seen(at_null(c, gears=facts.gears), facts))
-    # in the same company whatever the log lacks, so that logs share programs
-    company = {id_: k // TOGETHER for k, id_ in enumerate(c.id for c in effects if not c.acts_across_rows())}
-    groups: list[tuple[list[Effect], tuple[str, ...] | None]] = []
-    for k in sorted({company[e.id] for e in nulls if e.id in company}):
-        groups.append(([e for e in nulls if company.get(e.id) == k], None))
-    for e in (e for e in nulls if e.acts_across_rows()):
-        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.has_column),):
-            groups.append(([_only(e, sizes)], sizes))
-
-    found: list[Candidate] = []
-    place: dict[Column, int] = {}
-    recipes: list[Recipe] = []
-    programs = [Program.of(vehicle, group) for group, _ in groups]
-    for program, (group, only) in zip(programs, groups, strict=True):
-        for e in group:
-            for sizes, subs, shapes, kind in _of_effect(type(e), facts, grids or {}):
-                if only is not None and sizes != only:
-                    continue
-                keys = [Column(e.id, s, g, _own(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
-                for key in keys:
-                    if key not in place:
-                        place[key] = len(recipes)
-                        size = None if kind == "limit" else (key.name, key.group)
-                        recipes.append(program.recipe(e.id, shapes, size))
-                found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
-    return Plan(tuple(found), left_out, target, tuple(programs), tuple(recipes))
-
-
-def columns(
-    vehicle: Vehicle,
-    effects: Sequence[type[Effect]],
-    segments: Segments,
-    rows: int,
-    target: TargetName,
-    grids: Grids | None = None,
-) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
-    """Every candidate's columns on the first `rows` rows of padded segments, all at once: for few rows or effects.
-
-    **Returns:** candidates, their columns in the target's unit, and why the other effects were left out.
-    """
-    plan = plan_of(vehicle, effects, facts_of(segments, rows), target, grids)
-    out = np.zeros((len(segments), plan.width))
-    plan.write(out, segments)
-    return list(plan.candidates), out[:rows], dict(plan.left_out)
-
-
-def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
-    """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
-    idle = {p.name for p in effect.parameters if isinstance(p, Switch) and p.name not in sizes}
-    return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
 
 
 def as_seen(effect: Effect, facts: Facts) -> Effect:

@@ -1,6 +1,6 @@
 """How a candidate's column is computed: a vehicle with effects at their null, and a derivative or difference of it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,7 +24,8 @@ Structure = tuple[tuple[str, int | None, float, float], ...]
 class Program:
     """A vehicle with a few effects at their null, compiled once for one shape of rows.
 
-    `structure` says where each of their parameters sits, `null` holds the parameters' null values.
+    `structure` says where each of their parameters sits, `null` holds the parameters' null values, and those of found
+    effects as they were fitted.
     """
 
     car: Vehicle
@@ -32,19 +33,25 @@ class Program:
     null: Float[np.ndarray, " parameter"]
 
     @staticmethod
-    def of(vehicle: Vehicle, effects: Sequence[Effect]) -> "Program":
-        """The program of a vehicle with these effects. Raises `ValueError` for one it has already."""
-        structure, null = [], []
-        for e in effects:
+    def of(vehicle: Vehicle, effects: Iterable[Effect], has: Collection[str] = ()) -> "Program":
+        """The program of a vehicle with these effects beside its own. Raises `ValueError` for one it has already.
+
+        `has`: ids of effects of its own whose numbers are arguments as well, so that it does not matter which effects
+        were found.
+        """
+        car, structure, at = vehicle.plus(*effects), [], []
+        added = {e.id for e in car.effects} - {e.id for e in vehicle.effects} | {*has}
+        for e in (e for e in car.effects if e.id in added):
             for p in e.parameters:
                 leaf = getattr(e, p.name)
                 if leaf is None:
                     continue
-                count = len(leaf.values) if isinstance(leaf, Grouped) else None
-                for g in range(count) if count is not None else (None,):
-                    structure.append((f"effects.{e.id}.{p.name}", g, -np.inf, np.inf))
-                    null.append(p.null)
-        return Program(vehicle.plus(*effects), tuple(structure), np.array(null))
+                grouped = isinstance(leaf, Grouped)
+                values = np.atleast_1d(np.asarray(leaf.values if grouped else leaf, dtype=float))
+                path = f"effects.{e.id}.{p.name}"
+                structure += [(path, g if grouped else None, -np.inf, np.inf) for g in range(len(values))]
+                at += [*values]
+        return Program(car, tuple(structure), np.array(at))
 
     def recipe(
         self, effect_id: str, shapes: Sequence[tuple[str, float]], size: tuple[str, int | None] | None

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from hdev_jax.diagnosis.candidates.candidate import finer, plan_of
+from hdev_jax.diagnosis.candidates.candidate import finer
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.passes import both_looks
 from hdev_jax.diagnosis.scores.scores import Scores, best_of, plausible
@@ -49,7 +49,7 @@ def refined(training: Training, s: Score, scores: Scores) -> tuple[Score, float]
         grids["at_trip"] = facts.steps_near(dict(s.candidate.shapes)["at_trip"])
     if all(len(g) == 1 for g in grids.values()):
         return s, 1.0
-    plan = plan_of(scores.baseline.fit.vehicle, [s.candidate.effect], facts, training.target, grids)
+    plan = training.plan(scores.baseline.fit.vehicle, [s.candidate.effect], grids)
     own = (s.candidate.sizes, s.candidate.groups)
     only = [c.only([g in s.candidate.groups for g in c.groups]) for c in plan.candidates]
     same = [c for c in only if c is not None and (c.sizes, c.groups) == own]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, plan_of
+from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.cycle import barred
 from hdev_jax.diagnosis.competition.refit import joined
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
@@ -60,7 +60,7 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
         training.baseline(state.fit, replace(noise, level_sd=0.0)), clusters=Clusters(ids, len(slices), "trip")
     )
     on = {"in_mode": (1.0,), "share": (0.5,)}
-    plan = plan_of(state.fit.vehicle, [ModeChange], training.facts, training.target, on, searched=True)
+    plan = training.plan(state.fit.vehicle, [ModeChange], on, searched=True)
 
     def write(out: np.ndarray, chunk: Chunk) -> None:
         plan.write(out[:, :-1], chunk.segments)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, plan_of
+from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.cycle import barred
 from hdev_jax.diagnosis.competition.grid import LEADERS
 from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, LOAD_NUMBERS, Tested, besides, level_test
@@ -141,7 +141,7 @@ def _without_last(training: Training, state: State) -> State | None:
     less = decoded_again(training, without(with_states(training, state), state, last))
     there = with_states(training, less)
     like = [c for k, c in training.library.items() if k in SwitchingLoad.mistaken_for and not less.fit.vehicle.has(k)]
-    scores = score_all(there, less.fit, plan_of(less.fit.vehicle, like, training.facts, training.target))
+    scores = score_all(there, less.fit, training.plan(less.fit.vehicle, like))
     leaders = sorted(scores.best.values(), key=scores.worth, reverse=True)[:LEADERS]
     able = ((s, fit) for s in leaders if (fit := joined(there, less, s)) is not None)
     if (found := next(able, None)) is None:

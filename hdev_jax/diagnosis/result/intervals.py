@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, stats
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, Plan, beyond, plan_of
+from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, beyond
+from hdev_jax.diagnosis.candidates.plan import Plan
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import both_looks
@@ -118,7 +119,7 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
 
 def _apart(training: Training, state: State, c: Candidate, grids: Grids) -> tuple[Plan, Evidence, Evidence]:
     """Forms of a found effect on these grids, and evidence without it by generalised and by ordinary least squares."""
-    plan = plan_of(state.fit.vehicle.minus(c.id), [c.effect], training.facts, training.target, grids)
+    plan = training.plan(state.fit.vehicle.minus(c.id), [c.effect], grids)
     baseline = training.baseline(_without(state.fit, c.id), training.noise(state.fit))
     with_it = float(np.mean((training.measured - state.fit.predicted) ** 2))
     return plan, *both_looks(baseline, plan, variance=with_it)[:2]
@@ -161,10 +162,10 @@ def _undeclared(training: Training, state: State, s: Score) -> dict[str, Open]:
     c, vehicle = s.candidate, state.fit.vehicle
     if not vehicle.one_efficiency or vehicle.has(RegenEfficiency.id) or c.kind != "size" or None not in c.groups:
         return {}
-    beside = plan_of(vehicle, [RegenEfficiency], training.facts, training.target)
+    beside = training.plan(vehicle, [RegenEfficiency])
     if not beside.candidates or both_looks(training.baseline(state.fit), beside)[0].left([0]) > UNDECIDED:
         return {}
-    plan = plan_of(vehicle.minus(c.id), [c.effect, RegenEfficiency], training.facts, training.target)
+    plan = training.plan(vehicle.minus(c.id), [c.effect, RegenEfficiency])
     evidence = both_looks(training.baseline(_without(state.fit, c.id), training.noise(state.fit)), plan)[0]
     own = next((k for k in plan.candidates if k.sizes == c.sizes and k.id == c.id), None)
     other = next(k for k in plan.candidates if k.id == RegenEfficiency.id)

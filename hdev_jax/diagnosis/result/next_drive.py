@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.diagnosis.candidates.candidate import columns
+from hdev_jax.diagnosis.candidates.plan import columns
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.inference import Fit, jacobian, padded
 from hdev_jax.physics import Effect

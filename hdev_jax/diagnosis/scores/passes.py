@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from hdev_jax.diagnosis.candidates.candidate import Source
+from hdev_jax.diagnosis.candidates.plan import Source
 from hdev_jax.diagnosis.noise.noise import Noise, whiten
 from hdev_jax.diagnosis.scores.evidence import Evidence
 from hdev_jax.inference import Calibration, Chunk, Clusters, linearised

@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, Source, plan_of
+from hdev_jax.diagnosis.candidates.candidate import Candidate
+from hdev_jax.diagnosis.candidates.plan import Source
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.gls import generalised
 from hdev_jax.diagnosis.scores.passes import Baseline, both_looks
@@ -159,7 +160,7 @@ def score_all(training: Training, fit: Calibration, made: Source | None = None) 
     """Score everything in one pass: the library's effects, or candidates `made` elsewhere."""
     baseline = training.baseline(fit)
     known, _ = generalised(baseline)
-    source = made or plan_of(known.vehicle, list(training.library.values()), training.facts, training.target)
+    source = made or training.plan(known.vehicle, list(training.library.values()))
     return scored(replace(baseline, fit=known), source, training.settings)
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from hdev_jax.diagnosis.candidates.candidate import plan_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of, merged
+from hdev_jax.diagnosis.candidates.plan import plan_of
 from hdev_jax.diagnosis.noise.noise import estimate_noise
 from hdev_jax.diagnosis.scores.gls import generalised
 from hdev_jax.diagnosis.scores.passes import Baseline

@@ -1,0 +1,188 @@
+"""What each candidate would add to every row, without refitting anything, and by which programs it is computed."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, as_seen, own_shapes, ways_of
+from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
+from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
+from hdev_jax.physics import Effect, Switch, Vehicle, at_null, unavailable
+from hdev_jax.segments import Segments
+from hdev_jax.targets import TargetName
+
+__all__ = ["Column", "Plan", "Source", "columns", "plan_of"]
+
+TOGETHER = 6  # effects in one program of a long log: more of them run slower, fewer take longer to compile
+SHORT_ROWS = 65_536  # a log of no more takes less time to run with every effect than programs to compile without some
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column to compute: an effect's size (and group) at given shapes, or the difference a limit makes."""
+
+    effect_id: str
+    name: str
+    group: int | None
+    shapes: tuple[tuple[str, float], ...]
+    kind: str
+
+
+@runtime_checkable
+class Source(Protocol):
+    """What makes candidates' columns of any rows: the library's `Plan`, or the terms of a formula.
+
+    `candidates` hold places among `width` columns; `left_out` says by id why other effects are no candidates.
+    """
+
+    @property
+    def candidates(self) -> Sequence[Candidate]: ...
+
+    @property
+    def left_out(self) -> Mapping[str, str]: ...
+
+    @property
+    def width(self) -> int: ...
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The candidates that a log allows, and how each of their columns is made of any of its rows.
+
+    Made once from the facts of the whole log; whole trips are then evaluated a chunk at a time.
+    """
+
+    candidates: tuple[Candidate, ...]
+    left_out: Mapping[str, str]
+    target: TargetName
+    recipes: tuple[Recipe, ...]
+
+    @property
+    def width(self) -> int:
+        """How many columns there are."""
+        return len(self.recipes)
+
+    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column], in the target's unit."""
+        written(out, [self.recipes[k] for k in (range(self.width) if at is None else at)], segments, self.target)
+
+
+def plan_of(
+    vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: TargetName, grids: Grids | None = None,
+    *, searched: bool = False, library: Collection[type[Effect]] = (),
+) -> Plan:  # fmt: skip
+    """Every candidate that a log of these facts allows beside what the vehicle has.
+
+    `grids` replaces the grids of parameters by name; `searched` takes effects with a search of their own too. With the
+    `library` that a search is in, its vehicles share programs, whatever was found.
+    """
+    left_out: dict[str, str] = {}
+    nulls: list[Effect] = []
+    for c in effects:
+        if vehicle.has(c.id) or (c.searched and not searched):
+            continue
+        if why := unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in):
+            left_out[c.id] = why
+        else:
+            nulls.append(_absent(c, facts))
+    short = len(library) > 0 and facts.rows <= SHORT_ROWS
+    groups = _shared(vehicle, nulls, facts, library) if short else _apart(vehicle, nulls, effects)
+
+    found: list[Candidate] = []
+    place: dict[Column, int] = {}
+    recipes: list[Recipe] = []
+    for program, group, only in groups:
+        for e in group:
+            for sizes, subs, shapes, kind in ways_of(type(e), facts, grids or {}):
+                if only is not None and sizes != only:
+                    continue
+                keys = [Column(e.id, s, g, own_shapes(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
+                for key in keys:
+                    if key not in place:
+                        place[key] = len(recipes)
+                        size = None if kind == "limit" else (key.name, key.group)
+                        recipes.append(program.recipe(e.id, shapes, size))
+                found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
+    return Plan(tuple(found), left_out, target, tuple(recipes))
+
+
+# a program, the effects whose columns it makes, and the only sizes that it makes them for
+_Group = tuple[Program, Sequence[Effect], tuple[str, ...] | None]
+
+
+def _apart(vehicle: Vehicle, nulls: Sequence[Effect], effects: Sequence[type[Effect]]) -> list[_Group]:
+    """Programs that run fast: a few effects of one row beside the vehicle, or one effect across rows."""
+    # in the same company whatever the log lacks, so that logs share programs
+    company = {id_: k // TOGETHER for k, id_ in enumerate(c.id for c in effects if not c.acts_across_rows())}
+    groups: list[_Group] = []
+    for k in sorted({company[e.id] for e in nulls if e.id in company}):
+        group = [e for e in nulls if company.get(e.id) == k]
+        groups.append((Program.of(vehicle, group), group, None))
+    for e in (e for e in nulls if e.acts_across_rows()):
+        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.has_column),):
+            only = [_only(e, sizes)]
+            groups.append((Program.of(vehicle, only), only, sizes))
+    return groups
+
+
+def _shared(vehicle: Vehicle, nulls: Sequence[Effect], facts: Facts, library: Collection[type[Effect]]) -> list[_Group]:
+    """Programs that are compiled once for every vehicle of a search: all effects of the library are there, those that
+    were not found at their null; those that act across rows only where one of them is asked for."""
+    has = {c.id for c in library if vehicle.has(c.id) and not c.searched}
+    base = vehicle.minus(*has).plus(*(_whole(vehicle.effect(c.id), _absent(c, facts)) for c in library if c.id in has))
+    absent = {
+        c.id: _absent(c, facts)
+        for c in library
+        if not (vehicle.has(c.id) or c.searched or unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in))
+    }
+    absent |= {e.id: e for e in nulls}
+    across = {id_ for id_, e in absent.items() if e.acts_across_rows()}
+    groups: list[_Group] = []
+    for group, beside in (
+        ([e for e in nulls if e.id not in across], [e for id_, e in absent.items() if id_ not in across]),
+        ([e for e in nulls if e.id in across], list(absent.values())),
+    ):
+        if group:
+            groups.append((Program.of(base, beside, has), group, None))
+    return groups
+
+
+def _absent(effect: type[Effect], facts: Facts) -> Effect:
+    return as_seen(at_null(effect, gears=facts.gears), facts)
+
+
+def _whole(effect: Effect, absent: Effect) -> Effect:
+    """The effect with the limits that it was found without at their null."""
+    fields = {p.name: getattr(effect, p.name) for p in effect.parameters}
+    return type(effect)(**{k: getattr(absent, k) if v is None else v for k, v in fields.items()})
+
+
+def columns(
+    vehicle: Vehicle,
+    effects: Sequence[type[Effect]],
+    segments: Segments,
+    rows: int,
+    target: TargetName,
+    grids: Grids | None = None,
+) -> tuple[list[Candidate], Float[np.ndarray, "row k"], dict[str, str]]:
+    """Every candidate's columns on the first `rows` rows of padded segments, all at once: for few rows or effects.
+
+    **Returns:** candidates, their columns in the target's unit, and why the other effects were left out.
+    """
+    plan = plan_of(vehicle, effects, facts_of(segments, rows), target, grids)
+    out = np.zeros((len(segments), plan.width))
+    plan.write(out, segments)
+    return list(plan.candidates), out[:rows], dict(plan.left_out)
+
+
+def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
+    """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
+    idle = {p.name for p in effect.parameters if isinstance(p, Switch) and p.name not in sizes}
+    return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})
