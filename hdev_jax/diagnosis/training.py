@@ -75,8 +75,9 @@ class Training:
         self, vehicle: Vehicle, effects: Sequence[type[Effect]], grids: Grids | None = None, *, searched: bool = False
     ) -> Plan:
         """The candidates among `effects` beside the vehicle, by the programs that all vehicles of this search share."""
+        facts = replace(self.facts, gears=self.gears)  # as found effects have them, so that programs are the same
         library = self.library.values()
-        return plan_of(vehicle, effects, self.facts, self.target, grids, searched=searched, library=library)
+        return plan_of(vehicle, effects, facts, self.target, grids, searched=searched, library=library)
 
     def calibrate(self, vehicle: Vehicle, table: ParameterTable) -> Calibration:
         """The vehicle fitted to these rows by least squares."""

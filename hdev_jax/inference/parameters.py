@@ -110,15 +110,19 @@ def _pick(leaf: Any, group: int | None) -> Any:
 
 def insert(vehicle: Vehicle, structure: Any, values: Any) -> Vehicle:
     """`ParameterTable.insert` from the table's static structure."""
-    new: dict[str, Any] = {}
+    at: dict[str, list[tuple[int, int | None]]] = {}
     for k, (path, group, _, _) in enumerate(structure):
-        if group is None:
-            new[path] = values[k]
-        else:
-            old = new.get(path, leaf_of(vehicle, path))
-            new[path] = Grouped(jnp.asarray(old.values).at[group].set(values[k]), old.by)
-    if not new:
+        at.setdefault(path, []).append((k, group))
+    if not at:
         return vehicle
+    new: dict[str, Any] = {}
+    for path, places in at.items():
+        ks, groups = (list(x) for x in zip(*places, strict=True))
+        if groups[0] is None:
+            new[path] = values[ks[0]]
+        else:
+            old = leaf_of(vehicle, path)
+            new[path] = Grouped(jnp.asarray(old.values).at[np.array(groups)].set(values[np.array(ks)]), old.by)
     return eqx.tree_at(  # all at once: one at a time takes longer than the trace of the kernel
         lambda v: [leaf_of(v, path) for path in new], vehicle, [*new.values()], is_leaf=lambda x: isinstance(x, Grouped)
     )

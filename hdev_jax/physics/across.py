@@ -172,7 +172,9 @@ def later_slope(segments: Segments, ahead_s: Any) -> Float[Array, " row"]:
     here = slope[_row_at(jax.lax.stop_gradient(0.5 * (from_ + to)), start, bounds)]
     read = jnp.where(way > STANDS, (height_to - height_from) / jnp.where(way > STANDS, way, 1.0), here)
     # at 0 the channel to the last bit, with the derivative of what is read
-    return jnp.where(jnp.asarray(ahead_s) == 0, slope + (read - jax.lax.stop_gradient(read)), read)
+    return jnp.where(
+        jnp.asarray(ahead_s) == 0, jax.lax.stop_gradient(slope) + (read - jax.lax.stop_gradient(read)), read
+    )
 
 
 def _sums_before(x: Float[Array, " row"], first: Int[Array, " row"]) -> Float[Array, " row"]:

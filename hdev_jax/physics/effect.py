@@ -103,7 +103,7 @@ class Car(Protocol):
         ...
 
     def has(self, effect_id: str) -> bool:
-        """Whether the vehicle has this effect."""
+        """Whether the vehicle has this effect; it may be there at its null."""
         ...
 
     def effect(self, effect_id: str) -> Any:

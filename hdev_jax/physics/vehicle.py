@@ -37,7 +37,8 @@ class Vehicle(eqx.Module):
 
     **Arguments:**
 
-    - `effects`: in any order; they are kept by stage, so that vehicles with the same effects share compiled programs.
+    - `effects`: in any order; they are kept by stage, order and id, so that vehicles with the same effects share
+      compiled programs.
     - `mass_kg`, `nominal_voltage_v`: used where the log has no `mass_kg` or no `voltage_v`.
     - `driveline`, `machine`: the efficiencies of the chain; by default no losses. A driveline's efficiency covers the
       chain from the wheel to the battery unless its `covers_machine` is False.
@@ -282,7 +283,7 @@ class Vehicle(eqx.Module):
 
 def _place(effect: Effect) -> tuple[int, int, str]:
     """Declared terms of a stage come first, as they were given."""
-    return STAGES.index(effect.stage), effect.order, "" if effect.declared else effect.id
+    return STAGES.index(effect.stage), effect.order, "" if effect.declared or not effect.parameters else effect.id
 
 
 def _in_motion(row: Segments, x: Any) -> Any:

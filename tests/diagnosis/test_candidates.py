@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from planted import opened
@@ -15,7 +16,7 @@ from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.inference import padded
-from hdev_jax.physics import LIBRARY, Effect, Grouped, Size, Vehicle, at_null
+from hdev_jax.physics import LIBRARY, Effect, Grouped, Shape, Size, Vehicle, at_null
 from hdev_jax.problem import Problem
 
 # by hook and kind: force, power and sensor effects of one row, sums over a trip, groups, switches, shifts
@@ -129,7 +130,54 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
         each = {id(r.program): r.program for r in shared.recipes}.values()
         programs.append({(p.structure, jax.tree.structure(p.car)) for p in each})
     assert programs[0] == programs[1]
-    assert len(programs[0] & programs[2]) == 1
+    assert len(programs[0] & programs[2]) == 1  # the one of all effects; that of one-row effects has the filter now
+
+
+class Fading(Effect):
+    """Without a slope at the usual value of its shape, 0."""
+
+    id = "fading"
+    stage = "battery"
+    equation = "P = P₀ exp(−t/τ)"
+    parameters = (
+        Size("power_w", "W", 0.0, 1e3),
+        Shape("tau_s", "s", 0.0, 10.0, 0.0, 1e3, grid=(100.0, 300.0)),
+    )
+    power_w: Any
+    tau_s: Any
+
+    def power(self, row, car, point):
+        return self.power_w * jnp.exp(-row.duration_s / self.tau_s)
+
+
+class RootOfSpeed(Effect):
+    """With an infinite slope in the speed where it stands."""
+
+    id = "root_of_speed"
+    stage = "battery"
+    equation = "P = w √v"
+    parameters = (Size("w", "W/√(m/s)", 0.0, 1e2),)
+    w: Any
+
+    def power(self, row, car, point):
+        return self.w * jnp.sqrt(row.speed_mps)
+
+
+def test_an_effect_of_a_user_does_no_harm_to_other_columns(problem, rows):
+    facts = facts_of(rows.segments, rows.rows)
+    effects = [LIBRARY[k] for k in ("speed_scale", "auxiliary_power", "tyre_warmup")]
+    alone = plan_of(problem.vehicle, effects, facts, problem.target, library=effects)
+    every = [Fading, *effects, RootOfSpeed]
+    beside = plan_of(problem.vehicle, every, facts, problem.target, library=every)
+    a, b = (np.zeros((len(rows.segments), p.width)) for p in (alone, beside))
+    alone.write(a, rows.segments)
+    beside.write(b, rows.segments)
+    columns_of = {replace(c, columns=()): b[:, c.columns] for c in beside.candidates}
+    for c in alone.candidates:
+        np.testing.assert_array_equal(columns_of[replace(c, columns=())], a[:, c.columns])
+    own = {c.id: columns_of[replace(c, columns=())] for c in beside.candidates if c.id in ("fading", "root_of_speed")}
+    assert all(np.any(x != 0) for x in own.values())
+    assert len(own) == 2
 
 
 @pytest.mark.parametrize("effect_id", SIZES)

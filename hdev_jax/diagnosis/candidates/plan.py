@@ -10,14 +10,16 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, as_seen, own_shapes, ways_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
-from hdev_jax.physics import Effect, Switch, Vehicle, at_null, unavailable
+from hdev_jax.physics import LIBRARY, Effect, Switch, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
 __all__ = ["Column", "Plan", "Source", "columns", "plan_of"]
 
 TOGETHER = 6  # effects in one program of a long log: more of them run slower, fewer take longer to compile
-SHORT_ROWS = 65_536  # a log of no more takes less time to run with every effect than programs to compile without some
+# Of a log of 14,000 rows a column takes 5 ms with every effect and 1.5 ms with six, so all of them 1.5 s and 0.4 s; to
+# trace and compile those of a step anew takes 5 to 20 s. Twice or half of it changes the time alone.
+SHORT_ROWS = 65_536
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,7 @@ def plan_of(
     """Every candidate that a log of these facts allows beside what the vehicle has.
 
     `grids` replaces the grids of parameters by name; `searched` takes effects with a search of their own too. With the
-    `library` that a search is in, its vehicles share programs, whatever was found.
+    `library` of a search, its vehicles share programs, whichever effects of one row were found.
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []
@@ -92,65 +94,72 @@ def plan_of(
             left_out[c.id] = why
         else:
             nulls.append(_absent(c, facts))
-    short = len(library) > 0 and facts.rows <= SHORT_ROWS
-    groups = _shared(vehicle, nulls, facts, library) if short else _apart(vehicle, nulls, effects)
+    if library and facts.rows <= SHORT_ROWS:
+        # nothing is known of the slopes that a user's effect has at its null: it is in no program but its own
+        known = [e for e in nulls if type(e) in LIBRARY.values()]
+        groups = _shared(vehicle, known, facts, [c for c in library if c in LIBRARY.values()])
+        groups += [g for e in nulls if e not in known for g in _separate(vehicle, [e], [type(e)])]
+    else:
+        groups = _separate(vehicle, nulls, effects)
 
     found: list[Candidate] = []
     place: dict[Column, int] = {}
     recipes: list[Recipe] = []
-    for program, group, only in groups:
-        for e in group:
+    for g in groups:
+        for e in g.effects:
             for sizes, subs, shapes, kind in ways_of(type(e), facts, grids or {}):
-                if only is not None and sizes != only:
+                if g.sizes is not None and sizes != g.sizes:
                     continue
-                keys = [Column(e.id, s, g, own_shapes(e, s, shapes), kind) for s, g in zip(sizes, subs, strict=True)]
+                keys = [Column(e.id, s, k, own_shapes(e, s, shapes), kind) for s, k in zip(sizes, subs, strict=True)]
                 for key in keys:
                     if key not in place:
                         place[key] = len(recipes)
                         size = None if kind == "limit" else (key.name, key.group)
-                        recipes.append(program.recipe(e.id, shapes, size))
+                        recipes.append(g.program.recipe(e.id, shapes, size))
                 found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
     return Plan(tuple(found), left_out, target, tuple(recipes))
 
 
-# a program, the effects whose columns it makes, and the only sizes that it makes them for
-_Group = tuple[Program, Sequence[Effect], tuple[str, ...] | None]
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """A program and the effects whose columns it makes, for `sizes` alone where these are given."""
+
+    program: Program
+    effects: Sequence[Effect]
+    sizes: tuple[str, ...] | None = None
 
 
-def _apart(vehicle: Vehicle, nulls: Sequence[Effect], effects: Sequence[type[Effect]]) -> list[_Group]:
+def _separate(vehicle: Vehicle, nulls: Sequence[Effect], effects: Sequence[type[Effect]]) -> list[_Group]:
     """Programs that run fast: a few effects of one row beside the vehicle, or one effect across rows."""
     # in the same company whatever the log lacks, so that logs share programs
     company = {id_: k // TOGETHER for k, id_ in enumerate(c.id for c in effects if not c.acts_across_rows())}
     groups: list[_Group] = []
     for k in sorted({company[e.id] for e in nulls if e.id in company}):
         group = [e for e in nulls if company.get(e.id) == k]
-        groups.append((Program.of(vehicle, group), group, None))
+        groups.append(_Group(Program.of(vehicle, group), group))
     for e in (e for e in nulls if e.acts_across_rows()):
         for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.has_column),):
             only = [_only(e, sizes)]
-            groups.append((Program.of(vehicle, only), only, sizes))
+            groups.append(_Group(Program.of(vehicle, only), only, sizes))
     return groups
 
 
-def _shared(vehicle: Vehicle, nulls: Sequence[Effect], facts: Facts, library: Collection[type[Effect]]) -> list[_Group]:
-    """Programs that are compiled once for every vehicle of a search: all effects of the library are there, those that
-    were not found at their null; those that act across rows only where one of them is asked for."""
-    has = {c.id for c in library if vehicle.has(c.id) and not c.searched}
-    base = vehicle.minus(*has).plus(*(_whole(vehicle.effect(c.id), _absent(c, facts)) for c in library if c.id in has))
-    absent = {
-        c.id: _absent(c, facts)
-        for c in library
-        if not (vehicle.has(c.id) or c.searched or unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in))
-    }
-    absent |= {e.id: e for e in nulls}
-    across = {id_ for id_, e in absent.items() if e.acts_across_rows()}
+def _shared(vehicle: Vehicle, nulls: Sequence[Effect], facts: Facts, library: Sequence[type[Effect]]) -> list[_Group]:
+    """Programs that vehicles of a search share, whichever effects of one row were found: every effect of the library is
+    in them, those that were not found at their null; those across rows only where one of them is asked for."""
+    found = {c.id: vehicle.effect(c.id) for c in library if vehicle.has(c.id) and not c.searched}
+    base = vehicle.minus(*found).plus(*(_with_limits(e, _absent(type(e), facts)) for e in found.values()))
+    absent = {e.id: e for e in nulls}
+    for c in library:
+        out = vehicle.has(c.id) or c.searched or unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in)
+        if not out and c.id not in absent:
+            absent[c.id] = _absent(c, facts)
     groups: list[_Group] = []
-    for group, beside in (
-        ([e for e in nulls if e.id not in across], [e for id_, e in absent.items() if id_ not in across]),
-        ([e for e in nulls if e.id in across], list(absent.values())),
-    ):
-        if group:
-            groups.append((Program.of(base, beside, has), group, None))
+    if rowwise := [e for e in nulls if not e.acts_across_rows()]:
+        beside = [e for e in absent.values() if not e.acts_across_rows()]
+        groups.append(_Group(Program.of(base, beside, found), rowwise))
+    if across := [e for e in nulls if e.acts_across_rows()]:
+        groups.append(_Group(Program.of(base, absent.values(), found), across))
     return groups
 
 
@@ -158,7 +167,7 @@ def _absent(effect: type[Effect], facts: Facts) -> Effect:
     return as_seen(at_null(effect, gears=facts.gears), facts)
 
 
-def _whole(effect: Effect, absent: Effect) -> Effect:
+def _with_limits(effect: Effect, absent: Effect) -> Effect:
     """The effect with the limits that it was found without at their null."""
     fields = {p.name: getattr(effect, p.name) for p in effect.parameters}
     return type(effect)(**{k: getattr(absent, k) if v is None else v for k, v in fields.items()})

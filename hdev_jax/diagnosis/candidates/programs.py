@@ -22,7 +22,7 @@ Structure = tuple[tuple[str, int | None, float, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A vehicle with a few effects at their null, compiled once for one shape of rows.
+    """A vehicle with effects at their null, compiled once for one shape of rows.
 
     `structure` says where each of their parameters sits, `null` holds the parameters' null values, and those of found
     effects as they were fitted.
@@ -33,14 +33,14 @@ class Program:
     null: Float[np.ndarray, " parameter"]
 
     @staticmethod
-    def of(vehicle: Vehicle, effects: Iterable[Effect], has: Collection[str] = ()) -> "Program":
+    def of(vehicle: Vehicle, effects: Iterable[Effect], found: Collection[str] = ()) -> "Program":
         """The program of a vehicle with these effects beside its own. Raises `ValueError` for one it has already.
 
-        `has`: ids of effects of its own whose numbers are arguments as well, so that it does not matter which effects
-        were found.
+        `found`: ids of effects of its own whose numbers are arguments as well, so that vehicles with other effects
+        found share the program.
         """
         car, structure, at = vehicle.plus(*effects), [], []
-        added = {e.id for e in car.effects} - {e.id for e in vehicle.effects} | {*has}
+        added = {e.id for e in car.effects} - {e.id for e in vehicle.effects} | {*found}
         for e in (e for e in car.effects if e.id in added):
             for p in e.parameters:
                 leaf = getattr(e, p.name)
