@@ -38,6 +38,7 @@ Parameters = tuple[Parameter, ...]
 Real = Float[Array, ""]
 Row = Segments  # of one row: its columns are scalars
 Signal = Float[Array, " row"]  # one value for each row
+HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")  # methods of an effect, as they are called
 
 
 class Point(eqx.Module):
@@ -240,6 +241,11 @@ class Effect(eqx.Module):
         """Whether it needs other rows of the trip too, given that the channels `known` are there."""
         derives = cls.overrides("derive") and not (cls.derives and {*cls.derives} <= {*known})
         return derives or cls.overrides("across") or cls.overrides("observe")
+
+    @classmethod
+    def alone(cls, hook: str) -> bool:
+        """Whether it overrides this method and no other."""
+        return [h for h in HOOKS if cls.overrides(h)] == [hook]
 
     @classmethod
     def overrides(cls, hook: str) -> bool:

@@ -202,9 +202,7 @@ class Vehicle(eqx.Module):
 
     def _rows(self, segments: Segments, of: Callable[[_Chain, Segments], Any]) -> Any:
         """`of` the chain of every row; the one `vmap` of the kernel."""
-        for e in self.effects:
-            segments = e.across(e.derive(segments))
-        segments = jax.tree.map(jnp.asarray, segments)
+        segments = jax.tree.map(jnp.asarray, self.corrected(segments))
 
         def column(row: Segments) -> Any:
             return of(self._chain(self._sensed(row)), row)
@@ -219,6 +217,36 @@ class Vehicle(eqx.Module):
         sides = [jax.vmap(column)(segments.with_channels(grade_rad=grade + e)) for e in (sd, -sd)]
         return jax.tree.map(lambda a, b: 0.5 * (a + b), *sides)
 
+    # --- a target in three steps: they can be compiled apart ----------------------------------------------------------
+
+    def corrected(self, segments: Segments) -> Segments:
+        """The measurements as they should have been, by the effects that act across rows, with what these derive."""
+        for e in self.effects:
+            segments = e.across(e.derive(segments))
+        return segments
+
+    def column(self, segments: Segments, target: str | Target) -> Float[Array, " row"]:
+        """What each row comes to before an instrument shows it: battery power [W], torque [Nm] or force [N]."""
+        match target_of(target).name:
+            case "energy_wh" | "battery_power_kw":
+                return self._rows(segments, lambda c, _: c.point.power_w)
+            case "motor_torque_nm":
+                held = _in_motion if self.entry == "road" else lambda _, torque: torque
+                return self._rows(segments, lambda c, row: held(row, c.point.torque_nm))
+            case "traction_force_n":
+                return self._rows(segments, lambda c, row: _in_motion(row, c.wheel_n))
+
+    def shown(self, column: Float[Array, " row"], segments: Segments, target: str | Target) -> Float[Array, " row"]:
+        """A `column` as the instrument shows it, in the target's unit."""
+        column = self._observed(column, segments)
+        match target_of(target).name:
+            case "energy_wh":
+                return column * (jnp.asarray(segments.duration_s) / J_PER_WH)
+            case "battery_power_kw":
+                return column / 1000.0
+            case "motor_torque_nm" | "traction_force_n":
+                return column
+
     def _observed(self, column: Array, segments: Segments) -> Array:
         for e in self.effects:
             if e.overrides("observe"):
@@ -227,40 +255,31 @@ class Vehicle(eqx.Module):
 
     # --- what users ask for ------------------------------------------------------------------------------------------
 
+    def predict(self, segments: Segments, target: str | Target) -> Float[Array, " row"]:
+        """The prediction of a target, in the target's unit; `target` is its name (`energy_wh`, …) or a `Target`."""
+        return self.shown(self.column(segments, target), segments, target)
+
     def power(self, segments: Segments) -> Float[Array, " row"]:
         """Mean battery power of each row [W], positive out of the battery."""
-        return self._observed(self._rows(segments, lambda c, _: c.point.power_w), segments)
+        return self._observed(self.column(segments, "battery_power_kw"), segments)
 
     def energy(self, segments: Segments) -> Float[Array, " row"]:
         """Battery energy of each row [Wh]: e of paper 1, equation 5, with all effects of the vehicle."""
-        return self.power(segments) * (jnp.asarray(segments.duration_s) / J_PER_WH)
+        return self.predict(segments, "energy_wh")
 
     def force(self, segments: Segments) -> Float[Array, " row"]:
         """Traction force at the wheels [N]: F_w of paper 1, equation 3; 0 at a standstill, where brakes hold.
 
         Entry must be `road`.
         """
-        return self._observed(self._rows(segments, lambda c, row: _in_motion(row, c.wheel_n)), segments)
+        return self.predict(segments, "traction_force_n")
 
     def torque(self, segments: Segments) -> Float[Array, " row"]:
         """Torque at the motor shaft [Nm] (paper 2, equations 4 and 9); 0 at a standstill where the force is computed.
 
         Entry must be `road` or `wheel`.
         """
-        held = _in_motion if self.entry == "road" else lambda _, torque: torque
-        return self._observed(self._rows(segments, lambda c, row: held(row, c.point.torque_nm)), segments)
-
-    def predict(self, segments: Segments, target: str | Target) -> Float[Array, " row"]:
-        """The prediction of a target, in the target's unit; `target` is its name (`energy_wh`, …) or a `Target`."""
-        match target_of(target).name:
-            case "energy_wh":
-                return self.energy(segments)
-            case "battery_power_kw":
-                return self.power(segments) / 1000.0
-            case "motor_torque_nm":
-                return self.torque(segments)
-            case "traction_force_n":
-                return self.force(segments)
+        return self.predict(segments, "motor_torque_nm")
 
     def breakdown(self, segments: Segments) -> dict[str, Float[Array, " row"]]:
         """Energy of each effect by row [Wh], by effect id. The entries add up to `energy`, but for rounding.

@@ -1,6 +1,6 @@
 """What each candidate would add to every row, without refitting anything, and by which programs it is computed."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -94,7 +94,7 @@ def plan_of(
             left_out[c.id] = why
         else:
             nulls.append(_absent(c, facts))
-    if library and facts.rows <= SHORT_ROWS:
+    if library and not searched and facts.rows <= SHORT_ROWS:
         # nothing is known of the slopes that a user's effect has at its null: it is in no program but its own
         known = [e for e in nulls if type(e) in LIBRARY.values()]
         groups = _shared(vehicle, known, facts, [c for c in library if c in LIBRARY.values()])
@@ -138,15 +138,13 @@ def _separate(vehicle: Vehicle, nulls: Sequence[Effect], effects: Sequence[type[
         group = [e for e in nulls if company.get(e.id) == k]
         groups.append(_Group(Program.of(vehicle, group), group))
     for e in (e for e in nulls if e.acts_across_rows()):
-        for sizes in type(e).variants or (tuple(p.name for p in e.parameters if p.has_column),):
-            only = [_only(e, sizes)]
-            groups.append(_Group(Program.of(vehicle, only), only, sizes))
+        groups += [_Group(Program.of(vehicle, [only]), [only], sizes) for only, sizes in _variants(e)]
     return groups
 
 
 def _shared(vehicle: Vehicle, nulls: Sequence[Effect], facts: Facts, library: Sequence[type[Effect]]) -> list[_Group]:
-    """Programs that vehicles of a search share, whichever effects of one row were found: every effect of the library is
-    in them, those that were not found at their null; those across rows only where one of them is asked for."""
+    """Programs with one kernel that the vehicles of a search share, whichever effects were found: every effect of the
+    library that is part of it is there, those that were not found at their null."""
     found = {c.id: vehicle.effect(c.id) for c in library if vehicle.has(c.id) and not c.searched}
     base = vehicle.minus(*found).plus(*(_with_limits(e, _absent(type(e), facts)) for e in found.values()))
     absent = {e.id: e for e in nulls}
@@ -154,13 +152,25 @@ def _shared(vehicle: Vehicle, nulls: Sequence[Effect], facts: Facts, library: Se
         out = vehicle.has(c.id) or c.searched or unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in)
         if not out and c.id not in absent:
             absent[c.id] = _absent(c, facts)
-    groups: list[_Group] = []
-    if rowwise := [e for e in nulls if not e.acts_across_rows()]:
-        beside = [e for e in absent.values() if not e.acts_across_rows()]
-        groups.append(_Group(Program.of(base, beside, found), rowwise))
-    if across := [e for e in nulls if e.acts_across_rows()]:
-        groups.append(_Group(Program.of(base, absent.values(), found), across))
-    return groups
+    rowwise = {e.id: e for e in absent.values() if not _apart(e)}
+    groups = [_Group(Program.of(base, rowwise.values(), found), [e for e in nulls if e.id in rowwise])]
+    return groups + [
+        _Group(Program.of(base, [*rowwise.values(), only], found), [only], sizes)
+        for e in nulls
+        if e.id not in rowwise
+        for only, sizes in _variants(e)
+    ]
+
+
+def _apart(effect: Effect) -> bool:
+    """Whether it is not part of the kernel, and does not change its program."""
+    return effect.alone("across") or effect.alone("observe")
+
+
+def _variants(effect: Effect) -> Iterator[tuple[Effect, tuple[str, ...]]]:
+    """An effect across rows by the sizes that are tried together: what of it is idle is not cheap."""
+    for sizes in type(effect).variants or (tuple(p.name for p in effect.parameters if p.has_column),):
+        yield _only(effect, sizes), sizes
 
 
 def _absent(effect: type[Effect], facts: Facts) -> Effect:

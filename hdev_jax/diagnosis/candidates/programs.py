@@ -2,8 +2,8 @@
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hdev_jax.inference import insert
-from hdev_jax.physics import Effect, Grouped, Vehicle
+from hdev_jax.physics import Effect, Grouped, Size, Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
@@ -20,17 +20,69 @@ __all__ = ["Program", "Recipe", "computed", "written"]
 Structure = tuple[tuple[str, int | None, float, float], ...]
 
 
+class _Part(NamedTuple):
+    """Some effects of a program's vehicle; `structure` and `at` say which of the program's numbers are theirs."""
+
+    car: Vehicle
+    structure: Structure
+    at: list[int]
+
+
 @dataclass(frozen=True, eq=False)
 class Program:
     """A vehicle with effects at their null, compiled once for one shape of rows.
 
     `structure` says where each of their parameters sits, `null` holds the parameters' null values, and those of found
-    effects as they were fitted.
+    effects as they were fitted. What only corrects measurements across rows, or only changes the predicted column, is
+    compiled apart from the kernel: it is small, and the kernel is the same with and without it.
     """
 
     car: Vehicle
     structure: Structure
     null: Float[np.ndarray, " parameter"]
+
+    def predicted(
+        self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"]
+    ) -> Float[np.ndarray, " row"]:
+        """The prediction at these values, in the target's unit."""
+        before, kernel, after = self.parts
+        seen = _corrected(before.car, before.structure, segments, values[before.at]) if before.car.effects else segments
+        column = _column(kernel.car, kernel.structure, target, seen, values[kernel.at])
+        return np.asarray(_shown(after.car, after.structure, target, segments, column, values[after.at]))
+
+    def slope(
+        self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"],
+        tangent: Float[np.ndarray, " parameter"],
+    ) -> Float[np.ndarray, " row"]:  # fmt: skip
+        """The derivative of the prediction at these values along `tangent`."""
+        before, kernel, after = self.parts
+        seen = _corrected(before.car, before.structure, segments, values[before.at]) if before.car.effects else segments
+        at, along = values[kernel.at], tangent[kernel.at]
+        column, slope = _column_slope(kernel.car, kernel.structure, target, seen, at, along)
+        at, along = values[after.at], tangent[after.at]
+        return np.asarray(_shown_slope(after.car, after.structure, target, segments, column, at, slope, along))
+
+    @cached_property
+    def parts(self) -> tuple[_Part, _Part, _Part]:
+        """What corrects the measurements across rows, the kernel, what changes the predicted column."""
+        car, every = self.car, self.car.effects
+        # one after the other: where one of a kind does more, all of that kind stay in the kernel
+        across, observing = ([e for e in every if e.overrides(hook)] for hook in ("across", "observe"))
+        if not all(e.alone("across") and not any(isinstance(p, Size) for p in e.parameters) for e in across):
+            across = []
+        if not all(e.alone("observe") for e in observing):
+            observing = []
+        outside = [e.id for e in (*across, *observing)]
+        kernel = self._part(car.minus(*outside), [e.id for e in every if e.id not in outside])
+        bare = car.minus(*(e.id for e in every))
+        return (
+            self._part(bare.plus(*across), [e.id for e in across]), kernel,
+            self._part(bare.plus(*observing), [e.id for e in observing]),
+        )  # fmt: skip
+
+    def _part(self, car: Vehicle, ids: Sequence[str]) -> _Part:
+        at = [k for k, s in enumerate(self.structure) if s[0].split(".")[1] in ids]
+        return _Part(car, tuple(self.structure[k] for k in at), at)
 
     @staticmethod
     def of(vehicle: Vehicle, effects: Iterable[Effect], found: Collection[str] = ()) -> "Program":
@@ -87,11 +139,11 @@ def computed(recipes: Sequence[Recipe], segments: Segments, target: TargetName) 
     for r in recipes:
         p = r.program
         if r.tangent is not None:
-            yield np.asarray(_slope(p.car, p.structure, target, segments, r.values, r.tangent))
+            yield p.slope(segments, target, r.values, r.tangent)
         else:
             if id(p) not in base:
-                base[id(p)] = np.asarray(_predict(p.car, p.structure, target, segments, p.null))
-            yield np.asarray(_predict(p.car, p.structure, target, segments, r.values)) - base[id(p)]
+                base[id(p)] = p.predicted(segments, target, p.null)
+            yield p.predicted(segments, target, r.values) - base[id(p)]
 
 
 def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: TargetName) -> None:
@@ -101,16 +153,39 @@ def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, targ
 
 
 # not `eqx.filter_jit`: every leaf is an array, and sorting them out takes longer than the column of a short log
-@partial(jax.jit, static_argnums=(1, 2))
-def _predict(car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any) -> Array:
-    return insert(car, structure, jnp.asarray(values)).predict(segments, target)
+@partial(jax.jit, static_argnums=1)
+def _corrected(car: Vehicle, structure: Structure, segments: Segments, values: Any) -> Segments:
+    return insert(car, structure, jnp.asarray(values)).corrected(segments)
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _slope(
+def _column(car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any) -> Array:
+    return insert(car, structure, jnp.asarray(values)).column(segments, target)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _column_slope(
     car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any, tangent: Any
-) -> Array:
-    def predict(x: Array) -> Array:
-        return insert(car, structure, x).predict(segments, target)
+) -> tuple[Array, Array]:
+    def column(x: Array) -> Array:
+        return insert(car, structure, x).column(segments, target)
 
-    return jax.jvp(predict, (jnp.asarray(values),), (jnp.asarray(tangent),))[1]
+    return jax.jvp(column, (jnp.asarray(values),), (jnp.asarray(tangent),))
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _shown(
+    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any
+) -> Array:
+    return insert(car, structure, jnp.asarray(values)).shown(column, segments, target)
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _shown_slope(
+    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any,
+    slope: Array, tangent: Any,
+) -> Array:  # fmt: skip
+    def shown(y: Array, x: Array) -> Array:
+        return insert(car, structure, x).shown(y, segments, target)
+
+    return jax.jvp(shown, (column, jnp.asarray(values)), (slope, jnp.asarray(tangent)))[1]
