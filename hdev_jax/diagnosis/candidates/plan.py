@@ -83,7 +83,7 @@ def plan_of(
     """Every candidate that a log of these facts allows beside what the vehicle has.
 
     `grids` replaces the grids of parameters by name; `searched` takes effects with a search of their own too. With the
-    `library` of a search, its vehicles share programs, whichever effects of one row were found.
+    `library` of a search, its vehicles share the kernel's program, whichever effects were found.
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []

@@ -27,6 +27,10 @@ class _Part(NamedTuple):
     structure: Structure
     at: list[int]
 
+    def corrected(self, segments: Segments, values: Float[np.ndarray, " parameter"]) -> Segments:
+        """The measurements as these effects correct them; as they are where there are none."""
+        return _corrected(self.car, self.structure, segments, values[self.at]) if self.car.effects else segments
+
 
 @dataclass(frozen=True, eq=False)
 class Program:
@@ -46,7 +50,7 @@ class Program:
     ) -> Float[np.ndarray, " row"]:
         """The prediction at these values, in the target's unit."""
         before, kernel, after = self.parts
-        seen = _corrected(before.car, before.structure, segments, values[before.at]) if before.car.effects else segments
+        seen = before.corrected(segments, values)
         column = _column(kernel.car, kernel.structure, target, seen, values[kernel.at])
         return np.asarray(_shown(after.car, after.structure, target, segments, column, values[after.at]))
 
@@ -56,7 +60,7 @@ class Program:
     ) -> Float[np.ndarray, " row"]:  # fmt: skip
         """The derivative of the prediction at these values along `tangent`."""
         before, kernel, after = self.parts
-        seen = _corrected(before.car, before.structure, segments, values[before.at]) if before.car.effects else segments
+        seen = before.corrected(segments, values)
         at, along = values[kernel.at], tangent[kernel.at]
         column, slope = _column_slope(kernel.car, kernel.structure, target, seen, at, along)
         at, along = values[after.at], tangent[after.at]
