@@ -298,7 +298,9 @@ def _spelt(unit: str, kind: dict[str, str]) -> str:
     spelt = _ALIASES.get(spelt, spelt).replace("°C", "degree_Celsius")
     if spelt == "%":
         return "percent"
-    return spelt if spelt == "permille" or _parses(spelt) or not _parses(spelt.lower()) else spelt.lower()
+    if spelt == "permille" or spelt in kind.values():  # not asked of pint, whose registry takes a second to load
+        return spelt
+    return spelt if _parses(spelt) or not _parses(spelt.lower()) else spelt.lower()
 
 
 @cache

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, jacobian, tabular
 from hdev_jax.inference.clusters import LEAST_RATIO, Clusters, clusters_of
@@ -48,8 +48,10 @@ class Spread:
         self, level: float, open_sd: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
     ) -> Float[np.ndarray, " row"]:
         """Half the interval of each row, of which the coefficients leave `open_sd` open."""
-        own = float(stats.t.ppf(0.5 + level / 2, self.freedom)) * np.sqrt(_square(self.scale, self.growth, predicted))
-        return np.hypot(float(stats.norm.ppf(0.5 + level / 2)) * np.sqrt(self.open_times) * open_sd, own)
+        own = float(special.stdtrit(self.freedom, 0.5 + level / 2)) * np.sqrt(
+            _square(self.scale, self.growth, predicted)
+        )
+        return np.hypot(float(special.ndtri(0.5 + level / 2)) * np.sqrt(self.open_times) * open_sd, own)
 
     def total(
         self, level: float, open_sd: float, weight: Float[np.ndarray, " row"], predicted: Float[np.ndarray, " row"]
@@ -57,7 +59,7 @@ class Spread:
         """Half the interval of the weighed sum of these rows, of which the coefficients leave `open_sd` open."""
         each = weight * np.sqrt(_square(self.scale, self.growth, predicted))
         own = self.together * float(np.sum(each**2)) + (self.level * float(np.sum(each))) ** 2
-        return float(stats.t.ppf(0.5 + level / 2, self.total_freedom) * np.sqrt(self.open_times * open_sd**2 + own))
+        return float(special.stdtrit(self.total_freedom, 0.5 + level / 2) * np.sqrt(self.open_times * open_sd**2 + own))
 
 
 def _square(scale: float, growth: float, predicted: Float[np.ndarray, " row"]) -> Float[np.ndarray, " row"]:

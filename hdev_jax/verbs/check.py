@@ -38,13 +38,14 @@ def check(
     energy = log.target("energy_wh") if has_energy else None
     wide = max(4, *(len(name) for name in log.trip_names))
     lines += ["", f"{'trip':{wide}s} {'rows':>7s} {'min':>7s} {'km':>8s} {'kWh':>9s} {'kWh/km':>8s}"]
+    rows, km, minutes, kwh = (
+        np.bincount(s.trip, x, minlength=len(log.trip_names))
+        for x in (None, s.distance_m / 1e3, s.duration_s / 60, None if energy is None else energy / 1e3)
+    )
     for i, name in enumerate(log.trip_names):
-        m = s.trip == i
-        km, minutes = float(np.sum(s.distance_m[m])) / 1e3, float(np.sum(s.duration_s[m])) / 60
-        kwh = float(np.sum(energy[m])) / 1e3 if energy is not None else float("nan")
-        per = f"{kwh / km:8.3f}" if km > 0.05 and energy is not None else f"{'-':>8s}"
-        total = f"{kwh:9.3f}" if energy is not None else f"{'-':>9s}"
-        lines.append(f"{name:{wide}s} {int(m.sum()):7d} {minutes:7.1f} {km:8.2f} {total} {per}")
+        per = f"{kwh[i] / km[i]:8.3f}" if km[i] > 0.05 and has_energy else f"{'-':>8s}"
+        total = f"{kwh[i]:9.3f}" if has_energy else f"{'-':>9s}"
+        lines.append(f"{name:{wide}s} {rows[i]:7d} {minutes[i]:7.1f} {km[i]:8.2f} {total} {per}")
     if log.instruments:
         lines += ["", "instruments", *(f"  {i.line()}" for i in log.instruments)]
     lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]

@@ -25,7 +25,7 @@ from hdev_jax.inference import padded
 from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet, sheet_of_sections
 from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.physics import LIBRARY, Effect, Parameter, at_null, library
-from hdev_jax.physics.effect import STAGES
+from hdev_jax.physics.effect import HOOKS, STAGES
 from hdev_jax.physics.library import DECLARED
 from hdev_jax.problem import Problem, Split, prepare, split_trips, without_harmful_slope
 from hdev_jax.rundir import Run
@@ -41,7 +41,6 @@ Logs = Any  # a path or several, a `Log`, or a table in memory (pandas, polars, 
 # a sheet's path, a sheet, its sections as a mapping, or a result with a fitted one
 Vehicles = str | Path | Sheet | Mapping[str, Any] | Result
 Effects = str | Path | Sequence[type[Effect]] | None  # a Python file of a user's own effects, or their classes
-HOOKS = ("derive", "across", "sense", "force", "drive", "power", "observe")
 ROUNDING = 1e4  # units in the last place of the largest prediction, for two that count as equal
 
 
@@ -128,7 +127,7 @@ def _malformed(effect: type[Effect]) -> str | None:
         return f"entries is {effect.entries!r}; some of {', '.join(Effect.entries)} are expected"
     if effect.searched:
         return f"searched is {effect.searched!r}; only effects of the library have a search of their own"
-    if not any(getattr(effect, hook) is not getattr(Effect, hook) for hook in HOOKS):
+    if not any(effect.overrides(hook) for hook in HOOKS):
         return f"it overrides none of {', '.join(HOOKS)}, so it does nothing"
     if not (isinstance(parameters, tuple | list) and all(isinstance(p, Parameter) for p in parameters)):
         return "parameters is something else than a tuple of Size, Switch, Shape and Choice (hdev_jax.physics)"

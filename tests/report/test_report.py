@@ -11,12 +11,14 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from hdev_jax import report
 from hdev_jax.problem import metrics as errors
-from hdev_jax.report import ReportData, answer, statistics, words, write_calibration_report, write_report
 from hdev_jax.report import data as report_data
 from hdev_jax.report import names as shown
+from hdev_jax.report import page, statistics, words
+from hdev_jax.report.data import ReportData
+from hdev_jax.report.page import write_calibration_report, write_report
 from hdev_jax.report.residuals import panels
+from hdev_jax.report.words import answer
 
 VERDICTS = ("effects_found", "nothing_missing", "unexplained_structure", "effects_found_and_unexplained_structure")
 VOID = {"meta", "img", "br", "link", "hr", "input"}
@@ -542,7 +544,7 @@ def test_the_report_of_a_large_log_is_no_larger_than_its_figures(tmp_path):
     assert bytes_of(12_000) < 1.5 * bytes_of(1_200)
 
 
-@pytest.mark.parametrize("path", sorted(Path(report.__file__).parent.glob("*.py")), ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", sorted(Path(page.__file__).parent.glob("*.py")), ids=lambda p: p.stem)
 def test_plotting_is_loaded_on_first_use_and_pyplot_never(path):
     source = path.read_text(encoding="utf-8")
     assert "pyplot" not in source.replace("without pyplot", "")

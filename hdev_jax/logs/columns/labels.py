@@ -67,8 +67,8 @@ def within_vehicles(
     trips anew, so that most names belong to several vehicles.
     """
     good = (trip >= 0) & (vehicle >= 0)
-    pairs = np.unique(np.c_[trip, vehicle][good], axis=0)
-    shared = np.bincount(pairs[:, 0], minlength=len(names)) > 1 if len(pairs) else np.zeros(len(names), bool)
+    pairs = pd.unique(trip[good] * len(vehicles) + vehicle[good])  # hashed: a log has millions of rows, few pairs
+    shared = np.bincount(pairs // max(len(vehicles), 1), minlength=len(names)) > 1
     if len(names) < 2 or shared.mean() <= 0.5:
         return trip, names, False
     codes, both = _pairs(vehicle, vehicles, trip, names)

@@ -88,10 +88,9 @@ def read_text(path: Path, data: bytes, adapter: Adapter) -> Text:
 def _records(text: str, lines: list[str], layout: Layout) -> _Records:
     """Every record under the header that is not blank."""
     separator = layout.separator
-    start, fields, empty = [], [], []
     if '"' in text:  # a quoted field may hold separators and line breaks
+        start, end, fields, empty, last = [], [], [], [], 0
         reader = csv.reader((line + "\n" for line in lines[layout.first :]), delimiter=separator)
-        end, last = [], 0
         for row in reader:
             if row and (len(row) > 1 or row[0].strip()):
                 start.append(layout.first + last + 1)
@@ -99,18 +98,28 @@ def _records(text: str, lines: list[str], layout: Layout) -> _Records:
                 fields.append(len(row))
                 empty.append(not row[-1].strip())
             last = reader.line_num
-        ends = np.array(end, np.int64)
+        starts, ends = np.array(start, np.int64), np.array(end, np.int64)
+        counts, blank = np.array(fields, np.int64), np.array(empty, bool)
     else:
-        for k, line in enumerate(lines[layout.first :], layout.first + 1):
-            if line := line.rstrip("\r "):
-                start.append(k)
-                fields.append(line.count(separator) + 1)
-                empty.append(line.endswith(separator))
-        ends = np.array(start, np.int64)
-    starts = np.array(start, np.int64)
-    return _Records(
-        starts, ends, np.array(fields, np.int64), np.array(empty, bool), _odd(text, lines, starts, ends, layout)
-    )
+        starts, counts, blank = _plain_records(text, separator, layout.first)
+        ends = starts
+    return _Records(starts, ends, counts, blank, _odd(text, lines, starts, ends, layout))
+
+
+def _plain_records(text: str, separator: str, first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Line, number of fields and whether the last is empty, of each line after `first` that is not blank: counted in
+    bytes, all lines at once, since each is one record where nothing is quoted."""
+    data = np.frombuffer(text.encode() + b"\n", np.uint8)
+    breaks = np.flatnonzero(data == ord("\n"))
+    begin = np.r_[0, breaks[:-1] + 1]
+    end = breaks.copy()
+    while (more := np.flatnonzero((end > begin) & np.isin(data[end - 1], [ord("\r"), ord(" ")]))).size:
+        end[more] -= 1
+    found = np.flatnonzero(data == ord(separator))
+    counts = np.searchsorted(found, end) - np.searchsorted(found, begin) + 1
+    keep = np.flatnonzero(end > begin)
+    keep = keep[keep >= first]
+    return keep + 1, counts[keep], data[end[keep] - 1] == ord(separator)
 
 
 def _odd(text: str, lines: list[str], start: np.ndarray, end: np.ndarray, layout: Layout) -> np.ndarray:
