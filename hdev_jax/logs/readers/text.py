@@ -110,13 +110,13 @@ def _plain_records(text: str, separator: str, first: int) -> tuple[np.ndarray, n
     """Line, number of fields and whether the last is empty, of each line after `first` that is not blank: counted in
     bytes, all lines at once, since each is one record where nothing is quoted."""
     data = np.frombuffer(text.encode() + b"\n", np.uint8)
-    breaks = np.flatnonzero(data == ord("\n"))
-    begin = np.r_[0, breaks[:-1] + 1]
-    end = breaks.copy()
+    ends = np.flatnonzero((data == ord("\n")) | (data == ord(separator)))  # of fields
+    last = np.flatnonzero(data[ends] == ord("\n"))
+    counts = np.diff(last, prepend=-1)
+    end = ends[last]
+    begin = np.r_[0, end[:-1] + 1]
     while (more := np.flatnonzero((end > begin) & np.isin(data[end - 1], [ord("\r"), ord(" ")]))).size:
         end[more] -= 1
-    found = np.flatnonzero(data == ord(separator))
-    counts = np.searchsorted(found, end) - np.searchsorted(found, begin) + 1
     keep = np.flatnonzero(end > begin)
     keep = keep[keep >= first]
     return keep + 1, counts[keep], data[end[keep] - 1] == ord(separator)
