@@ -11,6 +11,7 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import Grids
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.plan import Plan, plan_of
+from hdev_jax.diagnosis.candidates.shared import SharedKernel
 from hdev_jax.diagnosis.noise.noise import Noise, estimate_noise
 from hdev_jax.diagnosis.scores.passes import Baseline
 from hdev_jax.diagnosis.settings import SETTINGS, Settings
@@ -75,13 +76,19 @@ class Training:
         self, vehicle: Vehicle, effects: Sequence[type[Effect]], grids: Grids | None = None, *, searched: bool = False
     ) -> Plan:
         """The candidates among `effects` beside the vehicle, by the programs that all vehicles of this search share."""
-        facts = replace(self.facts, gears=self.gears)  # as found effects have them, so that programs are the same
-        library = self.library.values()
-        return plan_of(vehicle, effects, facts, self.target, grids, searched=searched, library=library)
+        facts, kernel = self.kernel.facts, self.kernel
+        return plan_of(vehicle, effects, facts, self.target, grids, searched=searched, kernel=kernel)
+
+    @cached_property
+    def kernel(self) -> SharedKernel:
+        """What all vehicles of this search are computed by; gears as found effects have them."""
+        return SharedKernel(self.library, replace(self.facts, gears=self.gears))
 
     def calibrate(self, vehicle: Vehicle, table: ParameterTable) -> Calibration:
         """The vehicle fitted to these rows by least squares."""
-        return calibrate_rows(vehicle, table, self.rows, self.target, self.clusters, chunks=self.chunks)
+        return calibrate_rows(
+            vehicle, table, self.rows, self.target, self.clusters, chunks=self.chunks, linearise=self.kernel.linearised
+        )
 
     def residual(self, fit: Calibration) -> Float[np.ndarray, " row"]:
         """Measured − predicted, in the target's unit."""
@@ -98,7 +105,8 @@ class Training:
     def baseline(self, fit: Calibration, noise: Noise | None = None) -> Baseline:
         """What candidates are scored against: this fit with its noise, or with `noise`."""
         found = self.noise(fit) if noise is None else noise
-        return Baseline(lambda: self.chunks, self.clusters, len(self.slices), fit, self.target, found)
+        linearise = self.kernel.linearised
+        return Baseline(lambda: self.chunks, self.clusters, len(self.slices), fit, self.target, found, linearise)
 
     def with_channel(self, name: str, column: Float[np.ndarray, " row"]) -> "Training":
         """The same rows with one channel more; 0 where they are padded."""

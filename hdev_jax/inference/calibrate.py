@@ -4,7 +4,7 @@ The Jacobian and the prediction of a chunk of rows are one compiled program; the
 which add up over chunks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from hdev_jax.segments import Segments, trip_slices
 from hdev_jax.targets import TargetName
 
 __all__ = [
-    "STUDENT_DF", "WEAK", "Calibration", "Fit", "calibrate", "inside", "jacobian", "linearised", "padded",
+    "STUDENT_DF", "WEAK", "Calibration", "Fit", "Linearise", "calibrate", "inside", "jacobian", "linearised", "padded",
     "padded_rows", "predict", "tabular",
 ]  # fmt: skip
 
@@ -121,6 +121,9 @@ def linearised(
     return np.asarray(value), out
 
 
+Linearise = Callable[..., tuple[np.ndarray, np.ndarray]]  # `linearised`, or what takes and gives the same
+
+
 def jacobian(
     vehicle: Vehicle, table: ParameterTable, segments: Segments, target: TargetName
 ) -> Float[np.ndarray, "row free"]:
@@ -153,13 +156,14 @@ class _Problem:
     prior: Float[np.ndarray, " free"]
     prior_sd: Float[np.ndarray, " free"]
     scale: Float[np.ndarray, " free"]
+    linearise: Linearise
 
     def at(self, theta: Float[np.ndarray, " free"]) -> _Point:
         """The rows linearised at these coefficients."""
         predicted = np.empty(len(self.measured))
         slopes = np.empty((len(self.measured), len(theta)))
         for chunk in self.chunks:
-            value, slope = linearised(self.vehicle, self.table, chunk.segments, self.target, theta)
+            value, slope = self.linearise(self.vehicle, self.table, chunk.segments, self.target, theta)
             predicted[chunk.at], slopes[chunk.at] = value[: chunk.rows], slope[: chunk.rows]
         return _Point(theta, predicted, slopes)
 
@@ -224,6 +228,7 @@ def calibrate(
     noise: Literal["normal", "student_t"] = "normal",
     weights: Float[np.ndarray, " row"] | None = None,
     chunks: Sequence[Chunk] | None = None,
+    linearise: Linearise = linearised,
 ) -> Calibration:
     """Maximum a posteriori values of the table's free coefficients.
 
@@ -233,7 +238,8 @@ def calibrate(
 
     **Arguments:** `fit` from `padded`; `clusters` of its real rows; `noise`: "student_t" reweights rows by a
     t-distribution with 4 degrees of freedom, for logs with outliers; `weights` (real rows) multiply residuals;
-    `chunks`, the rows of `fit` in chunks, where they have been made already.
+    `chunks`, the rows of `fit` in chunks, where they have been made already; `linearise`, what gives predictions and
+    Jacobians.
 
     **Returns:** a `Calibration`, whose `converged` and `message` its caller reads. Coefficients that are not free are
     kept.
@@ -251,7 +257,7 @@ def calibrate(
     else:
         prior = prior_sd = np.zeros(0)
     scale = np.array([c.scale for c in free])
-    problem = _Problem(vehicle, table, chunks, target, measured, prior, prior_sd, scale)
+    problem = _Problem(vehicle, table, chunks, target, measured, prior, prior_sd, scale, linearise)
     point = problem.at(theta)
     sigma = float(np.sqrt(np.mean((base * (measured - point.predicted)) ** 2)))
     if not free:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hdev_jax.physics import DECLARED, LIBRARY, Effect, Grouped, Shape, Size, Vehicle
 
-__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "insert", "insert_by", "leaf_of"]
+__all__ = ["Coefficient", "ParameterTable", "effect_coefficients", "in_effect", "insert", "insert_by", "leaf_of"]
 
 # path in the sheet → (effect that holds it, its field)
 _DECLARED = {path: (c.id, field) for c in (*DECLARED, *LIBRARY.values()) for field, path in c.declared.items()}
@@ -55,16 +55,18 @@ def leaf_of(vehicle: Vehicle, path: str) -> Any:
     """The leaf at a path. Raises `KeyError` for a path that the vehicle does not have."""
     if path == "mass_kg":
         return vehicle.mass_kg
-    if path in _DECLARED:
-        effect_id, field = _DECLARED[path]
-        return getattr(vehicle.effect(effect_id), field)
-    head, _, rest = path.partition(".")
+    head, _, rest = in_effect(path).partition(".")
     if head in ("driveline", "machine"):
         return getattr(getattr(vehicle, head), rest)
     if head == "effects":
         effect_id, _, field = rest.partition(".")
         return getattr(vehicle.effect(effect_id), field)
     raise KeyError(path)
+
+
+def in_effect(path: str) -> str:
+    """The path by way of the effect that holds the coefficient: `effects.rolling.c_rr` of `road.c_rr`."""
+    return f"effects.{'.'.join(_DECLARED[path])}" if path in _DECLARED else path
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,11 @@ from planted import opened
 from hdev_jax.diagnosis.candidates.candidate import Candidate, finer, realised
 from hdev_jax.diagnosis.candidates.facts import facts_of
 from hdev_jax.diagnosis.candidates.plan import columns, plan_of
+from hdev_jax.diagnosis.candidates.shared import SharedKernel
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
 from hdev_jax.diagnosis.settings import SETTINGS
-from hdev_jax.inference import padded
+from hdev_jax.inference import ParameterTable, effect_coefficients, linearised, padded
 from hdev_jax.physics import LIBRARY, Effect, Grouped, Shape, Size, Vehicle, at_null
 from hdev_jax.problem import Problem
 
@@ -112,11 +113,11 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
         with_values(LIBRARY["gear_efficiency"], facts.gears, delta=(1, -0.01)),
     ]
     lag = LIBRARY["sampling_filter"](tap_1=np.asarray(0.1), tap_2=np.asarray(0.0), tau_s=None)
-    programs = []
+    programs, kernel = [], SharedKernel({c.id: c for c in effects}, facts)
     for has in (found[:1], found, [*found, lag]):
         vehicle = problem.vehicle.plus(*has)
         apart = plan_of(vehicle, effects, facts, problem.target)
-        shared = plan_of(vehicle, effects, facts, problem.target, library=effects)
+        shared = plan_of(vehicle, effects, facts, problem.target, kernel=kernel)
         assert shared.left_out == apart.left_out
         a, b = (np.zeros((len(rows.segments), p.width)) for p in (apart, shared))
         apart.write(a, rows.segments)
@@ -131,6 +132,32 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
         programs.append({(p.structure, jax.tree.structure(p.car)) for p in kernels})
     assert programs[0] == programs[1] == programs[2]
     assert len(programs[0]) == 1
+
+
+def test_the_shared_kernel_gives_the_same_jacobian(problem, rows):
+    """Beside effects of one row, across rows (a delay of the readings) and of the instrument, with every coefficient
+    free; whatever was found, the kernel is compiled once."""
+    facts = facts_of(rows.segments, rows.rows)
+    found = [
+        with_values(LIBRARY["auxiliary_power"], facts.gears, power_w=900.0),
+        with_values(LIBRARY["hvac_power"], facts.gears, above_w_per_k=60.0, cool_c=20.0),
+        with_values(LIBRARY["time_skew"], facts.gears, skew_s=0.7),
+        with_values(LIBRARY["power_gain"], facts.gears, gain=0.02),
+    ]
+    effects = ["auxiliary_power", "hvac_power", "time_skew", "power_gain", "cornering", "headwind"]
+    kernel, programs = SharedKernel({k: LIBRARY[k] for k in effects}, facts), set()
+    for has in (found[:1], found[:3], found):
+        vehicle = problem.vehicle.plus(*has)
+        own = [c for e in has for c in effect_coefficients(e, [p.name for p in e.parameters if p.has_column])]
+        table = ParameterTable((*problem.table.rows, *own))
+        theta = table.values(vehicle) * 1.01
+        expected = linearised(vehicle, table, rows.segments, problem.target, theta)
+        got = kernel.linearised(vehicle, table, rows.segments, problem.target, theta)
+        for a, b in zip(got, expected, strict=True):
+            assert np.all(np.abs(a - b) <= 1e-9 * np.max(np.abs(b), axis=0))
+        part = kernel._of_table(vehicle, table)[0].parts[1]
+        programs.add((part.structure, jax.tree.structure(part.car)))
+    assert len(programs) == 1
 
 
 class Fading(Effect):
@@ -166,9 +193,12 @@ class RootOfSpeed(Effect):
 def test_an_effect_of_a_user_does_no_harm_to_other_columns(problem, rows):
     facts = facts_of(rows.segments, rows.rows)
     effects = [LIBRARY[k] for k in ("speed_scale", "auxiliary_power", "tyre_warmup")]
-    alone = plan_of(problem.vehicle, effects, facts, problem.target, library=effects)
+    kernel = SharedKernel({c.id: c for c in effects}, facts)
+    alone = plan_of(problem.vehicle, effects, facts, problem.target, kernel=kernel)
     every = [Fading, *effects, RootOfSpeed]
-    beside = plan_of(problem.vehicle, every, facts, problem.target, library=every)
+    beside = plan_of(
+        problem.vehicle, every, facts, problem.target, kernel=SharedKernel({c.id: c for c in every}, facts)
+    )
     a, b = (np.zeros((len(rows.segments), p.width)) for p in (alone, beside))
     alone.write(a, rows.segments)
     beside.write(b, rows.segments)

@@ -1,25 +1,23 @@
 """What each candidate would add to every row, without refitting anything, and by which programs it is computed."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
-from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, as_seen, own_shapes, ways_of
+from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, own_shapes, ways_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
-from hdev_jax.physics import LIBRARY, Effect, Switch, Vehicle, at_null, unavailable
+from hdev_jax.diagnosis.candidates.shared import SHORT_ROWS, SharedKernel, absent
+from hdev_jax.physics import LIBRARY, Effect, Switch, Vehicle, unavailable
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
 __all__ = ["Column", "Plan", "Source", "columns", "plan_of"]
 
 TOGETHER = 6  # effects in one program of a long log: more of them run slower, fewer take longer to compile
-# Of a log of 14,000 rows a column takes 5 ms with every effect and 1.5 ms with six, so all of them 1.5 s and 0.4 s; to
-# trace and compile those of a step anew takes 5 to 20 s. Twice or half of it changes the time alone.
-SHORT_ROWS = 65_536
 
 
 @dataclass(frozen=True)
@@ -78,12 +76,12 @@ class Plan:
 
 def plan_of(
     vehicle: Vehicle, effects: Sequence[type[Effect]], facts: Facts, target: TargetName, grids: Grids | None = None,
-    *, searched: bool = False, library: Collection[type[Effect]] = (),
+    *, searched: bool = False, kernel: SharedKernel | None = None,
 ) -> Plan:  # fmt: skip
     """Every candidate that a log of these facts allows beside what the vehicle has.
 
     `grids` replaces the grids of parameters by name; `searched` takes effects with a search of their own too. With the
-    `library` of a search, its vehicles share the kernel's program, whichever effects were found.
+    `kernel` of a search, its vehicles share the programs, whichever effects were found.
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []
@@ -93,11 +91,11 @@ def plan_of(
         if why := unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in):
             left_out[c.id] = why
         else:
-            nulls.append(_absent(c, facts))
-    if library and not searched and facts.rows <= SHORT_ROWS:
+            nulls.append(absent(c, facts))
+    if kernel is not None and not searched and facts.rows <= SHORT_ROWS:
         # nothing is known of the slopes that a user's effect has at its null: it is in no program but its own
         known = [e for e in nulls if type(e) in LIBRARY.values()]
-        groups = _shared(vehicle, known, facts, [c for c in library if c in LIBRARY.values()])
+        groups = _shared(vehicle, known, kernel)
         groups += [g for e in nulls if e not in known for g in _separate(vehicle, [e], [type(e)])]
     else:
         groups = _separate(vehicle, nulls, effects)
@@ -142,45 +140,22 @@ def _separate(vehicle: Vehicle, nulls: Sequence[Effect], effects: Sequence[type[
     return groups
 
 
-def _shared(vehicle: Vehicle, nulls: Sequence[Effect], facts: Facts, library: Sequence[type[Effect]]) -> list[_Group]:
-    """Programs with one kernel that the vehicles of a search share, whichever effects were found: every effect of the
-    library that is part of it is there, those that were not found at their null."""
-    found = {c.id: vehicle.effect(c.id) for c in library if vehicle.has(c.id) and not c.searched}
-    base = vehicle.minus(*found).plus(*(_with_limits(e, _absent(type(e), facts)) for e in found.values()))
-    absent = {e.id: e for e in nulls}
-    for c in library:
-        out = vehicle.has(c.id) or c.searched or unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in)
-        if not out and c.id not in absent:
-            absent[c.id] = _absent(c, facts)
-    rowwise = {e.id: e for e in absent.values() if not _apart(e)}
-    groups = [_Group(Program.of(base, rowwise.values(), found), [e for e in nulls if e.id in rowwise])]
+def _shared(vehicle: Vehicle, nulls: Sequence[Effect], kernel: SharedKernel) -> list[_Group]:
+    """Programs with one kernel, whichever effects were found: those of one row in one, others each in its own."""
+    rowwise = [e for e in nulls if not (e.alone("across") or e.alone("observe"))]
+    groups = [_Group(kernel.program(vehicle, *rowwise), rowwise)]
     return groups + [
-        _Group(Program.of(base, [*rowwise.values(), only], found), [only], sizes)
+        _Group(kernel.program(vehicle, only), [only], sizes)
         for e in nulls
-        if e.id not in rowwise
+        if e not in rowwise
         for only, sizes in _variants(e)
     ]
-
-
-def _apart(effect: Effect) -> bool:
-    """Whether it is not part of the kernel, and does not change its program."""
-    return effect.alone("across") or effect.alone("observe")
 
 
 def _variants(effect: Effect) -> Iterator[tuple[Effect, tuple[str, ...]]]:
     """An effect across rows by the sizes that are tried together: what of it is idle is not cheap."""
     for sizes in type(effect).variants or (tuple(p.name for p in effect.parameters if p.has_column),):
         yield _only(effect, sizes), sizes
-
-
-def _absent(effect: type[Effect], facts: Facts) -> Effect:
-    return as_seen(at_null(effect, gears=facts.gears), facts)
-
-
-def _with_limits(effect: Effect, absent: Effect) -> Effect:
-    """The effect with the limits that it was found without at their null."""
-    fields = {p.name: getattr(effect, p.name) for p in effect.parameters}
-    return type(effect)(**{k: getattr(absent, k) if v is None else v for k, v in fields.items()})
 
 
 def columns(

@@ -5,19 +5,22 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hdev_jax.inference import insert
+from hdev_jax.inference.parameters import insert, leaf_of
 from hdev_jax.physics import Effect, Grouped, Size, Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
-__all__ = ["Program", "Recipe", "computed", "written"]
+__all__ = ["Place", "Program", "Recipe", "computed", "written"]
 
+Place = tuple[str, int | None]  # a coefficient's path, and its group
 Structure = tuple[tuple[str, int | None, float, float], ...]
+SIDE_BY_SIDE = 8  # derivatives are computed in multiples of so many, so that few programs are compiled
 
 
 class _Part(NamedTuple):
@@ -37,8 +40,8 @@ class Program:
     """A vehicle with effects at their null, compiled once for one shape of rows.
 
     `structure` says where each of their parameters sits, `null` holds the parameters' null values, and those of found
-    effects as they were fitted. What only corrects measurements across rows, or only changes the predicted column, is
-    compiled apart from the kernel: it is small, and the kernel is the same with and without it.
+    effects and of the declared model as they were fitted. What only corrects measurements across rows, or only changes
+    the predicted column, is compiled apart from the kernel: it is small, and the kernel is the same with and without.
     """
 
     car: Vehicle
@@ -66,6 +69,30 @@ class Program:
         at, along = values[after.at], tangent[after.at]
         return np.asarray(_shown_slope(after.car, after.structure, target, segments, column, at, slope, along))
 
+    def linearised(
+        self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"], free: Sequence[int]
+    ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]:
+        """The prediction at these values, and its derivatives in the parameters `free`, all side by side."""
+        before, kernel, after = self.parts
+        seen = before.corrected(segments, values)
+        at = values[kernel.at]
+        inner = [k for k, i in enumerate(free) if i in kernel.at]
+        column, inside = _column_slopes(
+            kernel.car, kernel.structure, target, seen, at, _directions([kernel.at.index(free[k]) for k in inner], at)
+        )
+        slopes = np.zeros((len(column), _even(len(free))))
+        slopes[:, inner] = np.asarray(inside)[:, : len(inner)]
+        for k in (k for k, i in enumerate(free) if i in before.at):
+            (one,) = np.eye(len(before.at))[[before.at.index(free[k])]]
+            moved = _corrected_slope(before.car, before.structure, segments, values[before.at], one)
+            slopes[:, k] = _column_moved(kernel.car, kernel.structure, target, seen, at, moved)
+        along = np.zeros((slopes.shape[1], len(after.at)))
+        for k in (k for k, i in enumerate(free) if i in after.at):
+            along[k, after.at.index(free[k])] = 1.0
+        at = values[after.at]
+        shown, slopes = _shown_slopes(after.car, after.structure, target, segments, column, at, slopes, along)
+        return np.asarray(shown), np.asarray(slopes)[:, : len(free)]
+
     @cached_property
     def parts(self) -> tuple[_Part, _Part, _Part]:
         """What corrects the measurements across rows, the kernel, what changes the predicted column."""
@@ -77,23 +104,28 @@ class Program:
         if not all(e.alone("observe") for e in observing):
             observing = []
         outside = [e.id for e in (*across, *observing)]
-        kernel = self._part(car.minus(*outside), [e.id for e in every if e.id not in outside])
         bare = car.minus(*(e.id for e in every))
+        held = [k for k, s in enumerate(self.structure) if not s[0].startswith(tuple(f"effects.{i}." for i in outside))]
         return (
-            self._part(bare.plus(*across), [e.id for e in across]), kernel,
-            self._part(bare.plus(*observing), [e.id for e in observing]),
+            self._part(bare.plus(*across), self._places(across)), self._part(car.minus(*outside), held),
+            self._part(bare.plus(*observing), self._places(observing)),
         )  # fmt: skip
 
-    def _part(self, car: Vehicle, ids: Sequence[str]) -> _Part:
-        at = [k for k, s in enumerate(self.structure) if s[0].split(".")[1] in ids]
+    def _places(self, effects: Sequence[Effect]) -> list[int]:
+        heads = tuple(f"effects.{e.id}." for e in effects)
+        return [k for k, s in enumerate(self.structure) if s[0].startswith(heads)]
+
+    def _part(self, car: Vehicle, at: list[int]) -> _Part:
         return _Part(car, tuple(self.structure[k] for k in at), at)
 
     @staticmethod
-    def of(vehicle: Vehicle, effects: Iterable[Effect], found: Collection[str] = ()) -> "Program":
+    def of(
+        vehicle: Vehicle, effects: Iterable[Effect], found: Collection[str] = (), declared: Sequence[Place] = ()
+    ) -> "Program":
         """The program of a vehicle with these effects beside its own. Raises `ValueError` for one it has already.
 
         `found`: ids of effects of its own whose numbers are arguments as well, so that vehicles with other effects
-        found share the program.
+        found share the program. `declared`: coefficients that are arguments too.
         """
         car, structure, at = vehicle.plus(*effects), [], []
         added = {e.id for e in car.effects} - {e.id for e in vehicle.effects} | {*found}
@@ -107,6 +139,10 @@ class Program:
                 path = f"effects.{e.id}.{p.name}"
                 structure += [(path, g if grouped else None, -np.inf, np.inf) for g in range(len(values))]
                 at += [*values]
+        for path, group in declared:
+            leaf = leaf_of(car, path)
+            structure += [(path, group, -np.inf, np.inf)]
+            at += [float(leaf if group is None else leaf.values[group])]
         return Program(car, tuple(structure), np.array(at))
 
     def recipe(
@@ -177,6 +213,51 @@ def _column_slope(
     return jax.jvp(column, (jnp.asarray(values),), (jnp.asarray(tangent),))
 
 
+def _even(count: int) -> int:
+    return -(-count // SIDE_BY_SIDE) * SIDE_BY_SIDE
+
+
+def _directions(places: Sequence[int], values: np.ndarray) -> Float[np.ndarray, "direction parameter"]:
+    """A row of zeros and a one for each place; then rows of zeros."""
+    out = np.zeros((_even(len(places)), len(values)))
+    out[np.arange(len(places)), places] = 1.0
+    return out
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _column_slopes(
+    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any, directions: Any
+) -> tuple[Array, Array]:
+    def column(x: Array) -> Array:
+        return insert(car, structure, x).column(segments, target)
+
+    def along(direction: Array) -> tuple[Array, Array]:
+        return jax.jvp(column, (jnp.asarray(values),), (direction,))
+
+    return jax.vmap(along, out_axes=(None, -1))(jnp.asarray(directions))
+
+
+@partial(jax.jit, static_argnums=1)
+def _corrected_slope(car: Vehicle, structure: Structure, segments: Segments, values: Any, tangent: Any) -> Segments:
+    def numbers(x: Array) -> Segments:
+        return eqx.filter(insert(car, structure, x).corrected(segments), eqx.is_inexact_array)
+
+    return jax.jvp(numbers, (jnp.asarray(values),), (jnp.asarray(tangent),))[1]
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _column_moved(
+    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any, moved: Segments
+) -> Array:
+    """The derivative of the column along `moved` measurements."""
+    numbers, others = eqx.partition(segments, eqx.is_inexact_array)
+
+    def column(x: Segments) -> Array:
+        return insert(car, structure, jnp.asarray(values)).column(eqx.combine(x, others), target)
+
+    return jax.jvp(column, (numbers,), (moved,))[1]
+
+
 @partial(jax.jit, static_argnums=(1, 2))
 def _shown(
     car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any
@@ -193,3 +274,17 @@ def _shown_slope(
         return insert(car, structure, x).shown(y, segments, target)
 
     return jax.jvp(shown, (column, jnp.asarray(values)), (slope, jnp.asarray(tangent)))[1]
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def _shown_slopes(
+    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any,
+    slopes: Any, directions: Any,
+) -> tuple[Array, Array]:  # fmt: skip
+    def shown(y: Array, x: Array) -> Array:
+        return insert(car, structure, x).shown(y, segments, target)
+
+    def along(slope: Array, direction: Array) -> tuple[Array, Array]:
+        return jax.jvp(shown, (column, jnp.asarray(values)), (slope, direction))
+
+    return jax.vmap(along, in_axes=(-1, 0), out_axes=(None, -1))(jnp.asarray(slopes), jnp.asarray(directions))

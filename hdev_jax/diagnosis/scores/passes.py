@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.candidates.plan import Source
 from hdev_jax.diagnosis.noise.noise import Noise, whiten
 from hdev_jax.diagnosis.scores.evidence import Evidence
 from hdev_jax.inference import Calibration, Chunk, Clusters, linearised
-from hdev_jax.inference.calibrate import WEAK
+from hdev_jax.inference.calibrate import WEAK, Linearise
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TargetName
 
@@ -29,7 +29,8 @@ class Baseline:
     """What candidates are scored against: the log's chunks, its clusters, the fitted vehicle, the noise of what it
     leaves.
 
-    `chunks()` starts from the first chunk each time; `trips` is how many the log has.
+    `chunks()` starts from the first chunk each time; `trips` is how many the log has; `linearise` gives predictions
+    and Jacobians.
     """
 
     chunks: Callable[[], Iterable[Chunk]]
@@ -38,12 +39,13 @@ class Baseline:
     fit: Calibration
     target: TargetName
     noise: Noise
+    linearise: Linearise = linearised
 
     def rows(self, chunk: Chunk, width: int, write: Write) -> Float[np.ndarray, "padded k"]:
         """[Jacobian | `width` columns | residual] of a chunk, 0 where it is padded."""
         base = len(self.fit.table.free)
         out = np.empty((len(chunk.segments), base + width + 1))
-        predicted, out[:, :base] = linearised(self.fit.vehicle, self.fit.table, chunk.segments, self.target)
+        predicted, out[:, :base] = self.linearise(self.fit.vehicle, self.fit.table, chunk.segments, self.target)
         write(out[:, base : base + width], chunk)
         out[: chunk.rows, -1] = chunk.measured - predicted[: chunk.rows]
         out[chunk.rows :] = 0.0
