@@ -10,7 +10,7 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, own_shapes, ways_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
-from hdev_jax.diagnosis.candidates.shared import SHORT_ROWS, SharedKernel, absent
+from hdev_jax.diagnosis.candidates.shared import SHORT_ROWS, SharedKernel, absent, apart
 from hdev_jax.physics import LIBRARY, Effect, Switch, Vehicle, unavailable
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
@@ -142,13 +142,10 @@ def _separate(vehicle: Vehicle, nulls: Sequence[Effect], effects: Sequence[type[
 
 def _shared(vehicle: Vehicle, nulls: Sequence[Effect], kernel: SharedKernel) -> list[_Group]:
     """Programs with one kernel, whichever effects were found: those of one row in one, others each in its own."""
-    rowwise = [e for e in nulls if not (e.alone("across") or e.alone("observe"))]
+    rowwise = [e for e in nulls if not apart(e)]
     groups = [_Group(kernel.program(vehicle, *rowwise), rowwise)]
     return groups + [
-        _Group(kernel.program(vehicle, only), [only], sizes)
-        for e in nulls
-        if e not in rowwise
-        for only, sizes in _variants(e)
+        _Group(kernel.program(vehicle, only), [only], sizes) for e in nulls if apart(e) for only, sizes in _variants(e)
     ]
 
 

@@ -62,36 +62,32 @@ class Program:
         tangent: Float[np.ndarray, " parameter"],
     ) -> Float[np.ndarray, " row"]:  # fmt: skip
         """The derivative of the prediction at these values along `tangent`."""
-        before, kernel, after = self.parts
-        seen = before.corrected(segments, values)
-        at, along = values[kernel.at], tangent[kernel.at]
-        column, slope = _column_slope(kernel.car, kernel.structure, target, seen, at, along)
-        at, along = values[after.at], tangent[after.at]
-        return np.asarray(_shown_slope(after.car, after.structure, target, segments, column, at, slope, along))
+        return self._along(segments, target, values, tangent[None])[1][:, 0]
 
     def linearised(
         self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"], free: Sequence[int]
     ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]:
         """The prediction at these values, and its derivatives in the parameters `free`, all side by side."""
+        along = np.zeros((-(-len(free) // SIDE_BY_SIDE) * SIDE_BY_SIDE, len(values)))
+        along[np.arange(len(free)), free] = 1.0
+        shown, slopes = self._along(segments, target, values, along)
+        return shown, slopes[:, : len(free)]
+
+    def _along(
+        self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"],
+        along: Float[np.ndarray, "direction parameter"],
+    ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row direction"]]:  # fmt: skip
+        """The prediction at these values, and its derivatives along these directions."""
         before, kernel, after = self.parts
-        seen = before.corrected(segments, values)
-        at = values[kernel.at]
-        inner = [k for k, i in enumerate(free) if i in kernel.at]
-        column, inside = _column_slopes(
-            kernel.car, kernel.structure, target, seen, at, _directions([kernel.at.index(free[k]) for k in inner], at)
+        seen, at = before.corrected(segments, values), values[kernel.at]
+        column, slopes = _column_slopes(kernel.car, kernel.structure, target, seen, at, along[:, kernel.at])
+        for k in np.flatnonzero(np.any(along[:, before.at] != 0, axis=1)):
+            moved = _corrected_slope(before.car, before.structure, segments, values[before.at], along[k, before.at])
+            slopes = slopes.at[:, k].add(_column_moved(kernel.car, kernel.structure, target, seen, at, moved))
+        shown, slopes = _shown_slopes(
+            after.car, after.structure, target, segments, column, values[after.at], slopes, along[:, after.at]
         )
-        slopes = np.zeros((len(column), _even(len(free))))
-        slopes[:, inner] = np.asarray(inside)[:, : len(inner)]
-        for k in (k for k, i in enumerate(free) if i in before.at):
-            (one,) = np.eye(len(before.at))[[before.at.index(free[k])]]
-            moved = _corrected_slope(before.car, before.structure, segments, values[before.at], one)
-            slopes[:, k] = _column_moved(kernel.car, kernel.structure, target, seen, at, moved)
-        along = np.zeros((slopes.shape[1], len(after.at)))
-        for k in (k for k, i in enumerate(free) if i in after.at):
-            along[k, after.at.index(free[k])] = 1.0
-        at = values[after.at]
-        shown, slopes = _shown_slopes(after.car, after.structure, target, segments, column, at, slopes, along)
-        return np.asarray(shown), np.asarray(slopes)[:, : len(free)]
+        return np.asarray(shown), np.asarray(slopes)
 
     @cached_property
     def parts(self) -> tuple[_Part, _Part, _Part]:
@@ -204,27 +200,6 @@ def _column(car: Vehicle, structure: Structure, target: TargetName, segments: Se
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _column_slope(
-    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any, tangent: Any
-) -> tuple[Array, Array]:
-    def column(x: Array) -> Array:
-        return insert(car, structure, x).column(segments, target)
-
-    return jax.jvp(column, (jnp.asarray(values),), (jnp.asarray(tangent),))
-
-
-def _even(count: int) -> int:
-    return -(-count // SIDE_BY_SIDE) * SIDE_BY_SIDE
-
-
-def _directions(places: Sequence[int], values: np.ndarray) -> Float[np.ndarray, "direction parameter"]:
-    """A row of zeros and a one for each place; then rows of zeros."""
-    out = np.zeros((_even(len(places)), len(values)))
-    out[np.arange(len(places)), places] = 1.0
-    return out
-
-
-@partial(jax.jit, static_argnums=(1, 2))
 def _column_slopes(
     car: Vehicle, structure: Structure, target: TargetName, segments: Segments, values: Any, directions: Any
 ) -> tuple[Array, Array]:
@@ -263,17 +238,6 @@ def _shown(
     car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any
 ) -> Array:
     return insert(car, structure, jnp.asarray(values)).shown(column, segments, target)
-
-
-@partial(jax.jit, static_argnums=(1, 2))
-def _shown_slope(
-    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any,
-    slope: Array, tangent: Any,
-) -> Array:  # fmt: skip
-    def shown(y: Array, x: Array) -> Array:
-        return insert(car, structure, x).shown(y, segments, target)
-
-    return jax.jvp(shown, (column, jnp.asarray(values)), (slope, jnp.asarray(tangent)))[1]
 
 
 @partial(jax.jit, static_argnums=(1, 2))

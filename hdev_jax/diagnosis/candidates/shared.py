@@ -19,7 +19,7 @@ from hdev_jax.physics import DECLARED, LIBRARY, Effect, Vehicle, at_null, unavai
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
-__all__ = ["SHORT_ROWS", "SharedKernel", "absent"]
+__all__ = ["SHORT_ROWS", "SharedKernel", "absent", "apart"]
 
 # Of a log of 14,000 rows a column takes 5 ms with every effect and 1.5 ms with six, so all of them 1.5 s and 0.4 s; to
 # trace and compile those of a step anew takes 5 to 20 s. Twice or half of it changes the time alone.
@@ -79,11 +79,7 @@ class SharedKernel:
         for c in (c for c in self.library.values() if LIBRARY.get(c.id) is c and not c.searched):
             if vehicle.has(c.id):
                 found[c.id] = _with_limits(vehicle.effect(c.id), self._null(c))
-            elif not (
-                c.alone("across")
-                or c.alone("observe")
-                or unavailable(c, self.facts.sample, vehicle.entry, vehicle.stands_in)
-            ):
+            elif not (apart(c) or unavailable(c, self.facts.sample, vehicle.entry, vehicle.stands_in)):
                 rest[c.id] = self._null(c)
         return vehicle.minus(*found).plus(*found.values()), tuple(found), rest
 
@@ -91,6 +87,11 @@ class SharedKernel:
         if effect.id not in self._nulls:
             self._nulls[effect.id] = absent(effect, self.facts)
         return self._nulls[effect.id]
+
+
+def apart(effect: Effect | type[Effect]) -> bool:
+    """Whether it is not part of the kernel, and does not change its program."""
+    return effect.alone("across") or effect.alone("observe")
 
 
 def absent(effect: type[Effect], facts: Facts) -> Effect:
