@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from hdev_jax.diagnosis.candidates.shared import SharedKernel
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
 from hdev_jax.diagnosis.competition.compete import compete, named_alone, no_instrument_named, none_named, rows_with
 from hdev_jax.diagnosis.competition.refit import as_reported
@@ -38,7 +39,7 @@ Checkpoint = Callable[[str, Callable[[], Any]], Any]
 @dataclass(frozen=True)
 class Outcome:
     """What came out: `summary` is diagnosis.json, `before` and `after` the two vehicles, the columns for figures;
-    `given`, the rows with their decoded states, where a load has one."""
+    `kernel`, the programs that computed them; `given`, the rows with their decoded states, where a load has one."""
 
     problem: Problem
     split: Split
@@ -49,6 +50,7 @@ class Outcome:
     predicted_before: np.ndarray
     predicted_after: np.ndarray
     found: dict[str, dict[str, tuple[float, float, str]]]
+    kernel: SharedKernel
     given: Given | None = None
 
 
@@ -117,7 +119,7 @@ def _diagnosed(
     # 5. Sizes with their intervals, classes, and the drives that separate the members of a class
     leeway = {f.id: left_open(training, named, f.score, steps[-1]) for f in named.found}
     leeway |= {} if given is None else given.left_open
-    summary = summarise(problem, split, named, steps, predicted, left, leeway, settings, given)
+    summary = summarise(problem, split, named, steps, predicted, left, leeway, training, given)
     summary["excluded"] = excluded
     twins = [(f.id, library[t]) for f in named.found for t in f.alike[:MOST_IN_CLASS] if t in library]
     if twins:
@@ -129,7 +131,7 @@ def _diagnosed(
     found = {k: {n: (p["value"], p["sd"], p["unit"]) for n, p in v.items()} for k, v in sheet.items()}
     return Outcome(
         problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found,
-        given,
+        training.kernel, given,
     )  # fmt: skip
 
 
@@ -156,7 +158,7 @@ def _handed_out(
     """
     settings = training.settings
     steps = path(training, problem, named)
-    predicted = [problem.predict(fit.vehicle) for fit in steps]
+    predicted = [problem.predict(fit.vehicle, compute=training.kernel.predict) for fit in steps]
     if named.found and not any(f.score.candidate.effect.searched for f in named.found):
         levels = training.clusters.kind == "trip"
         if not held_out_gain(problem, split, predicted[0], predicted[-1], levels=levels) > -settings.ahead:
@@ -175,7 +177,8 @@ def _handed_out(
     left = Remainder(**plain)
     if named.found and not left.significant:  # beside something unexplained, these weights would fit that
         known = as_reported(training, named)
-        steps, predicted = [*steps[:-1], known], [*predicted[:-1], problem.predict(known.vehicle)]
+        last = problem.predict(known.vehicle, compute=training.kernel.predict)
+        steps, predicted = [*steps[:-1], known], [*predicted[:-1], last]
         test = problem.rows(split.test)
         left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
         given = given_states(problem, split, named, known, seed)

@@ -82,7 +82,7 @@ class Training:
     @cached_property
     def kernel(self) -> SharedKernel:
         """What all vehicles of this search are computed by; gears as found effects have them."""
-        return SharedKernel(self.library, replace(self.facts, gears=self.gears))
+        return SharedKernel(self.library, replace(self.facts, gears=self.gears), self.rows.segments)
 
     def calibrate(self, vehicle: Vehicle, table: ParameterTable) -> Calibration:
         """The vehicle fitted to these rows by least squares."""

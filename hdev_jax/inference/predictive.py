@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import optimize, special
 
-from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, jacobian, tabular
+from hdev_jax.inference.calibrate import STUDENT_DF, Calibration, Fit, Linearise, linearised, tabular
 from hdev_jax.inference.clusters import LEAST_RATIO, Clusters, clusters_of
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
@@ -80,12 +80,12 @@ def covariance_root(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "
 
 def left_out(
     fit: Calibration, rows: Fit, target: TargetName, weight: Float[np.ndarray, " row"],
-    noise: Literal["normal", "student_t"] = "normal",
+    noise: Literal["normal", "student_t"] = "normal", *, linearise: Linearise = linearised,
 ) -> tuple[Spread, Clusters]:  # fmt: skip
     """The spread of a fit's errors on trips that it has not seen, from its own rows by leaving each trip out.
 
-    **Arguments:** `rows` the padded rows of the fit; `weight` of a real row in a trip's total. **Returns:** the spread,
-    and whose sums it was seen in.
+    **Arguments:** `rows` the padded rows of the fit; `weight` of a real row in its trip; `linearise` as `calibrate`
+    takes it. **Returns:** the spread, and whose sums it was seen in.
     """
     n, robust = rows.rows, noise == "student_t"
     segments = rows.segments.take(np.arange(len(rows.segments)) < n)
@@ -93,7 +93,7 @@ def left_out(
     error = np.asarray(rows.measured)[:n] - fit.predicted
     open_sd = np.zeros(clusters.count)
     if fit.table.free:
-        x = jacobian(fit.vehicle, fit.table, rows.segments, target)[:n]
+        x = linearise(fit.vehicle, fit.table, rows.segments, target)[1][:n]
         tail = (STUDENT_DF + 1.0) / (STUDENT_DF + (error / fit.sigma) ** 2) if robust else np.ones(n)
         counted = tail / (fit.sigma**2 * fit.inflation)
         error, open_sd = errors_left_out(x, error, counted, weight, clusters, tabular(fit.table)[1])

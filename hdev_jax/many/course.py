@@ -12,7 +12,7 @@ import numpy as np
 from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
 from hdev_jax.energy.saved import conditions
-from hdev_jax.inference import jacobian, padded
+from hdev_jax.inference import padded
 from hdev_jax.physics import LIBRARY
 from hdev_jax.targets import TARGETS
 
@@ -54,7 +54,7 @@ def course_of(outcome: Outcome) -> dict[str, Any]:
     if not table.free:
         return {**out, "coefficients": None}
     rows = padded(problem.segments, problem.measured)
-    j = np.asarray(jacobian(vehicle, table, rows.segments, problem.target))[: rows.rows]
+    j = outcome.kernel.linearised(vehicle, table, rows.segments, problem.target)[1][: rows.rows]
     residual = problem.measured - predicted
     trip = np.asarray(problem.segments.trip)
     noise = estimate_noise(residual, trip, seconds, levels=len(there) > 1)

@@ -164,7 +164,7 @@ def _energy(outcome: Outcome, seed: int) -> dict[str, Any]:
     problem = replace(problem, segments=segments, vehicle=fit.vehicle, table=fit.table)
     used = problem.rows(outcome.split.train)
     rows = padded(problem.segments.take(used), problem.measured[used])
-    spread, _ = left_out(fit, rows, problem.target, problem.weight()[used])
+    spread, _ = left_out(fit, rows, problem.target, problem.weight()[used], linearise=outcome.kernel.linearised)
     freedom = max(cluster_rows(problem.segments.take(used)).count - 1.0, 2.0)
     found = ledger_of(Fitted(problem, fit.vehicle, fit.covariance, freedom, spread, "diagnosed"), seed=seed)
     return {

@@ -115,7 +115,8 @@ class Aero(Effect):
 
 def density_of_weather(row: Segments) -> Any:
     """Density of the air [kg/m³]: p/(R·T) with the pressure of ISO 2533 at the row's altitude."""
-    pressure_pa = 101325.0 * (1.0 - 2.25577e-5 * row.get("altitude_m", 0.0)) ** 5.25588
+    left = jnp.maximum(1.0 - 2.25577e-5 * row.get("altitude_m", 0.0), 0.0)  # none above 44 km
+    pressure_pa = 101325.0 * left**5.25588
     return pressure_pa / (287.05 * (row.get("ambient_temp_c", 15.0) + 273.15))
 
 

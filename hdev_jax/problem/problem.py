@@ -1,6 +1,6 @@
 """A log, a sheet and a target brought together: where the verbs that fit or predict start."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -51,10 +51,15 @@ class Problem:
     def _padded(self) -> Fit:
         return padded(self.segments, self.measured)
 
-    def predict(self, vehicle: Vehicle, segments: Segments | None = None) -> np.ndarray:
-        """The target's column by this vehicle on every row of the log, or of `segments` in its place."""
+    def predict(
+        self, vehicle: Vehicle, segments: Segments | None = None, *, compute: Callable[..., Any] = predict
+    ) -> np.ndarray:
+        """The target's column by this vehicle on every row of the log, or of `segments` in its place.
+
+        `compute` takes and gives what `hdev_jax.inference.predict` does.
+        """
         rows = self._padded if segments is None else padded(segments, self.measured)
-        return np.asarray(predict(vehicle, rows.segments, self.target))[: rows.rows]
+        return np.asarray(compute(vehicle, rows.segments, self.target))[: rows.rows]
 
 
 def prepare(log: Log, sheet: Sheet, target: str | None = None, *, need_measured: bool = True) -> Problem:

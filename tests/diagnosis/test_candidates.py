@@ -16,7 +16,7 @@ from hdev_jax.diagnosis.candidates.shared import SharedKernel
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
 from hdev_jax.diagnosis.settings import SETTINGS
-from hdev_jax.inference import ParameterTable, effect_coefficients, linearised, padded
+from hdev_jax.inference import ParameterTable, effect_coefficients, linearised, padded, predict
 from hdev_jax.physics import LIBRARY, Effect, Grouped, Shape, Size, Vehicle, at_null
 from hdev_jax.problem import Problem
 
@@ -113,7 +113,7 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
         with_values(LIBRARY["gear_efficiency"], facts.gears, delta=(1, -0.01)),
     ]
     lag = LIBRARY["sampling_filter"](tap_1=np.asarray(0.1), tap_2=np.asarray(0.0), tau_s=None)
-    programs, kernel = [], SharedKernel({c.id: c for c in effects}, facts)
+    programs, kernel = [], SharedKernel({c.id: c for c in effects}, facts, rows.segments)
     for has in (found[:1], found, [*found, lag]):
         vehicle = problem.vehicle.plus(*has)
         apart = plan_of(vehicle, effects, facts, problem.target)
@@ -134,7 +134,7 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
     assert len(programs[0]) == 1
 
 
-def test_the_shared_kernel_gives_the_same_jacobian(problem, rows):
+def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows):
     """Beside effects of one row, across rows (a delay of the readings) and of the instrument, with every coefficient
     free; whatever was found, the kernel is compiled once."""
     facts = facts_of(rows.segments, rows.rows)
@@ -145,7 +145,7 @@ def test_the_shared_kernel_gives_the_same_jacobian(problem, rows):
         with_values(LIBRARY["power_gain"], facts.gears, gain=0.02),
     ]
     effects = ["auxiliary_power", "hvac_power", "time_skew", "power_gain", "cornering", "headwind"]
-    kernel, programs = SharedKernel({k: LIBRARY[k] for k in effects}, facts), set()
+    kernel, programs = SharedKernel({k: LIBRARY[k] for k in effects}, facts, rows.segments), set()
     for has in (found[:1], found[:3], found):
         vehicle = problem.vehicle.plus(*has)
         own = [c for e in has for c in effect_coefficients(e, [p.name for p in e.parameters if p.has_column])]
@@ -155,6 +155,9 @@ def test_the_shared_kernel_gives_the_same_jacobian(problem, rows):
         got = kernel.linearised(vehicle, table, rows.segments, problem.target, theta)
         for a, b in zip(got, expected, strict=True):
             assert np.all(np.abs(a - b) <= 1e-9 * np.max(np.abs(b), axis=0))
+        plain = np.asarray(predict(vehicle, rows.segments, problem.target))
+        shared = kernel.predict(vehicle, rows.segments, problem.target)
+        assert np.all(np.abs(shared - plain) <= 1e-12 * np.max(np.abs(plain)))
         part = kernel._of_table(vehicle, table)[0].parts[1]
         programs.add((part.structure, jax.tree.structure(part.car)))
     assert len(programs) == 1
@@ -190,15 +193,34 @@ class RootOfSpeed(Effect):
         return self.w * jnp.sqrt(row.speed_mps)
 
 
-def test_an_effect_of_a_user_does_no_harm_to_other_columns(problem, rows):
+def test_a_reading_that_is_no_number_harms_no_vehicle_that_does_not_use_it(problem, rows):
+    """Absent effects are at their null in the shared kernel, and 0 times what is no number is none."""
+    spoilt = np.array(rows.segments.channels["ambient_temp_c"])
+    spoilt[7] = np.nan
+    segments = rows.segments.with_channels(ambient_temp_c=spoilt)
+    facts, effects = facts_of(segments, rows.rows), [LIBRARY[k] for k in ("auxiliary_power", "hvac_power")]
+    vehicle = problem.vehicle.plus(with_values(effects[0], facts.gears, power_w=900.0))
+    table = ParameterTable((*problem.table.rows, *effect_coefficients(vehicle.effect("auxiliary_power"), ["power_w"])))
+    plain = linearised(vehicle, table, segments, problem.target)
+    for seen in (segments, rows.segments):  # in training rows, and only in others
+        kernel = SharedKernel({c.id: c for c in effects}, facts, seen)
+        assert kernel.serves(vehicle, problem.target) == (seen is rows.segments)
+        for a, b in zip(kernel.linearised(vehicle, table, segments, problem.target), plain, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+        np.testing.assert_allclose(kernel.predict(vehicle, segments, problem.target), plain[0], rtol=1e-9)
+    assert np.all(np.isfinite(plain[0]))
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_an_effect_of_a_user_does_no_harm_to_other_columns(problem, rows, long):
     facts = facts_of(rows.segments, rows.rows)
+    facts = replace(facts, rows=100_000) if long else facts
     effects = [LIBRARY[k] for k in ("speed_scale", "auxiliary_power", "tyre_warmup")]
-    kernel = SharedKernel({c.id: c for c in effects}, facts)
+    kernel = SharedKernel({c.id: c for c in effects}, facts, rows.segments)
     alone = plan_of(problem.vehicle, effects, facts, problem.target, kernel=kernel)
     every = [Fading, *effects, RootOfSpeed]
-    beside = plan_of(
-        problem.vehicle, every, facts, problem.target, kernel=SharedKernel({c.id: c for c in every}, facts)
-    )
+    with_own = SharedKernel({c.id: c for c in every}, facts, rows.segments)
+    beside = plan_of(problem.vehicle, every, facts, problem.target, kernel=with_own)
     a, b = (np.zeros((len(rows.segments), p.width)) for p in (alone, beside))
     alone.write(a, rows.segments)
     beside.write(b, rows.segments)

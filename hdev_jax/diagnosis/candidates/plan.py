@@ -10,8 +10,8 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, own_shapes, ways_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
 from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
-from hdev_jax.diagnosis.candidates.shared import SHORT_ROWS, SharedKernel, absent, apart
-from hdev_jax.physics import LIBRARY, Effect, Switch, Vehicle, unavailable
+from hdev_jax.diagnosis.candidates.shared import SharedKernel, absent, apart, of_library
+from hdev_jax.physics import Effect, Switch, Vehicle, unavailable
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
@@ -92,13 +92,13 @@ def plan_of(
             left_out[c.id] = why
         else:
             nulls.append(absent(c, facts))
-    if kernel is not None and not searched and facts.rows <= SHORT_ROWS:
-        # nothing is known of the slopes that a user's effect has at its null: it is in no program but its own
-        known = [e for e in nulls if type(e) in LIBRARY.values()]
+    known = [e for e in nulls if of_library(type(e))]
+    if kernel is not None and not searched and kernel.serves(vehicle, target):
         groups = _shared(vehicle, known, kernel)
-        groups += [g for e in nulls if e not in known for g in _separate(vehicle, [e], [type(e)])]
     else:
-        groups = _separate(vehicle, nulls, effects)
+        groups = _separate(vehicle, known, effects)
+    # nothing is known of the slopes that a user's effect has at its null: it is in no program but its own
+    groups += [g for e in nulls if e not in known for g in _separate(vehicle, [e], [type(e)])]
 
     found: list[Candidate] = []
     place: dict[Column, int] = {}

@@ -67,7 +67,8 @@ class Program:
     def linearised(
         self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"], free: Sequence[int]
     ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]:
-        """The prediction at these values, and its derivatives in the parameters `free`, all side by side."""
+        """The prediction at these values, in the target's unit, and its derivatives in the parameters `free`, per unit
+        of each, all side by side."""
         along = np.zeros((-(-len(free) // SIDE_BY_SIDE) * SIDE_BY_SIDE, len(values)))
         along[np.arange(len(free)), free] = 1.0
         shown, slopes = self._along(segments, target, values, along)
@@ -121,7 +122,8 @@ class Program:
         """The program of a vehicle with these effects beside its own. Raises `ValueError` for one it has already.
 
         `found`: ids of effects of its own whose numbers are arguments as well, so that vehicles with other effects
-        found share the program. `declared`: coefficients that are arguments too.
+        found share the program. `declared`: coefficients of the declared model that are arguments too; `KeyError` for
+        one that the vehicle does not have.
         """
         car, structure, at = vehicle.plus(*effects), [], []
         added = {e.id for e in car.effects} - {e.id for e in vehicle.effects} | {*found}

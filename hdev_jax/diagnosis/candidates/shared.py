@@ -13,70 +13,129 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import as_seen
 from hdev_jax.diagnosis.candidates.facts import Facts
 from hdev_jax.diagnosis.candidates.programs import Place, Program
-from hdev_jax.inference import ParameterTable, linearised
-from hdev_jax.inference.parameters import in_effect
+from hdev_jax.inference import ParameterTable, linearised, predict
+from hdev_jax.inference.parameters import in_effect, leaf_of
 from hdev_jax.physics import DECLARED, LIBRARY, Effect, Vehicle, at_null, unavailable
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
-__all__ = ["SHORT_ROWS", "SharedKernel", "absent", "apart"]
+__all__ = ["SharedKernel", "absent", "apart", "of_library"]
 
 # Of a log of 14,000 rows a column takes 5 ms with every effect and 1.5 ms with six, so all of them 1.5 s and 0.4 s; to
 # trace and compile those of a step anew takes 5 to 20 s. Twice or half of it changes the time alone.
 SHORT_ROWS = 65_536
+RESULTS = 6  # Jacobians that are kept: 2 MB for 14,000 rows and 20 coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class SharedKernel:
-    """The programs of the vehicles of a search over the `library`, on a log of these `facts`.
+    """The programs of the vehicles of a search over the `library`, on the padded training rows `segments` of a log of
+    these `facts`.
 
     Effects of a user are in no program but their own: nothing is known of the slopes that they have at their null.
     """
 
     library: Mapping[str, type[Effect]]
     facts: Facts
+    segments: Segments
     _nulls: dict[str, Effect] = field(default_factory=dict, init=False, repr=False)
     _last: list[Any] = field(default_factory=list, init=False, repr=False)
+    _sound: dict[TargetName, bool] = field(default_factory=dict, init=False, repr=False)
+    _programs: dict[Any, Program] = field(default_factory=dict, init=False, repr=False)
+    _results: dict[Any, Any] = field(default_factory=dict, init=False, repr=False)
 
     def program(self, vehicle: Vehicle, *more: Effect, declared: Sequence[Place] = ()) -> Program:
         """The vehicle with every other effect of the library that is part of the kernel, and with `more`."""
         base, found, rest = self._completed(vehicle)
-        return Program.of(base, [*rest.values(), *(e for e in more if e.id not in rest)], found, declared)
+        return Program.of(base, {**rest, **{e.id: e for e in more}}.values(), found, declared)
+
+    def serves(self, vehicle: Vehicle, target: TargetName) -> bool:
+        """Whether the shared programs serve this search: not on a long log, where what is absent costs more than a new
+        program, nor where a reading leaves an absent effect without a finite value (an altitude of 65 km), since 0
+        times that is no number either."""
+        if self.facts.rows > SHORT_ROWS:
+            return False
+        if target not in self._sound:
+            program = self.program(vehicle)
+            finite = np.isfinite(program.predicted(self.segments, target, program.null))
+            self._sound[target] = bool(np.all(finite == np.isfinite(predict(vehicle, self.segments, target))))
+        return self._sound[target]
 
     def linearised(
         self, vehicle: Vehicle, table: ParameterTable, segments: Segments, target: TargetName, theta: Any = None
     ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]:
-        """The prediction and its derivative in the free coefficients, at their present values or at `theta`.
-
-        The declared model has a program of its own, and so have vehicles with other effects than the library's, and
-        rows of a long log, where what is absent costs more than a new program.
-        """
-        beside = [e for e in vehicle.effects if type(e) not in DECLARED]
-        known = all(type(e) is LIBRARY.get(e.id) and not e.searched for e in beside)
-        if not (beside and known and table.free) or len(segments) > SHORT_ROWS:
+        """The prediction, in the target's unit, and its derivative in the free coefficients, per unit of each, at their
+        present values or at `theta`."""
+        if not table.free or not self._of_library(vehicle, target):
             return linearised(vehicle, table, segments, target, theta)
         if not (self._last and self._last[0] is vehicle and self._last[1] is table):  # a solver asks many times
             self._last[:] = vehicle, table, self._of_table(vehicle, table)
-        program, free = self._last[2]
-        values = program.null.copy()
+        program, values, free = self._last[2]
         if theta is not None:
+            values = values.copy()
             values[free] = np.asarray(theta)
-        return program.linearised(jax.tree.map(jnp.asarray, segments), target, values, free)
+        key = id(program), values.tobytes(), tuple(free), target, id(segments)
+        if key not in self._results:  # what was fitted is scored at the same values
+            result = program.linearised(jax.tree.map(jnp.asarray, segments), target, values, free)
+            if not all(np.all(np.isfinite(x)) for x in result):  # rows that the search has not seen
+                result = linearised(vehicle, table, segments, target, theta)
+            self._results[key] = program, segments, result  # held, so that no other has their ids
+            while len(self._results) > RESULTS:
+                self._results.pop(next(iter(self._results)))
+        return self._results[key][-1]
 
-    def _of_table(self, vehicle: Vehicle, table: ParameterTable) -> tuple[Program, list[int]]:
-        """The program with the table's coefficients as arguments, and where among them the free ones are."""
+    def predict(self, vehicle: Vehicle, segments: Segments, target: TargetName) -> Float[np.ndarray, " row"]:
+        """The prediction on every row, in the target's unit."""
+        if self._of_library(vehicle, target):
+            program = self.program(vehicle)
+            predicted = program.predicted(jax.tree.map(jnp.asarray, segments), target, program.null)
+            if np.all(np.isfinite(predicted)):  # not on rows that the search has not seen
+                return predicted
+        return np.asarray(predict(vehicle, segments, target))
+
+    def _of_library(self, vehicle: Vehicle, target: TargetName) -> bool:
+        """Whether the vehicle is computed by the shared programs: the declared model has its own, and so have vehicles
+        with other effects than the library's."""
+        beside = [e for e in vehicle.effects if type(e) not in DECLARED]
+        known = all(of_library(type(e)) and not e.searched for e in beside)
+        return bool(beside) and known and self.serves(vehicle, target)
+
+    def _of_table(
+        self, vehicle: Vehicle, table: ParameterTable
+    ) -> tuple[Program, Float[np.ndarray, " parameter"], list[int]]:
+        """The program with the table's coefficients as arguments, their values, and where among them the free ones
+        are. It is made once for vehicles that differ in these coefficients and in effects that are part of the kernel.
+        """
         heads = tuple(f"effects.{k}." for k in self.library)
         rows = [(in_effect(c.path), c.group) for c in table.rows]
         others = sorted((x for x in rows if not x[0].startswith(heads)), key=lambda x: (x[0], x[1] or 0))
-        program = self.program(vehicle, declared=others)
-        place = {(path, group): k for k, (path, group, _, _) in enumerate(program.structure)}
-        return program, [place[in_effect(c.path), c.group] for c in table.free]
+        beside = {e.id: e for e in vehicle.effects if type(e) not in DECLARED}
+        rest = jax.tree.leaves(
+            (vehicle.mass_kg, vehicle.nominal_voltage_v, vehicle.driveline, vehicle.machine,
+             [e for e in vehicle.effects if type(e) in DECLARED])
+        )  # fmt: skip
+        varied = {id(x) for x in jax.tree.leaves([leaf_of(vehicle, path) for path, _ in others])}
+        held = tuple(np.asarray(x).tobytes() for x in rest if id(x) not in varied)
+        key = tuple(i for i, e in beside.items() if apart(e)), tuple(others), held
+        if key not in self._programs:
+            self._programs[key] = self.program(vehicle, declared=others)
+        program, values, place = self._programs[key], [], {}
+        for k, (path, group, _, _) in enumerate(program.structure):
+            leaf = leaf_of(vehicle, path) if not path.startswith(heads) else self._leaf(beside, *path.split(".")[1:])
+            values.append(float(leaf if group is None else leaf.values[group]))
+            place[path, group] = k
+        return program, np.array(values), [place[in_effect(c.path), c.group] for c in table.free]
+
+    def _leaf(self, found: Mapping[str, Effect], effect_id: str, name: str) -> Any:
+        """A parameter of a found effect, or at its null where it was found without it or not at all."""
+        leaf = getattr(found[effect_id], name) if effect_id in found else None
+        return getattr(self._null(self.library[effect_id]), name) if leaf is None else leaf
 
     def _completed(self, vehicle: Vehicle) -> tuple[Vehicle, Collection[str], dict[str, Effect]]:
         """A vehicle whose found effects have the limits that they were found without, at their null; the ids of these
         effects; the other effects of the library that are part of the kernel, at their null, by id."""
         found, rest = {}, {}
-        for c in (c for c in self.library.values() if LIBRARY.get(c.id) is c and not c.searched):
+        for c in (c for c in self.library.values() if of_library(c) and not c.searched):
             if vehicle.has(c.id):
                 found[c.id] = _with_limits(vehicle.effect(c.id), self._null(c))
             elif not (apart(c) or unavailable(c, self.facts.sample, vehicle.entry, vehicle.stands_in)):
@@ -87,6 +146,11 @@ class SharedKernel:
         if effect.id not in self._nulls:
             self._nulls[effect.id] = absent(effect, self.facts)
         return self._nulls[effect.id]
+
+
+def of_library(effect: type[Effect]) -> bool:
+    """Whether it is one of the library's own, not a user's of the same id."""
+    return LIBRARY.get(effect.id) is effect
 
 
 def apart(effect: Effect | type[Effect]) -> bool:

@@ -17,7 +17,7 @@ from hdev_jax.diagnosis.scores.passes import distance_from_table, evidence_of
 from hdev_jax.diagnosis.scores.scores import Scores, without_idle
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
-from hdev_jax.inference import Calibration, ParameterTable, effect_coefficients, predict
+from hdev_jax.inference import Calibration, ParameterTable, effect_coefficients
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Choice, Effect, Switch, Vehicle
 
@@ -168,7 +168,7 @@ def as_reported(training: Training, state: State) -> Calibration:
     if not (np.all(agree) and np.min(better) >= 1.0 and np.max(better) >= settings.known):
         return fit
     predicted = np.concatenate(
-        [np.asarray(predict(known.vehicle, c.segments, training.target))[: c.rows] for c in training.chunks]
+        [training.kernel.predict(known.vehicle, c.segments, training.target)[: c.rows] for c in training.chunks]
     )
     each = zip(fit.table.free, known.values, error, strict=True)
     table = _known(fit.table, {c.name: (float(x), float(e)) for c, x, e in each})

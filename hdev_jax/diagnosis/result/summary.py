@@ -14,6 +14,7 @@ from hdev_jax.diagnosis.result.hidden import Given, errors_by_knowledge, state_b
 from hdev_jax.diagnosis.result.intervals import Open
 from hdev_jax.diagnosis.result.modes import mode_block
 from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration, cluster_rows
 from hdev_jax.physics import Choice, ModeChange, Parameter, StepChange
 from hdev_jax.problem import Problem, Split, metrics
@@ -130,7 +131,7 @@ def summarise(
     predicted: list[np.ndarray],
     left: Remainder,
     leeway: Mapping[str, Mapping[str, Open]],
-    settings: Settings,
+    training: Training,
     given: Given | None = None,
 ) -> dict[str, Any]:
     """The contract's diagnosis.json. `leeway`: by effect and parameter, what is left open; `given`: the decoded states
@@ -199,15 +200,15 @@ def summarise(
             "course": left.course,
         },
         "missing_channels": list(left.missing_channels),
-        "not_decidable": _not_decidable(state.verdicts, left, settings),
+        "not_decidable": _not_decidable(state.verdicts, left, training.settings),
         "verdict": verdict,
         "parameters_fitted": _fitted(state),
         "clusters": {"kind": clusters.kind, "count": clusters.count, "trips": len(split.train)},
         "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
         "notes": [
             *problem.notes,
-            *_warnings(steps, state, settings),
-            *_known(problem, state, steps[-1], test, rmse[-1]),
+            *_warnings(steps, state, training.settings),
+            *_known(problem, state, steps[-1], training, test, rmse[-1]),
             *_by_trip(problem, state),
             *(_of_last_vehicle(problem, train) if any(c["id"] == StepChange.id for c in candidates) else ()),
             *_odd_rows(problem, predicted[0]),
@@ -273,11 +274,13 @@ def _warnings(steps: list[Calibration], state: State, settings: Settings) -> lis
     return out
 
 
-def _known(problem: Problem, state: State, last: Calibration, test: np.ndarray, rmse: float) -> list[str]:
+def _known(
+    problem: Problem, state: State, last: Calibration, training: Training, test: np.ndarray, rmse: float
+) -> list[str]:
     """How the coefficients of the model with the effects are estimated, where not as those of the declared model."""
     if last is state.fit or not state.found:
         return []
-    said = problem.predict(state.fit.vehicle)[test]
+    said = problem.predict(state.fit.vehicle, compute=training.kernel.predict)[test]
     plain = metrics(problem.measured[test], said, problem.weight()[test])["rmse"]
     return [
         "the model with the effects is fitted by generalised least squares, which gives smaller standard errors: test "

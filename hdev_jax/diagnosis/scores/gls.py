@@ -43,10 +43,10 @@ def generalised(baseline: Baseline) -> tuple[Calibration, Float[np.ndarray, "fre
         step, covariance = _step(evidence, here)
         if not np.all(np.isfinite(step)):
             return failed
-        there = _at(here, here.values + step)
-        if np.max(np.abs(there.values - here.values) / np.maximum(np.sqrt(np.diag(covariance)), 1e-300)) < SETTLED:
-            return here, covariance
-        here = there
+        there = _inside(here, here.values + step)
+        if np.max(np.abs(there - here.values) / np.maximum(np.sqrt(np.diag(covariance)), 1e-300)) < SETTLED:
+            return replace(here, vehicle=here.table.insert(here.vehicle, here.values)), covariance
+        here = replace(here, values=there)  # the Jacobian is at the values, whatever the vehicle has
     return failed
 
 
@@ -56,7 +56,7 @@ def _step(evidence: Evidence, here: Calibration) -> tuple[np.ndarray, np.ndarray
     step, covariance = evidence.step()
     held = np.zeros(len(step), dtype=bool)
     for _ in range(len(step)):
-        inside = _at(here, here.values + step).values
+        inside = _inside(here, here.values + step)
         out = ~held & (np.abs(inside - (here.values + step)) > 1e-9 * np.sqrt(np.diag(covariance)))
         if not np.any(out) or not np.all(np.isfinite(step)):
             break
@@ -71,11 +71,10 @@ def _step(evidence: Evidence, here: Calibration) -> tuple[np.ndarray, np.ndarray
     return step, covariance
 
 
-def _at(fit: Calibration, values: Float[np.ndarray, " free"]) -> Calibration:
-    """The fit with other values, inside their supports."""
+def _inside(fit: Calibration, values: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
+    """Other values of the fit's coefficients, inside their supports."""
     inside = []
     for c, x in zip(fit.table.free, values, strict=True):
         edge = EDGE * (c.upper - c.lower) if np.isfinite(c.upper - c.lower) and c.upper < 1e9 else 0.0
         inside.append(float(np.clip(x, c.lower + edge, c.upper - edge)))
-    theta = np.array(inside)
-    return replace(fit, vehicle=fit.table.insert(fit.vehicle, theta), values=theta)
+    return np.array(inside)

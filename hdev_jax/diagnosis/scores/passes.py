@@ -45,7 +45,8 @@ class Baseline:
         """[Jacobian | `width` columns | residual] of a chunk, 0 where it is padded."""
         base = len(self.fit.table.free)
         out = np.empty((len(chunk.segments), base + width + 1))
-        predicted, out[:, :base] = self.linearise(self.fit.vehicle, self.fit.table, chunk.segments, self.target)
+        fit = self.fit
+        predicted, out[:, :base] = self.linearise(fit.vehicle, fit.table, chunk.segments, self.target, fit.values)
         write(out[:, base : base + width], chunk)
         out[: chunk.rows, -1] = chunk.measured - predicted[: chunk.rows]
         out[chunk.rows :] = 0.0

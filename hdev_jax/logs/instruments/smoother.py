@@ -233,7 +233,7 @@ def _moves(course: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
     return move, blocks(of_height, both, jnp.swapaxes(both, -1, -2), of_slope, of_drift)
 
 
-def _times(a: Array, b: Array) -> Array:
+def _product(a: Array, b: Array) -> Array:
     """A matrix by a matrix or a vector, written out: a product of small matrices for each lane is ten times slower."""
     columns = a[:, :, None] if b.ndim == a.ndim else a
     parts = [columns[:, j] * b[j][None] for j in range(b.shape[0])]
@@ -248,7 +248,7 @@ def _outer(a: Array, b: Array) -> Array:
     return a[:, None] * b[None]
 
 
-def _turned(a: Array) -> Array:
+def _transposed(a: Array) -> Array:
     return jnp.swapaxes(a, 0, 1)
 
 
@@ -280,15 +280,15 @@ def _forward(cells: Any, course: Array, sees: Array, keep: bool) -> Any:
     def step(carry: Any, cell: Any) -> Any:
         mean, cov = carry
         move, new, z, noise, there, sees = cell
-        mean = _times(move, mean)
-        cov = _times(_times(move, cov), _turned(move)) + new
-        towards = _times(cov, sees)
+        mean = _product(move, mean)
+        cov = _product(_product(move, cov), _transposed(move)) + new
+        towards = _product(cov, sees)
         var = _dot(towards, sees) + noise
         gain = jnp.where(there[None], towards / var[None], 0.0)
         miss = jnp.where(there, z - _dot(mean, sees), 0.0)
         after = mean + gain * miss[None], cov - _outer(gain, towards)
-        told = _Cell(move, mean, cov, miss, var, gain, there, sees)
-        return after, told if keep else jnp.where(there, -0.5 * (miss**2 / var + jnp.log(var)), 0.0)
+        cell = _Cell(move, mean, cov, miss, var, gain, there, sees)
+        return after, cell if keep else jnp.where(there, -0.5 * (miss**2 / var + jnp.log(var)), 0.0)
 
     lanes = z.shape[-1]
     first = jnp.stack([UNKNOWN_M**2 * sees[0], slope**2, (slope / length) ** 2, drift**2, (drift / tau) ** 2])[:states]
@@ -310,15 +310,15 @@ def _states(cells: Any, course: Array, sees: Array, wants: Array) -> tuple[Array
 
     def step(carry: Any, cell: _Cell) -> Any:
         r, n = carry  # what later cells say, as it acts on this one
-        told = jnp.where(cell.there, 1.0 / cell.var, 0.0)
-        r = r + cell.sees * (cell.miss * told - _dot(cell.gain, r))[None]
-        n = n - _outer(_times(n, cell.gain), cell.sees)
-        n = n + _outer(cell.sees, cell.sees * told[None] - _times(_turned(n), cell.gain))
-        towards = _times(cell.cov, wants[:, None])
+        precision = jnp.where(cell.there, 1.0 / cell.var, 0.0)
+        r = r + cell.sees * (cell.miss * precision - _dot(cell.gain, r))[None]
+        n = n - _outer(_product(n, cell.gain), cell.sees)
+        n = n + _outer(cell.sees, cell.sees * precision[None] - _product(_transposed(n), cell.gain))
+        towards = _product(cell.cov, wants[:, None])
         mean = _dot(cell.mean, wants[:, None]) + _dot(towards, r)
-        spread = _dot(towards, wants[:, None]) - _dot(towards, _times(n, towards))
-        back = _turned(cell.move)
-        return (_times(back, r), _times(_times(back, n), cell.move)), (mean, spread)
+        spread = _dot(towards, wants[:, None]) - _dot(towards, _product(n, towards))
+        back = _transposed(cell.move)
+        return (_product(back, r), _product(_product(back, n), cell.move)), (mean, spread)
 
     lanes = cells[0].shape[0]
     end = jnp.zeros((len(wants), lanes)), jnp.zeros((len(wants), len(wants), lanes))

@@ -60,10 +60,10 @@ def read_text(path: Path, data: bytes, adapter: Adapter) -> Text:
         text = data.decode("cp1252", errors="replace")  # what spreadsheets write where it is not UTF-8
     if "\r" in text and "\n" not in text:
         text = text.replace("\r", "\n")
-    layout = layout_of(path, text, adapter.header_line)
-    check_header(path, layout.names)
     lines = text.split("\n")
     try:
+        layout = layout_of(path, text, adapter.header_line)
+        check_header(path, layout.names)
         records = _records(text, lines, layout)
     except csv.Error as e:
         raise InputError(f"{path}: not a regular table: {e}") from None
@@ -115,7 +115,8 @@ def _plain_records(text: str, separator: str, first: int) -> tuple[np.ndarray, n
     counts = np.diff(last, prepend=-1)
     end = ends[last]
     begin = np.r_[0, end[:-1] + 1]
-    while (more := np.flatnonzero((end > begin) & np.isin(data[end - 1], [ord("\r"), ord(" ")]))).size:
+    more = np.arange(len(end))
+    while (more := more[(end[more] > begin[more]) & np.isin(data[end[more] - 1], [ord("\r"), ord(" ")])]).size:
         end[more] -= 1
     keep = np.flatnonzero(end > begin)
     keep = keep[keep >= first]

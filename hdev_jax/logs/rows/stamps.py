@@ -94,6 +94,8 @@ def _left(
     y, out = power[inner][good], np.empty(3)
     for k, (begin, end, seconds) in enumerate(pairs):
         mean, gain = 0.5 * (begin + end)[good], (0.5 * (end**2 - begin**2) / seconds)[good]
-        x = np.column_stack([np.ones(len(y)), mean, mean**3, np.maximum(gain, 0.0), np.minimum(gain, 0.0)])
-        out[k] = np.sum((y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) ** 2)
+        columns = (np.ones(len(y)), mean, mean * mean * mean, np.maximum(gain, 0.0), np.minimum(gain, 0.0))
+        x = np.column_stack([c / max(float(np.linalg.norm(c)), 1e-300) for c in columns])
+        # by the normal equations of columns of length one: five by five, and no decomposition of every row
+        out[k] = np.sum((y - x @ np.linalg.lstsq(x.T @ x, x.T @ y, rcond=None)[0]) ** 2)
     return out / max(float(np.sum((y - y.mean()) ** 2)), 1e-300)
