@@ -180,7 +180,7 @@ def tried(problem: Problem, known: Mapping[str, type[Effect]], file: Effects, *c
         bad = np.zeros(rows.rows, dtype=bool)
         try:
             plan = plan_of(car, [c], facts, problem.target, searched=True)
-            for column in computed(plan.recipes, rows.segments, problem.target):
+            for _, column in computed(plan.recipes, rows.segments, problem.target):
                 bad |= ~np.isfinite(column[: rows.rows])
             null = plain if c.id in plan.left_out else problem.predict(car.plus(_idle(c, facts)))
         except Exception as e:
