@@ -80,10 +80,14 @@ class Program:
         for k in np.flatnonzero(np.any(along[:, before.at] != 0, axis=1)):
             moved = _corrected_slope(before.car, before.structure, segments, values[before.at], along[k, before.at])
             slopes = slopes.at[:, k].add(_column_moved(kernel.car, kernel.structure, target, seen, at, moved))
-        shown, slopes = _shown_slopes(
-            after.car, after.structure, target, segments, column, values[after.at], slopes, along[:, after.at]
-        )
-        return np.asarray(shown), np.asarray(slopes)
+        parts = [slice(k, k + TOGETHER) for k in range(0, len(along), TOGETHER)]  # always as many: compiled once
+        each = [
+            _shown_slopes(
+                after.car, after.structure, target, segments, column, values[after.at], slopes[:, k], along[k, after.at]
+            )
+            for k in parts
+        ]
+        return np.asarray(each[0][0]), np.concatenate([np.asarray(s) for _, s in each], axis=1)
 
     @cached_property
     def parts(self) -> tuple[_Part, _Part, _Part]:
@@ -173,6 +177,7 @@ class _Pass:
     values: Float[np.ndarray, " parameter"]
     claimed: Bool[np.ndarray, " parameter"]
     places: list[int]
+    sizes: list[int]
 
     def takes(self, r: Recipe) -> bool:
         """Whether the recipe's shapes agree with those that are here."""
@@ -180,11 +185,12 @@ class _Pass:
             return False
         return not np.any((self.claimed & r.own) & (self.values != r.values))
 
-    def add(self, place: int, r: Recipe) -> None:
+    def add(self, place: int, r: Recipe, size: int) -> None:
         """One derivative more; `place` among the recipes."""
         self.values = np.where(r.own, r.values, self.values)
         self.claimed = self.claimed | r.own
         self.places.append(place)
+        self.sizes.append(size)
 
 
 def computed(
@@ -203,16 +209,14 @@ def computed(
             continue
         fits = next((x for x in passes if x.takes(r)), None)
         if fits is None:
-            fits = _Pass(p, p.null, np.zeros(len(p.null), bool), [])
+            fits = _Pass(p, p.null, np.zeros(len(p.null), bool), [], [])
             passes.append(fits)
-        fits.add(k, r)
+        fits.add(k, r, r.size)
     for x in passes:
-        sizes = [recipes[k].size for k in x.places]
-        slopes = x.program.linearised(segments, target, x.values, sizes, lanes=TOGETHER)[1]
-        for column, k in zip(slopes.T, x.places, strict=True):
+        slopes = x.program.linearised(segments, target, x.values, x.sizes, lanes=TOGETHER)[1]
+        for column, k, size in zip(slopes.T, x.places, x.sizes, strict=True):
             if not np.all(np.isfinite(column)):  # perhaps for another's shape
-                own = recipes[k]
-                column = x.program.linearised(segments, target, own.values, [own.size], lanes=TOGETHER)[1][:, 0]
+                column = x.program.linearised(segments, target, recipes[k].values, [size], lanes=TOGETHER)[1][:, 0]
             yield k, column
 
 
