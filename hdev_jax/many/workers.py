@@ -20,7 +20,7 @@ __all__ = ["Workers", "computed"]
 PATIENCE_S = 30  # for a scheduler to answer
 RETRIES = 3  # of a vehicle whose worker was lost
 # Arrays of a log are megabytes. Given back to the system after each use, as Dask has it (65,536 bytes), they cost
-# page faults: a quarter of the time of a vehicle in the system, a thirtieth without.
+# page faults: a quarter of a vehicle's time is then spent in the operating system, with these a thirtieth.
 _KEEPS_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "268435456", "MALLOC_MMAP_THRESHOLD_": "33554432"}
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 _NO_DASK = "needs Dask: pip install 'hdev_jax[fleet]'"

@@ -132,7 +132,7 @@ class Effect(eqx.Module):
     """One named cause of consumption. A subclass overrides the method of its stage and no other.
 
     **Methods for one row:** `force`, `drive` and `power` return what the effect *adds* (N, N, W); it must be zero while
-    every size is at its null value. `sense` returns the row's measurements, corrected.
+    every size is at its null value, whatever its shapes. `sense` returns the row's measurements, corrected.
 
     **Methods across the rows of a trip:** `derive` adds channels of its own, `across` corrects measurements, `observe`
     changes the predicted column. All must be differentiable in the effect's parameters.

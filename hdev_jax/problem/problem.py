@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hdev_jax.inference import Fit, ParameterTable, padded, predict
+from hdev_jax.inference import Fit, ParameterTable, padded
+from hdev_jax.inference import predict as predict_rows
 from hdev_jax.inference.sheet import Sheet, build, choose_entry, traction_force_from_torque
 from hdev_jax.logs import Log
 from hdev_jax.physics import GROUPS, Vehicle
@@ -52,7 +53,7 @@ class Problem:
         return padded(self.segments, self.measured)
 
     def predict(
-        self, vehicle: Vehicle, segments: Segments | None = None, *, compute: Callable[..., Any] = predict
+        self, vehicle: Vehicle, segments: Segments | None = None, *, compute: Callable[..., Any] = predict_rows
     ) -> np.ndarray:
         """The target's column by this vehicle on every row of the log, or of `segments` in its place.
 

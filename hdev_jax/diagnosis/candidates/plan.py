@@ -98,7 +98,7 @@ def plan_of(
     else:
         groups = _separate(vehicle, known, effects)
     # nothing is known of the slopes that a user's effect has at its null: it is in no program but its own
-    groups += [g for e in nulls if e not in known for g in _separate(vehicle, [e], [type(e)])]
+    groups += [g for e in nulls if not of_library(type(e)) for g in _separate(vehicle, [e], [type(e)])]
 
     found: list[Candidate] = []
     place: dict[Column, int] = {}

@@ -20,8 +20,8 @@ __all__ = ["Place", "Program", "Recipe", "computed", "written"]
 
 Place = tuple[str, int | None]  # a coefficient's path, and its group
 Structure = tuple[tuple[str, int | None, float, float], ...]
-SIDE_BY_SIDE = 8  # coefficients' derivatives are computed in multiples of so many, so that few programs are compiled
-TOGETHER = 4  # columns in one pass: takes 9 ms of 14,000 rows, one alone 7.5 ms
+PER_PASS = 4  # columns in one pass: 9 ms for 14,000 rows, one alone 7.5 ms
+SIDE_BY_SIDE = 2 * PER_PASS  # coefficients' derivatives in multiples of so many, so that few programs are compiled
 
 
 class _Part(NamedTuple):
@@ -80,7 +80,7 @@ class Program:
         for k in np.flatnonzero(np.any(along[:, before.at] != 0, axis=1)):
             moved = _corrected_slope(before.car, before.structure, segments, values[before.at], along[k, before.at])
             slopes = slopes.at[:, k].add(_column_moved(kernel.car, kernel.structure, target, seen, at, moved))
-        parts = [slice(k, k + TOGETHER) for k in range(0, len(along), TOGETHER)]  # always as many: compiled once
+        parts = [slice(k, k + PER_PASS) for k in range(0, len(along), PER_PASS)]  # always as many: compiled once
         each = [
             _shown_slopes(
                 after.car, after.structure, target, segments, column, values[after.at], slopes[:, k], along[k, after.at]
@@ -170,8 +170,8 @@ class Recipe:
 
 @dataclass
 class _Pass:
-    """Derivatives that the program gives at once: at the null but for the shapes of their effects, since those of an
-    absent effect change no other column."""
+    """Derivatives that the program gives at once, each at the shapes of its own effect: shapes of an effect whose sizes
+    are at their null change no other effect's column."""
 
     program: Program
     values: Float[np.ndarray, " parameter"]
@@ -181,7 +181,7 @@ class _Pass:
 
     def takes(self, r: Recipe) -> bool:
         """Whether the recipe's shapes agree with those that are here."""
-        if r.program is not self.program or len(self.places) == TOGETHER:
+        if r.program is not self.program or len(self.places) == PER_PASS:
             return False
         return not np.any((self.claimed & r.own) & (self.values != r.values))
 
@@ -213,10 +213,10 @@ def computed(
             passes.append(fits)
         fits.add(k, r, r.size)
     for x in passes:
-        slopes = x.program.linearised(segments, target, x.values, x.sizes, lanes=TOGETHER)[1]
+        slopes = x.program.linearised(segments, target, x.values, x.sizes, lanes=PER_PASS)[1]
         for column, k, size in zip(slopes.T, x.places, x.sizes, strict=True):
             if not np.all(np.isfinite(column)):  # perhaps for another's shape
-                column = x.program.linearised(segments, target, recipes[k].values, [size], lanes=TOGETHER)[1][:, 0]
+                column = x.program.linearised(segments, target, recipes[k].values, [size], lanes=PER_PASS)[1][:, 0]
             yield k, column
 
 

@@ -21,10 +21,10 @@ from hdev_jax.targets import TargetName
 
 __all__ = ["SharedKernel", "absent", "apart", "of_library"]
 
-# Of a log of 14,000 rows a column takes 5 ms with every effect and 1.5 ms with six, so all of them 1.5 s and 0.4 s; to
-# trace and compile those of a step anew takes 5 to 20 s. Twice or half of it changes the time alone.
+# Of a log of 14,000 rows a column takes 2.3 ms with every effect, so those of a step 0.3 s; to trace and compile them
+# anew takes 5 to 20 s. Twice or half of it changes the time alone.
 SHORT_ROWS = 65_536
-RESULTS = 6  # Jacobians that are kept: 2 MB for 14,000 rows and 20 coefficients
+RESULTS = 6  # Jacobians that are kept: 2 MB each for 14,000 rows and 20 coefficients, 10 MB for 65,536
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,8 @@ class SharedKernel:
 
     def serves(self, vehicle: Vehicle, target: TargetName) -> bool:
         """Whether the shared programs serve this search: not on a long log, where what is absent costs more than a new
-        program, nor where a reading leaves an absent effect without a finite value (an altitude of 65 km), since 0
-        times that is no number either."""
+        program, nor where a reading leaves an absent effect without a finite value (NaN in a channel that the vehicle
+        does not use), since 0 times that is no number either."""
         if self.facts.rows > SHORT_ROWS:
             return False
         if target not in self._sound:
@@ -77,9 +77,11 @@ class SharedKernel:
         key = id(program), values.tobytes(), tuple(free), target, id(segments)
         if key not in self._results:  # what was fitted is scored at the same values
             result = program.linearised(jax.tree.map(jnp.asarray, segments), target, values, free)
-            if not all(np.all(np.isfinite(x)) for x in result):  # rows that the search has not seen
+            if not all(np.all(np.isfinite(x)) for x in result):  # at these values, or on other rows than `serves` saw
                 result = linearised(vehicle, table, segments, target, theta)
-            self._results[key] = program, segments, result  # held, so that no other has their ids
+            for x in result:
+                x.flags.writeable = False  # the next caller gets the same arrays
+            self._results[key] = segments, result  # held, so that no others have their id
             while len(self._results) > RESULTS:
                 self._results.pop(next(iter(self._results)))
         return self._results[key][-1]
@@ -89,15 +91,15 @@ class SharedKernel:
         if self._of_library(vehicle, target):
             program = self.program(vehicle)
             predicted = program.predicted(jax.tree.map(jnp.asarray, segments), target, program.null)
-            if np.all(np.isfinite(predicted)):  # not on rows that the search has not seen
+            if np.all(np.isfinite(predicted)):  # at these values, and on other rows than `serves` saw
                 return predicted
         return np.asarray(predict(vehicle, segments, target))
 
     def _of_library(self, vehicle: Vehicle, target: TargetName) -> bool:
         """Whether the vehicle is computed by the shared programs: the declared model has its own, and so have vehicles
-        with other effects than the library's."""
+        with other effects than this library's."""
         beside = [e for e in vehicle.effects if type(e) not in DECLARED]
-        known = all(of_library(type(e)) and not e.searched for e in beside)
+        known = all(of_library(type(e)) and self.library.get(e.id) is type(e) and not e.searched for e in beside)
         return bool(beside) and known and self.serves(vehicle, target)
 
     def _of_table(

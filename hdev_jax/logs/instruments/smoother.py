@@ -287,8 +287,8 @@ def _forward(cells: Any, course: Array, sees: Array, keep: bool) -> Any:
         gain = jnp.where(there[None], towards / var[None], 0.0)
         miss = jnp.where(there, z - _dot(mean, sees), 0.0)
         after = mean + gain * miss[None], cov - _outer(gain, towards)
-        cell = _Cell(move, mean, cov, miss, var, gain, there, sees)
-        return after, cell if keep else jnp.where(there, -0.5 * (miss**2 / var + jnp.log(var)), 0.0)
+        known = _Cell(move, mean, cov, miss, var, gain, there, sees)
+        return after, known if keep else jnp.where(there, -0.5 * (miss**2 / var + jnp.log(var)), 0.0)
 
     lanes = z.shape[-1]
     first = jnp.stack([UNKNOWN_M**2 * sees[0], slope**2, (slope / length) ** 2, drift**2, (drift / tau) ** 2])[:states]
