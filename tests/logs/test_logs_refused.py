@@ -374,3 +374,10 @@ def test_a_quoted_text_may_hold_separators_and_line_breaks(tmp_path):
     frame = samples(60).assign(note='stop\nat "HB", then\na,b,c,d,e,f,g,h,i\nend')
     frame.to_csv(tmp_path / "log.csv", index=False)
     assert len(read_log(tmp_path / "log.csv")) == 60
+
+
+def test_a_carriage_return_within_a_line_is_named(tmp_path):
+    path = tmp_path / "m.csv"
+    path.write_bytes(b"time_s,speed_mps,battery_power_w\n0,1,2\n1,4\r.5,9\n2,3,4\n")
+    with pytest.raises(InputError, match=r"m\.csv, line 3: a carriage return within the line"):
+        read_log([path])

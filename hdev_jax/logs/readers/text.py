@@ -66,6 +66,9 @@ def read_text(path: Path, data: bytes, adapter: Adapter) -> Text:
         check_header(path, layout.names)
         records = _records(text, lines, layout)
     except csv.Error as e:
+        if line := next((i for i, x in enumerate(lines, 1) if "\r" in x.rstrip("\r")), 0):
+            what = "a carriage return within the line, where other lines end in a line feed"
+            raise InputError(f"{path}, line {line}: {what}; write the file with one kind of line end") from None
         raise InputError(f"{path}: not a regular table: {e}") from None
     records, ledger = _kept(path, lines, records, layout)
     body = _body(text, lines, records, layout)
