@@ -24,7 +24,8 @@ __all__ = ["SharedKernel", "absent", "apart", "of_library"]
 # Of a log of 14,000 rows a column takes 2.3 ms with every effect, so those of a step 0.3 s; to trace and compile them
 # anew takes 5 to 20 s. Twice or half of it changes the time alone.
 SHORT_ROWS = 65_536
-RESULTS = 6  # Jacobians that are kept: 2 MB each for 14,000 rows and 20 coefficients, 10 MB for 65,536
+# Jacobians that are kept, which changes the time alone: 2 MB each for 14,000 rows and 20 coefficients, 10 MB for 65,536
+RESULTS = 6
 
 
 @dataclass(frozen=True, eq=False)
