@@ -30,7 +30,8 @@ def open_mdf(path: Path) -> Any:
     asammdf = library("asammdf", path, "can")
     with _silent_deletion():
         try:
-            return asammdf.MDF(path)
+            # its own search for frames reads the whole file once more, only for channels that we make ourselves
+            return asammdf.MDF(path, process_bus_logging=False)
         except Exception as e:  # asammdf's own, struct's, zlib's and more, by where the damage is
             why = str(e)[:120]
     raise InputError(f"{path}: truncated or damaged MDF file ({why})")
