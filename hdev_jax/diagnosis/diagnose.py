@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from hdev_jax.diagnosis.candidates.shared import SharedKernel
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Described, formula
 from hdev_jax.diagnosis.competition.compete import compete, named_alone, no_instrument_named, none_named, rows_with
 from hdev_jax.diagnosis.competition.refit import as_reported
@@ -39,7 +38,7 @@ Checkpoint = Callable[[str, Callable[[], Any]], Any]
 @dataclass(frozen=True)
 class Outcome:
     """What came out: `summary` is diagnosis.json, `before` and `after` the two vehicles, the columns for figures;
-    `kernel`, the programs that computed them; `given`, the rows with their decoded states, where a load has one."""
+    `training`, the rows it was searched on; `given`, the rows with their decoded states, where a load has one."""
 
     problem: Problem
     split: Split
@@ -50,7 +49,7 @@ class Outcome:
     predicted_before: np.ndarray
     predicted_after: np.ndarray
     found: dict[str, dict[str, tuple[float, float, str]]]
-    kernel: SharedKernel
+    training: Training
     given: Given | None = None
 
 
@@ -131,7 +130,7 @@ def _diagnosed(
     found = {k: {n: (p["value"], p["sd"], p["unit"]) for n, p in v.items()} for k, v in sheet.items()}
     return Outcome(
         problem, split, summary, steps[0].vehicle, steps[-1].vehicle, steps[-1], predicted[0], predicted[-1], found,
-        training.kernel, given,
+        training, given,
     )  # fmt: skip
 
 

@@ -1,15 +1,17 @@
 """A vehicle with the uncertainty of its coefficients: calibrated on a log, or as a fit before has left it."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.inference import Spread, calibrate, cluster_rows, covariance_root, left_out, padded
+from hdev_jax.inference import predict as predict_rows
 from hdev_jax.inference.calibrate import inside
 from hdev_jax.inference.sheet import Sheet
 from hdev_jax.physics import Vehicle
@@ -29,7 +31,7 @@ class Fitted:
 
     `covariance` of the table's free coefficients, known to `freedom` degrees of freedom; `spread`, the noise of rows
     and trips, None where the log does not measure the target and no fit has left it; `how`, where the estimates come
-    from, in a sentence; `notes` for the user.
+    from, in a sentence; `notes` for the user; `compute`, as in `Problem.predict`.
     """
 
     problem: Problem
@@ -39,6 +41,7 @@ class Fitted:
     spread: Spread | None
     how: str
     notes: tuple[str, ...] = ()
+    compute: Callable[..., Any] = predict_rows
 
     @property
     def values(self) -> Float[np.ndarray, " free"]:
@@ -80,7 +83,7 @@ class Fitted:
     @cached_property
     def predicted(self) -> Float[np.ndarray, " row"]:
         """The target's column at the estimates."""
-        return self.problem.predict(self.vehicle)
+        return self.problem.predict(self.vehicle, compute=self.compute)
 
 
 def calibrated_on(problem: Problem, trips: Sequence[int] | None = None) -> Fitted:

@@ -54,7 +54,7 @@ def course_of(outcome: Outcome) -> dict[str, Any]:
     if not table.free:
         return {**out, "coefficients": None}
     rows = padded(problem.segments, problem.measured)
-    j = outcome.kernel.linearised(vehicle, table, rows.segments, problem.target)[1][: rows.rows]
+    j = outcome.training.kernel.linearised(vehicle, table, rows.segments, problem.target)[1][: rows.rows]
     residual = problem.measured - predicted
     trip = np.asarray(problem.segments.trip)
     noise = estimate_noise(residual, trip, seconds, levels=len(there) > 1)

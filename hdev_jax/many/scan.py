@@ -13,6 +13,7 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.diagnose import Outcome, training_of
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import ParameterTable
 from hdev_jax.physics import LIBRARY, Vehicle
 from hdev_jax.problem import Problem, Split
@@ -29,7 +30,7 @@ def key_of(candidate: Candidate) -> str:
     return f"{candidate.id}.{candidate.sizes[0]} {shapes}".strip()
 
 
-def scan_of(outcome: Outcome, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
+def scan_of(outcome: Outcome) -> dict[str, dict[str, Any]]:
     """Size (from its null) and standard error of each candidate, by its key (`key_of`), with the found effects in.
 
     **Returns:** of each `id`, `kind` ("size", or "limit": a switch, whose size is a share of its full difference),
@@ -39,7 +40,7 @@ def scan_of(outcome: Outcome, split: Split, settings: Settings) -> dict[str, dic
         return {}
     vehicle = outcome.fit.vehicle if outcome.found else outcome.problem.vehicle
     table = outcome.fit.table if outcome.found else outcome.problem.table
-    out = _scanned(outcome.problem, split, settings, vehicle, table)
+    out = _scanned(outcome.training, vehicle, table)
     for id_, parameters in outcome.found.items():
         for name, (value, sd, _) in parameters.items():
             p = next((p for p in LIBRARY[id_].parameters if p.name == name), None)
@@ -53,20 +54,18 @@ def scan_of(outcome: Outcome, split: Split, settings: Settings) -> dict[str, dic
 
 def scan_beside(problem: Problem, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
     """As `scan_of`, for a sheet that has the effects in it; it is calibrated with them."""
-    return _scanned(problem, split, settings, problem.vehicle, problem.table)
-
-
-def _scanned(
-    problem: Problem, split: Split, settings: Settings, vehicle: Vehicle, table: ParameterTable
-) -> dict[str, dict[str, Any]]:
     training, _ = training_of(problem, split, LIBRARY, settings)
+    return _scanned(training, problem.vehicle, problem.table)
+
+
+def _scanned(training: Training, vehicle: Vehicle, table: ParameterTable) -> dict[str, dict[str, Any]]:
     scores = score_all(training, training.calibrate(vehicle, table))
     evidence = scores.white
     squares = np.diag(evidence.totals()[0])[evidence.base : -1]
     out = {}
     for c in scores.source.candidates:
         one = len(c.columns) == 1 and c.groups[0] is None and not _of_own_trips(c)
-        if not one or not squares[c.columns[0]] > 1e-20 or evidence.left(c.columns) < settings.absorbed:
+        if not one or not squares[c.columns[0]] > 1e-20 or evidence.left(c.columns) < training.settings.absorbed:
             continue
         value, sd = (float(x[0]) for x in evidence.estimate(c))
         if np.isfinite(value) and np.isfinite(sd) and sd > 0:

@@ -126,7 +126,7 @@ def _analysed(task: Mapping[str, Any]) -> dict[str, Any]:
                     for e in summary["effects"]],
         "fitted": {e: {n: [v, sd] for n, (v, sd, _) in ps.items()} for e, ps in outcome.found.items()},
         "coefficients": _coefficients(outcome, problem),
-        "scan": {} if doubts else scan_of(outcome, split, settings),
+        "scan": {} if doubts else scan_of(outcome),
         "course": course_of(outcome),
         "ledger": energy,
         "notes": notes,
@@ -159,14 +159,15 @@ def _coefficients(outcome: Outcome, problem: Problem) -> dict[str, dict[str, Any
 
 def _energy(outcome: Outcome, seed: int) -> dict[str, Any]:
     """Rows of the vehicle's ledger for the whole log and each week [kWh]."""
-    problem, fit = outcome.problem, outcome.fit
+    problem, fit, kernel = outcome.problem, outcome.fit, outcome.training.kernel
     segments = outcome.given.segments if outcome.given else problem.segments
     problem = replace(problem, segments=segments, vehicle=fit.vehicle, table=fit.table)
     used = problem.rows(outcome.split.train)
     rows = padded(problem.segments.take(used), problem.measured[used])
-    spread, _ = left_out(fit, rows, problem.target, problem.weight()[used], linearise=outcome.kernel.linearised)
+    spread, _ = left_out(fit, rows, problem.target, problem.weight()[used], linearise=kernel.linearised)
     freedom = max(cluster_rows(problem.segments.take(used)).count - 1.0, 2.0)
-    found = ledger_of(Fitted(problem, fit.vehicle, fit.covariance, freedom, spread, "diagnosed"), seed=seed)
+    fitted = Fitted(problem, fit.vehicle, fit.covariance, freedom, spread, "diagnosed", compute=kernel.predict)
+    found = ledger_of(fitted, seed=seed)
     return {
         "rows": _lines(found.rows, ("level", "name", "cause", "kwh", "lower", "upper")),
         "about": _lines(found.about, ("level", "name", "km", "hours", "trips", "measured_kwh", "regenerated_kwh",

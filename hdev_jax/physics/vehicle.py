@@ -288,13 +288,15 @@ class Vehicle(eqx.Module):
         effect counts by the difference that it makes to the prediction.
         """
         hours = jnp.asarray(segments.duration_s) / J_PER_WH
-        chain_only = self._with(tuple(e for e in self.effects if not _is_sensor(e)))
-        parts = {k: w * hours for k, w in chain_only._rows(segments, lambda c, _: c.added_w).items()}
-        car, before = chain_only, chain_only.energy(segments)
+        car = self._with(tuple(e for e in self.effects if not _is_sensor(e)))
+        added, column = car._rows(segments, lambda c, _: (c.added_w, c.point.power_w))
+        parts, before = {k: w * hours for k, w in added.items()}, column * hours
         for e in self.effects:
             if _is_sensor(e):
                 car = car.plus(e)
-                after = car.energy(segments)
+                if not e.alone("observe"):  # what only shows the column leaves it as it is
+                    column = car.column(segments, "energy_wh")
+                after = car.shown(column, segments, "energy_wh")
                 parts[e.id] = after - before
                 before = after
         return parts

@@ -17,6 +17,7 @@ from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.inference import ParameterTable, effect_coefficients, linearised, padded, predict
+from hdev_jax.inference.parameters import insert
 from hdev_jax.physics import LIBRARY, Effect, Grouped, Shape, Size, Vehicle, at_null
 from hdev_jax.problem import Problem
 
@@ -161,6 +162,41 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows)
         part = kernel._of_table(vehicle, table)[0].parts[1]
         programs.add((part.structure, jax.tree.structure(part.car)))
     assert len(programs) == 1
+
+
+class Amplified(Effect):
+    """An amplifier that draws power itself, so that it acts in the kernel and behind it."""
+
+    id = "amplified"
+    stage = "battery"
+    equation = "P → (P + P₀)(1 + g)"
+    parameters = (Size("gain", "1", 0.0, 0.1, -1.0, 1.0), Size("power_w", "W", 0.0, 1e3))
+    gain: Any
+    power_w: Any
+
+    def power(self, row, car, point):
+        return self.power_w
+
+    def observe(self, column, segments):
+        return column * (1.0 + self.gain)
+
+
+def test_an_effect_that_also_changes_the_column_is_a_part_of_both_programs(problem, rows):
+    facts = facts_of(rows.segments, rows.rows)
+    plan = plan_of(problem.vehicle, [LIBRARY["time_skew"], Amplified, LIBRARY["sampling_filter"]], facts, "energy_wh")
+    program = next(r.program for r in plan.recipes if "amplified" in {e.id for e in r.program.car.effects})
+    values = program.null + 0.1 * np.arange(1, len(program.null) + 1)
+    free = range(len(values))
+    column, slopes = program.linearised(rows.segments, "energy_wh", values, free)
+
+    def whole(x):
+        return insert(program.car, program.structure, x).predict(rows.segments, "energy_wh")
+
+    expected = np.asarray(whole(jnp.asarray(values)))
+    np.testing.assert_allclose(column, expected, atol=1e-9 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(program.predicted(rows.segments, "energy_wh", values), column, rtol=1e-12)
+    for k, slope in zip(free, np.asarray(jax.jacfwd(whole)(jnp.asarray(values))).T, strict=True):
+        np.testing.assert_allclose(slopes[:, k], slope, atol=1e-9 * np.max(np.abs(slope)))
 
 
 class Fading(Effect):

@@ -10,8 +10,7 @@ import pytest
 
 from hdev_jax.diagnosis.candidates.facts import facts_of
 from hdev_jax.diagnosis.candidates.plan import columns
-from hdev_jax.diagnosis.candidates.shared import SharedKernel
-from hdev_jax.diagnosis.diagnose import Outcome
+from hdev_jax.diagnosis.diagnose import Outcome, training_of
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import calibrate, cluster_rows, padded, predict
 from hdev_jax.inference.sheet import Sheet, read_sheet
@@ -149,9 +148,9 @@ def test_the_page_shows_the_test_part_as_a_part_of_its_trip(tmp_path):
     segments = problem.segments.take(train)
     rows = padded(segments, problem.measured[train])
     fit = calibrate(problem.vehicle, problem.table, rows, problem.target, cluster_rows(segments))
-    car, kernel = fit.vehicle.plus(*ACROSS_ROWS), SharedKernel({}, facts_of(rows.segments, rows.rows), rows.segments)
+    car, (training, _) = fit.vehicle.plus(*ACROSS_ROWS), training_of(problem, split, {})
     predicted = problem.predict(car)
-    result = Outcome(problem, split, {"target": problem.target}, car, car, fit, predicted, predicted, {}, kernel)
+    result = Outcome(problem, split, {"target": problem.target}, car, car, fit, predicted, predicted, {}, training)
     data = of_diagnosis(result, "", 0.0)
     assert sum(data.breakdown["after"].values()) == pytest.approx(np.sum(predicted[test]) / 1e3, rel=1e-9)
     since = data.row("distance_since_start_m")

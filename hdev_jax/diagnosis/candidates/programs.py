@@ -42,8 +42,9 @@ class Program:
     """A vehicle with effects at their null, compiled once for one shape of rows.
 
     `structure` says where each of their parameters sits, `null` holds the parameters' null values, and those of found
-    effects and of the declared model as they were fitted. What only corrects measurements across rows, or only changes
-    the predicted column, is compiled apart from the kernel: it is small, and the kernel is the same with and without.
+    effects and of the declared model as they were fitted. What only corrects measurements across rows, and each effect
+    that changes the predicted column, is compiled apart from the kernel: it is small, and the kernel is the same with
+    and without.
     """
 
     car: Vehicle
@@ -57,7 +58,9 @@ class Program:
         before, kernel, after = self.parts
         seen = before.corrected(segments, values)
         column = _column(kernel.car, kernel.structure, target, seen, values[kernel.at])
-        return np.asarray(_shown(after.car, after.structure, target, segments, column, values[after.at]))
+        for part in after:
+            column = _observed(part.car, part.structure, segments, column, values[part.at])
+        return np.asarray(_in_unit(self._bare, target, segments, column))
 
     def linearised(
         self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"], free: Sequence[int],
@@ -81,32 +84,35 @@ class Program:
         for k in np.flatnonzero(np.any(along[:, before.at] != 0, axis=1)):
             moved = _corrected_slope(before.car, before.structure, segments, values[before.at], along[k, before.at])
             slopes = slopes.at[:, k].add(_column_moved(kernel.car, kernel.structure, target, seen, at, moved))
-        parts = [slice(k, k + PER_PASS) for k in range(0, len(along), PER_PASS)]  # always as many: compiled once
-        each = [
-            _shown_slopes(
-                after.car, after.structure, target, segments, column, values[after.at], slopes[:, k], along[k, after.at]
-            )
-            for k in parts
-        ]
-        return np.asarray(each[0][0]), np.concatenate([np.asarray(s) for _, s in each], axis=1)
+        each = [slopes[:, k : k + PER_PASS] for k in range(0, len(along), PER_PASS)]  # always as many: compiled once
+        for part in after:
+            at, ways = values[part.at], along[:, part.at]
+            moved = [
+                _observed_slopes(part.car, part.structure, segments, column, at, x, ways[k * PER_PASS :][:PER_PASS])
+                for k, x in enumerate(each)
+            ]
+            column, each = moved[0][0], [x for _, x in moved]
+        shown = [np.asarray(_in_unit(self._bare, target, segments, x)) for x in (column, *each)]
+        return shown[0], np.concatenate(shown[1:], axis=1)
 
     @cached_property
-    def parts(self) -> tuple[_Part, _Part, _Part]:
-        """What corrects the measurements across rows, the kernel, what changes the predicted column."""
-        car, every = self.car, self.car.effects
-        # one after the other: where one of a kind does more, all of that kind stay in the kernel
+    def parts(self) -> tuple[_Part, _Part, list[_Part]]:
+        """What corrects the measurements across rows, the kernel, and each effect that changes the predicted column."""
+        every = self.car.effects
         across, observing = ([e for e in every if e.overrides(hook)] for hook in ("across", "observe"))
+        # one after the other: where one of them does more, all stay in the kernel
         if not all(e.alone("across") and not any(isinstance(p, Size) for p in e.parameters) for e in across):
             across = []
-        if not all(e.alone("observe") for e in observing):
-            observing = []
-        outside = [e.id for e in (*across, *observing)]
-        bare = car.minus(*(e.id for e in every))
+        outside = [e.id for e in (*across, *(e for e in observing if e.alone("observe")))]
         held = [k for k, s in enumerate(self.structure) if not s[0].startswith(tuple(f"effects.{i}." for i in outside))]
         return (
-            self._part(bare.plus(*across), self._places(across)), self._part(car.minus(*outside), held),
-            self._part(bare.plus(*observing), self._places(observing)),
+            self._part(self._bare.plus(*across), self._places(across)), self._part(self.car.minus(*outside), held),
+            [self._part(self._bare.plus(e), self._places([e])) for e in observing],
         )  # fmt: skip
+
+    @cached_property
+    def _bare(self) -> Vehicle:
+        return self.car.minus(*(e.id for e in self.car.effects))
 
     def _places(self, effects: Sequence[Effect]) -> list[int]:
         heads = tuple(f"effects.{e.id}." for e in effects)
@@ -272,22 +278,27 @@ def _column_moved(
     return jax.jvp(column, (numbers,), (moved,))[1]
 
 
-@partial(jax.jit, static_argnums=(1, 2))
-def _shown(
-    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any
-) -> Array:
-    return insert(car, structure, jnp.asarray(values)).shown(column, segments, target)
+@partial(jax.jit, static_argnums=1)
+def _observed(car: Vehicle, structure: Structure, segments: Segments, column: Array, values: Any) -> Array:
+    return insert(car, structure, jnp.asarray(values)).effects[0].observe(column, segments)
 
 
-@partial(jax.jit, static_argnums=(1, 2))
-def _shown_slopes(
-    car: Vehicle, structure: Structure, target: TargetName, segments: Segments, column: Array, values: Any,
-    slopes: Any, directions: Any,
-) -> tuple[Array, Array]:  # fmt: skip
-    def shown(y: Array, x: Array) -> Array:
-        return insert(car, structure, x).shown(y, segments, target)
+@partial(jax.jit, static_argnums=1)
+def _observed_slopes(
+    car: Vehicle, structure: Structure, segments: Segments, column: Array, values: Any, slopes: Any, directions: Any
+) -> tuple[Array, Array]:
+    def observed(y: Array, x: Array) -> Array:
+        return insert(car, structure, x).effects[0].observe(y, segments)
 
     def along(slope: Array, direction: Array) -> tuple[Array, Array]:
-        return jax.jvp(shown, (column, jnp.asarray(values)), (slope, direction))
+        return jax.jvp(observed, (column, jnp.asarray(values)), (slope, direction))
 
     return jax.vmap(along, in_axes=(-1, 0), out_axes=(None, -1))(jnp.asarray(slopes), jnp.asarray(directions))
+
+
+@partial(jax.jit, static_argnums=1)
+def _in_unit(bare: Vehicle, target: TargetName, segments: Segments, columns: Array) -> Array:
+    """A column, or several side by side, in the target's unit: without effects, `shown` multiplies only."""
+    if columns.ndim == 1:
+        return bare.shown(columns, segments, target)
+    return jax.vmap(lambda x: bare.shown(x, segments, target), in_axes=-1, out_axes=-1)(columns)
