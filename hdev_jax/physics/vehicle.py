@@ -294,7 +294,7 @@ class Vehicle(eqx.Module):
         for e in self.effects:
             if _is_sensor(e):
                 car = car.plus(e)
-                if not e.alone("observe"):  # what only shows the column leaves it as it is
+                if not e.alone("observe"):  # which acts behind the kernel
                     column = car.column(segments, "energy_wh")
                 after = car.shown(column, segments, "energy_wh")
                 parts[e.id] = after - before

@@ -12,7 +12,8 @@ from planted import opened
 from hdev_jax.diagnosis.candidates.candidate import Candidate, finer, realised
 from hdev_jax.diagnosis.candidates.facts import facts_of
 from hdev_jax.diagnosis.candidates.plan import columns, plan_of
-from hdev_jax.diagnosis.candidates.shared import SharedKernel
+from hdev_jax.diagnosis.candidates.programs import Program
+from hdev_jax.diagnosis.candidates.shared import SharedKernel, absent
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import inside, plausible, without_idle
 from hdev_jax.diagnosis.settings import SETTINGS
@@ -137,7 +138,7 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
 
 def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows):
     """Beside effects of one row, across rows (a delay of the readings) and of the instrument, with every coefficient
-    free; whatever was found, the kernel is compiled once."""
+    free; whatever was found, the kernel is compiled once, and each instrument."""
     facts = facts_of(rows.segments, rows.rows)
     found = [
         with_values(LIBRARY["auxiliary_power"], facts.gears, power_w=900.0),
@@ -147,6 +148,7 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows)
     ]
     effects = ["auxiliary_power", "hvac_power", "time_skew", "power_gain", "cornering", "headwind"]
     kernel, programs = SharedKernel({k: LIBRARY[k] for k in effects}, facts, rows.segments), set()
+    instruments = set()
     for has in (found[:1], found[:3], found):
         vehicle = problem.vehicle.plus(*has)
         own = [c for e in has for c in effect_coefficients(e, [p.name for p in e.parameters if p.has_column])]
@@ -159,9 +161,11 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows)
         plain = np.asarray(predict(vehicle, rows.segments, problem.target))
         shared = kernel.predict(vehicle, rows.segments, problem.target)
         assert np.all(np.abs(shared - plain) <= 1e-12 * np.max(np.abs(plain)))
-        part = kernel._of_table(vehicle, table)[0].parts[1]
+        _, part, after = kernel._of_table(vehicle, table)[0].parts
         programs.add((part.structure, jax.tree.structure(part.car)))
+        instruments |= {(x.structure, jax.tree.structure(x.car)) for x in after}
     assert len(programs) == 1
+    assert len(instruments) == 2
 
 
 class Amplified(Effect):
@@ -181,22 +185,23 @@ class Amplified(Effect):
         return column * (1.0 + self.gain)
 
 
-def test_an_effect_that_also_changes_the_column_is_a_part_of_both_programs(problem, rows):
+@pytest.mark.parametrize("target", ["energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n"])
+def test_instruments_show_the_column_one_after_the_other(problem, rows, target):
+    """Also where one of them acts in the kernel too; values and slopes as of the whole vehicle."""
     facts = facts_of(rows.segments, rows.rows)
-    plan = plan_of(problem.vehicle, [LIBRARY["time_skew"], Amplified, LIBRARY["sampling_filter"]], facts, "energy_wh")
-    program = next(r.program for r in plan.recipes if "amplified" in {e.id for e in r.program.car.effects})
+    known = [absent(LIBRARY[k], facts) for k in ("power_gain", "time_skew", "sampling_filter", "auxiliary_power")]
+    program = Program.of(problem.vehicle, [*known, absent(Amplified, facts)])
     values = program.null + 0.1 * np.arange(1, len(program.null) + 1)
-    free = range(len(values))
-    column, slopes = program.linearised(rows.segments, "energy_wh", values, free)
+    column, slopes = program.linearised(rows.segments, target, values, range(len(values)))
 
     def whole(x):
-        return insert(program.car, program.structure, x).predict(rows.segments, "energy_wh")
+        return insert(program.car, program.structure, x).predict(rows.segments, target)
 
     expected = np.asarray(whole(jnp.asarray(values)))
     np.testing.assert_allclose(column, expected, atol=1e-9 * np.max(np.abs(expected)))
-    np.testing.assert_allclose(program.predicted(rows.segments, "energy_wh", values), column, rtol=1e-12)
-    for k, slope in zip(free, np.asarray(jax.jacfwd(whole)(jnp.asarray(values))).T, strict=True):
-        np.testing.assert_allclose(slopes[:, k], slope, atol=1e-9 * np.max(np.abs(slope)))
+    np.testing.assert_allclose(program.predicted(rows.segments, target, values), column, rtol=1e-12)
+    for got, slope in zip(slopes.T, np.asarray(jax.jacfwd(whole)(jnp.asarray(values))).T, strict=True):
+        np.testing.assert_allclose(got, slope, atol=1e-9 * np.max(np.abs(slope)))
 
 
 class Fading(Effect):

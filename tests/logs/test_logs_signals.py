@@ -180,6 +180,27 @@ def test_faster_powers_are_averaged_and_states_kept(tmp_path):
         read_log(tmp_path / "x.mf4")
 
 
+def test_a_database_within_the_file_decodes_its_frames(tmp_path):
+    """As loggers attach it (ASAM MDF, bus logging): its signals are channels like any other."""
+    from asammdf.blocks import v4_constants as blocks
+
+    fields = [("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1")]
+    records = np.zeros(N, [(f"CAN_DataFrame.{k}", t) for k, t in (*fields, ("DataBytes", "(8,)u1"))])
+    for key, value in {"BusChannel": 1, "ID": 291, "DLC": 8, "DataLength": 8}.items():
+        records[f"CAN_DataFrame.{key}"] = value
+    records["CAN_DataFrame.DataBytes"][:, :2] = np.round(100 * V).astype(">u2")[:, None].view("u1")
+    source = asammdf.Source("CAN1", "CAN1", "", blocks.SOURCE_BUS, blocks.BUS_TYPE_CAN)
+    kept = (DBC.encode(), "truck.dbc", None)
+    mdf = asammdf.MDF(version="4.10")
+    mdf.append(asammdf.Signal(records, T, name="CAN_DataFrame", source=source, attachment=kept), acq_source=source)
+    mdf.groups[0].channel_group.flags |= blocks.FLAG_CG_BUS_EVENT
+    mdf.append(asammdf.Signal(T, T, name="P", unit="kW"))
+    mdf.save(tmp_path / "x.mf4")
+    columns = {"speed_mps": "Speed", "battery_power_w": "P"}
+    log = read_log(tmp_path / "x.mf4", Adapter.from_dict({"columns": columns}))
+    np.testing.assert_allclose(log.segments.distance_m, V / 36.0, rtol=1e-3)
+
+
 @pytest.mark.parametrize("ending", ["blf", "mf4", "asc"])
 def test_a_truncated_recording_is_refused(tmp_path, ending, capfd):
     path = write(tmp_path / f"x.{ending}", drive())

@@ -42,9 +42,9 @@ class Program:
     """A vehicle with effects at their null, compiled once for one shape of rows.
 
     `structure` says where each of their parameters sits, `null` holds the parameters' null values, and those of found
-    effects and of the declared model as they were fitted. What only corrects measurements across rows, and each effect
-    that changes the predicted column, is compiled apart from the kernel: it is small, and the kernel is the same with
-    and without.
+    effects and of the declared model as they were fitted. What only corrects measurements across rows is compiled apart
+    from the kernel, and so is each `observe`: they are small, and the kernel is the same with and without. An effect
+    that does more than observe is in the kernel too.
     """
 
     car: Vehicle
@@ -86,14 +86,14 @@ class Program:
             slopes = slopes.at[:, k].add(_column_moved(kernel.car, kernel.structure, target, seen, at, moved))
         each = [slopes[:, k : k + PER_PASS] for k in range(0, len(along), PER_PASS)]  # always as many: compiled once
         for part in after:
-            at, ways = values[part.at], along[:, part.at]
-            moved = [
-                _observed_slopes(part.car, part.structure, segments, column, at, x, ways[k * PER_PASS :][:PER_PASS])
+            own, ways = values[part.at], along[:, part.at]
+            shown = [
+                _observed_slopes(part.car, part.structure, segments, column, own, x, ways[k * PER_PASS :][:PER_PASS])
                 for k, x in enumerate(each)
             ]
-            column, each = moved[0][0], [x for _, x in moved]
-        shown = [np.asarray(_in_unit(self._bare, target, segments, x)) for x in (column, *each)]
-        return shown[0], np.concatenate(shown[1:], axis=1)
+            column, each = shown[0][0], [x for _, x in shown]
+        converted = [np.asarray(_in_unit(self._bare, target, segments, x)) for x in (column, *each)]
+        return converted[0], np.concatenate(converted[1:], axis=1)
 
     @cached_property
     def parts(self) -> tuple[_Part, _Part, list[_Part]]:
@@ -298,7 +298,7 @@ def _observed_slopes(
 
 @partial(jax.jit, static_argnums=1)
 def _in_unit(bare: Vehicle, target: TargetName, segments: Segments, columns: Array) -> Array:
-    """A column, or several side by side, in the target's unit: without effects, `shown` multiplies only."""
+    """A column, or several side by side, in the target's unit: without effects, `shown` only converts it."""
     if columns.ndim == 1:
         return bare.shown(columns, segments, target)
     return jax.vmap(lambda x: bare.shown(x, segments, target), in_axes=-1, out_axes=-1)(columns)

@@ -19,6 +19,7 @@ from hdev_jax.logs.readers.signals.frames import Asked, Identifier, Recording, f
 __all__ = ["channels_of_mdf", "frames_of_mdf", "open_mdf"]
 
 _FRAME = "CAN_DataFrame"
+_DECODED = (_FRAME, "LIN_Frame")  # by asammdf, given a database
 _BUS_EVENTS = ("CAN_", "LIN_", "ETH_", "FLX_", "MOST_")  # ASAM MDF, bus logging: names of its groups
 _TIME = 1  # synchronisation by time; others count angles, metres or records
 _RECORDS = 1_000_000  # frames looked at together
@@ -26,15 +27,25 @@ _TEXTS = (6, 7, 8, 9, 10, 11, 12, 13, 14)  # data types of MDF 4 that are texts,
 
 
 def open_mdf(path: Path) -> Any:
-    """The file, open. Raises `InputError` where it is damaged, and without the library."""
+    """The file, open, with the channels that a database of its own decodes from its frames.
+
+    Raises `InputError` where it is damaged, and without the library.
+    """
     asammdf = library("asammdf", path, "can")
     with _silent_deletion():
         try:
-            # its own search for frames reads the whole file once more, only for channels that we make ourselves
-            return asammdf.MDF(path, process_bus_logging=False)
+            # frames are read whole where asammdf decodes them: only where it can
+            mdf = asammdf.MDF(path, process_bus_logging=False)
+            return asammdf.MDF(path) if _own_database(mdf) else mdf
         except Exception as e:  # asammdf's own, struct's, zlib's and more, by where the damage is
             why = str(e)[:120]
     raise InputError(f"{path}: truncated or damaged MDF file ({why})")
+
+
+def _own_database(mdf: Any) -> bool:
+    """Whether the file has a database attached to its frames."""
+    channels = (c for group in mdf.groups for c in group.channels)
+    return any(c.name in _DECODED and getattr(c, "attachment", None) is not None for c in channels)
 
 
 @contextmanager
