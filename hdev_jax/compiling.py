@@ -9,12 +9,16 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["compile_quickly", "compiles_long", "keep_compiled"]
+__all__ = ["compile_quickly", "compiles_long", "crowded", "keep_compiled"]
 
 FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
 PACKED = 5  # times smaller than that, where a file is compressed
 KEPT_BYTES = 40_000_000  # some 2,000 programs; JAX looks at each when it adds one; those not used for longest go first
+# Memory maps of a process: Linux gives it 65,530. So many are 1 GB of compiled programs, those of three searches on
+# 20,000 rows.
+MOST_MAPS = 10_000
+FORGET_EVERY = 40  # calls, where nobody says how many maps there are
 _COMPRESSED = {".gz", ".parquet", ".mat", ".zip", ".xz", ".bz2"}
 
 
@@ -29,6 +33,18 @@ def compiles_long(logs: Iterable[str | Path]) -> bool:
     """Whether compiling is most of what these logs take; what is no file counts as nothing."""
     paths = [p for p in map(Path, logs) if p.is_file()]
     return sum(p.stat().st_size * (PACKED if p.suffix in _COMPRESSED else 1) for p in paths) < SMALL_BYTES
+
+
+def crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:
+    """Whether it is time for `jax.clear_caches()`, after so many calls; `maps`: where Linux lists memory maps.
+
+    JAX keeps every program in memory: a process that searches one log after another would run out of it.
+    """
+    try:
+        with maps.open("rb") as lines:
+            return sum(1 for _ in lines) > MOST_MAPS
+    except OSError:
+        return calls % FORGET_EVERY == 0
 
 
 def keep_compiled() -> Path | None:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import pandas as pd
 
-from experiments.runner.workers import crowded
+from hdev_jax.compiling import crowded
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State

@@ -21,12 +21,11 @@ from typing import Any
 
 from experiments.runner.store import sources
 from hdev_jax import progress
+from hdev_jax.compiling import crowded
 
-__all__ = ["ClusterError", "Job", "Outcome", "call", "crowded", "in_turn", "on_cluster", "on_cores"]
+__all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
-MOST_MAPS = 15_000  # memory maps of a process: Linux gives it 65,530; so many are some 2 GB of compiled programs
-FORGET_EVERY = 40  # tasks, where nobody says how many maps there are
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC")  # the last: XLA's pool
 PATIENCE = 30  # seconds for a scheduler to answer
 
 Job = tuple[str, list[dict[str, Any]]]
@@ -48,7 +47,7 @@ def call(job: Job) -> tuple[list[Any], float]:
     # only where JAX is in use: an experiment may do without
     def run(task: dict[str, Any]) -> Any:
         if crowded(next(_calls)) and (jax := sys.modules.get("jax")) is not None:
-            jax.clear_caches()  # a process that compiles for ever runs out of memory maps
+            jax.clear_caches()
         return module.run(task)
 
     started = time.perf_counter()
@@ -57,15 +56,6 @@ def call(job: Job) -> tuple[list[Any], float]:
     if len(results) != len(tasks):
         raise ValueError(f"{job[0]}.run_together gave {len(results)} results for {len(tasks)} tasks")
     return results, time.perf_counter() - started
-
-
-def crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:
-    """Whether it is time to forget what was compiled, after so many calls; `maps`: where Linux lists memory maps."""
-    try:
-        with maps.open("rb") as lines:
-            return sum(1 for _ in lines) > MOST_MAPS
-    except OSError:
-        return calls % FORGET_EVERY == 0
 
 
 def in_turn(jobs: Sequence[Job]) -> Iterator[tuple[int, Outcome]]:
@@ -125,7 +115,7 @@ def _prepare_worker(compiled: str, threads: int) -> None:
     A cache for each worker: JAX does not write an entry in one step.
     """
     if threads == 1:
-        one = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        one = "--xla_cpu_multi_thread_eigen=false"
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {one}".strip()
     os.environ.update(dict.fromkeys(_THREADS, str(threads)))
     import jax

@@ -5,6 +5,7 @@ another.
 """
 
 import contextlib
+import itertools
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,7 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hdev_jax.compiling import keep_compiled
+import jax
+
+from hdev_jax.compiling import crowded, keep_compiled
 from hdev_jax.errors import InputError
 
 __all__ = ["Workers", "computed"]
@@ -22,7 +25,8 @@ RETRIES = 3  # of a vehicle whose worker was lost
 # Arrays of a log are megabytes. Given back to the system after each use, as Dask has it (65,536 bytes), they cost
 # page faults: a quarter of a vehicle's time is then spent in the operating system, with these a thirtieth.
 _KEEPS_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "268435456", "MALLOC_MMAP_THRESHOLD_": "33554432"}
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NPROC": "1"}  # the last: XLA's pool
+_calls = itertools.count(1)
 _NO_DASK = "needs Dask: pip install 'hdev_jax[fleet]'"
 
 Work = Callable[[Mapping[str, Any]], dict[str, Any]]
@@ -48,7 +52,7 @@ def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> 
         return
     if where.scheduler is None and (where.count < 2 or len(tasks) < 2):
         for i, task in enumerate(tasks):
-            yield i, work(task)
+            yield i, _done(work, task)
         return
     option = f"--scheduler {where.scheduler}" if where.scheduler else f"--workers {where.count}"
     try:
@@ -101,7 +105,7 @@ def _client_of(address: str, option: str) -> Any:
 
 
 def _one_thread_xla() -> str:
-    one = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    one = "--xla_cpu_multi_thread_eigen=false"
     asked = os.environ.get("XLA_FLAGS", "")
     return asked if one in asked else f"{asked} {one}".strip()
 
@@ -119,8 +123,12 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 def _there(work: Work, task: dict[str, Any]) -> dict[str, Any]:
     """What a worker does: double precision, the cache of compiled programs that all of them share, the task."""
-    import jax
-
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
+    return _done(work, task)
+
+
+def _done(work: Work, task: Mapping[str, Any]) -> dict[str, Any]:
+    if crowded(next(_calls)):
+        jax.clear_caches()
     return work(task)

@@ -11,10 +11,11 @@ import pytest
 from toy_studies import squares
 
 from experiments.__main__ import main
-from experiments.runner import store, workers
+from experiments.runner import store
 from experiments.runner.compare import check, comparison
 from experiments.runner.engine import run_config
 from experiments.runner.tables import read_markdown
+from hdev_jax import compiling
 from hdev_jax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -60,11 +61,11 @@ def test_a_process_forgets_what_it_compiled_before_its_memory_maps_run_out(tmp_p
     few, many = tmp_path / "few", tmp_path / "many"
     few.write_text("map\n" * 10)
     many.write_text("map\n" * 11)
-    monkeypatch.setattr(workers, "MOST_MAPS", 10)
-    assert [workers.crowded(calls, few) for calls in (1, workers.FORGET_EVERY)] == [False, False]
-    assert workers.crowded(1, many)
+    monkeypatch.setattr(compiling, "MOST_MAPS", 10)
+    assert [compiling.crowded(calls, few) for calls in (1, compiling.FORGET_EVERY)] == [False, False]
+    assert compiling.crowded(1, many)
     nowhere = tmp_path / "no" / "maps"
-    assert [workers.crowded(calls, nowhere) for calls in (1, workers.FORGET_EVERY)] == [False, True]
+    assert [compiling.crowded(calls, nowhere) for calls in (1, compiling.FORGET_EVERY)] == [False, True]
 
 
 def test_what_was_killed_resumes(tmp_path, config, monkeypatch):

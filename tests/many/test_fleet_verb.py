@@ -8,10 +8,12 @@ import os
 import shutil
 from pathlib import Path
 
+import jax
+import numpy as np
 import pandas as pd
 import pytest
 
-from hdev_jax import cli
+from hdev_jax import cli, compiling
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.many import Workers, computed
 from hdev_jax.many import workers as workers_module
@@ -99,6 +101,19 @@ def test_the_ledger_adds_up_to_what_the_meters_measured(logs, whole):
     logs_wh.append(pd.read_parquet(logs / "logs" / "vehicle_id=V2", partitioning=None)["energy_wh"].sum())
     assert block["measured"] == pytest.approx(sum(logs_wh) / 1e3, rel=1e-6)
     assert block.drop("measured").sum() == pytest.approx(block["measured"], rel=1e-6)
+
+
+@pytest.mark.parametrize(("maps", "programs"), [(10**6, [1, 2, 3]), (0, [1, 1, 1])])
+def test_a_process_does_not_keep_the_programs_of_every_vehicle(monkeypatch, maps, programs):
+    double = jax.jit(lambda x: 2.0 * x)
+
+    def work(task):
+        double(np.zeros(task["rows"]))
+        return {"programs": double._cache_size()}
+
+    monkeypatch.setattr(compiling, "MOST_MAPS", maps)
+    done = computed(work, [{"rows": n} for n in (1, 2, 3)], Workers())
+    assert [r["programs"] for _, r in done] == programs
 
 
 def test_a_run_that_was_killed_goes_on_and_gives_the_same(logs, whole, monkeypatch):
