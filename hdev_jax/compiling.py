@@ -5,11 +5,13 @@ is three quarters of the time, and programs that are not optimised bring the ans
 rows both take as long. Results differ in the last bits of a double.
 """
 
+import itertools
 import os
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["compile_quickly", "compiles_long", "crowded", "keep_compiled"]
+__all__ = ["compile_quickly", "compiles_long", "crowded", "keep_compiled", "make_room"]
 
 FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
@@ -19,6 +21,7 @@ KEPT_BYTES = 40_000_000  # some 2,000 programs; JAX looks at each when it adds o
 # 20,000 rows.
 MOST_MAPS = 10_000
 FORGET_EVERY = 40  # calls, where nobody says how many maps there are
+_calls = itertools.count(1)
 _COMPRESSED = {".gz", ".parquet", ".mat", ".zip", ".xz", ".bz2"}
 
 
@@ -36,15 +39,21 @@ def compiles_long(logs: Iterable[str | Path]) -> bool:
 
 
 def crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:
-    """Whether it is time for `jax.clear_caches()`, after so many calls; `maps`: where Linux lists memory maps.
-
-    JAX keeps every program in memory: a process that searches one log after another would run out of it.
-    """
+    """Whether it is time to forget what was compiled, after so many calls; `maps`: where Linux lists memory maps."""
     try:
         with maps.open("rb") as lines:
             return sum(1 for _ in lines) > MOST_MAPS
     except OSError:
         return calls % FORGET_EVERY == 0
+
+
+def make_room() -> None:
+    """Before the next log of many: JAX keeps every program in memory, and a process would run out of it.
+
+    It is forgotten only where it is in use: an experiment may do without.
+    """
+    if crowded(next(_calls)) and (jax := sys.modules.get("jax")) is not None:
+        jax.clear_caches()
 
 
 def keep_compiled() -> Path | None:

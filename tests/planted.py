@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import pandas as pd
 
-from hdev_jax.compiling import crowded
+from hdev_jax.compiling import make_room
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State
@@ -57,8 +56,6 @@ wheel_radius_m = 0.5
 
 SHORT = {"trips": 12, "rows_per_trip": 120, "ar_coefficient": 0.97}
 
-_runs = 0
-
 
 def run(seed: int, **options) -> tuple[SyntheticLog, Outcome]:
     """Write a short log and its sheet, read them back, and run the whole loop on the default split."""
@@ -69,10 +66,7 @@ def run(seed: int, **options) -> tuple[SyntheticLog, Outcome]:
 
 def diagnosed(problem: Problem, split: Split, library: Mapping[str, type[Effect]] = LIBRARY, **options) -> Outcome:
     """The whole loop, with what a process that compiles for every log has to forget now and then."""
-    global _runs
-    _runs += 1
-    if crowded(_runs):
-        jax.clear_caches()  # or it runs out of memory maps
+    make_room()
     return diagnose(problem, split, library, **{"seed": 0} | options)
 
 

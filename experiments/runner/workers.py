@@ -6,11 +6,9 @@ end; an outcome is the tasks' results and the seconds that they took, or the exc
 
 import contextlib
 import importlib
-import itertools
 import json
 import multiprocessing
 import os
-import sys
 import tempfile
 import threading
 import time
@@ -21,7 +19,7 @@ from typing import Any
 
 from experiments.runner.store import sources
 from hdev_jax import progress
-from hdev_jax.compiling import crowded
+from hdev_jax.compiling import make_room
 
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
@@ -36,7 +34,6 @@ class ClusterError(Exception):
     """The cluster is at fault, in one line; what is done is kept, and the same command goes on when it is put right."""
 
 
-_calls = itertools.count(1)
 _one_at_a_time = threading.Lock()
 
 
@@ -44,10 +41,8 @@ def call(job: Job) -> tuple[list[Any], float]:
     """Run a job here: `run(task)`, or where there are several `run_together(tasks)`, if the experiment has that."""
     module, tasks = importlib.import_module(job[0]), job[1]
 
-    # only where JAX is in use: an experiment may do without
     def run(task: dict[str, Any]) -> Any:
-        if crowded(next(_calls)) and (jax := sys.modules.get("jax")) is not None:
-            jax.clear_caches()
+        make_room()
         return module.run(task)
 
     started = time.perf_counter()

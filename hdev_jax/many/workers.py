@@ -5,7 +5,6 @@ another.
 """
 
 import contextlib
-import itertools
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,9 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-
-from hdev_jax.compiling import crowded, keep_compiled
+from hdev_jax.compiling import keep_compiled, make_room
 from hdev_jax.errors import InputError
 
 __all__ = ["Workers", "computed"]
@@ -26,7 +23,6 @@ RETRIES = 3  # of a vehicle whose worker was lost
 # page faults: a quarter of a vehicle's time is then spent in the operating system, with these a thirtieth.
 _KEEPS_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "268435456", "MALLOC_MMAP_THRESHOLD_": "33554432"}
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NPROC": "1"}  # the last: XLA's pool
-_calls = itertools.count(1)
 _NO_DASK = "needs Dask: pip install 'hdev_jax[fleet]'"
 
 Work = Callable[[Mapping[str, Any]], dict[str, Any]]
@@ -123,12 +119,13 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 def _there(work: Work, task: dict[str, Any]) -> dict[str, Any]:
     """What a worker does: double precision, the cache of compiled programs that all of them share, the task."""
+    import jax
+
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
     return _done(work, task)
 
 
 def _done(work: Work, task: Mapping[str, Any]) -> dict[str, Any]:
-    if crowded(next(_calls)):
-        jax.clear_caches()
+    make_room()
     return work(task)
