@@ -185,7 +185,9 @@ def _figure(run: Run, lines: Sequence[Line], service: Results, config: Any) -> N
             right.hlines(place, low / true, high / true, color=colour, lw=1.4)
             right.plot(value / true, place, "o", color=colour, ms=3, label=words)
     right.axvline(1.0, color=GREY, lw=0.8)
-    right.set_yticks(list(at.values()), [v.replace("_", " ") for v in variants], fontsize=7)
+    right.set_yticks(
+        list(at.values()), [f"vehicle {v}" if len(v) == 1 else v.replace("_", " ") for v in variants], fontsize=7
+    )
     right.set_xlabel(f"estimated over true force at {SHOWN_KMH[0]:g} km/h")
     right.set_title("In service, synthetic fleet")
     fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=3)

@@ -139,20 +139,21 @@ def _figure(run: Run, forecasts: Results, shares: Sequence[float], alarms: Seque
     for (kind, sheet), colour in zip(kinds, (GREY, BEFORE, AFTER), strict=True):
         spread = [_errors(forecasts, kind, sheet, s) for s in shares]
         ax.plot(at, [np.median(np.abs(x[:, 0])) for x in spread], color=colour, marker="o",
-                label=f"{TRIPS[kind]}, {sheet} sheet")  # fmt: skip
+                label=f"median error: {TRIPS[kind]}, {sheet} sheet")  # fmt: skip
         ax.plot(at, [np.median(x[:, 1]) for x in spread], "--", color=colour)
-    ax.plot([], [], "--", color="0.5", label="half the 90 % interval")
-    ax.set(xlabel="share of the trip behind [%]", ylabel="median error of the rest [%]", ylim=(0, None))
+    ax.plot([], [], "--", color="0.5", label="dashed: half of the 90 % interval")
+    ax.set(xlabel="share of the trip driven so far [%]", ylabel="energy of the rest [%]", ylim=(0, None))
     ax.set_title("Forecast of the rest, synthetic fleet")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     tidy(ax)
     ax = fig.add_subplot(1, 2, 2)
     place = np.arange(len(alarms))
     ax.barh(place, [a["right_percent"] for a in alarms], color=AFTER, label="right, or in its class")
-    ax.barh(place, [a["false_percent"] for a in alarms], left=[a["right_percent"] for a in alarms], color=GREY,
-            label="another name")  # fmt: skip
+    if any(a["false_percent"] for a in alarms):
+        ax.barh(place, [a["false_percent"] for a in alarms], left=[a["right_percent"] for a in alarms], color=GREY,
+                label="another name")  # fmt: skip
     ax.set_yticks(place, [a["name"].split(" planted")[0].replace("_", " ") for a in alarms])
-    ax.set(xlabel="streams with an alarm [%]", xlim=(0, 100))
+    ax.set(xlabel="logs with an alarm [%]", xlim=(0, 100))
     ax.set_title("Alarms, an effect planted, synthetic")
     if alarms:
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)

@@ -19,8 +19,8 @@ def prediction_figure(run: Run, artefact: str, clock: Any, measured: Any, predic
     """Figures 12 and 13: measured and predicted power, and their difference below."""
     fig = figure(7.0, 4.0)
     above, below = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    above.plot(clock, measured, color=MEASURED, label="measured")
-    above.plot(clock, predicted, color=AFTER, label="one step ahead", linestyle="--")
+    above.plot(clock, measured, color=MEASURED, label="measured", linewidth=1.6)
+    above.plot(clock, predicted, color=AFTER, label="predicted one step ahead", linewidth=0.8)
     above.set_ylabel("battery power [kW]")
     above.legend(loc="upper right")
     below.plot(clock, predicted - measured, color=GREY)
@@ -39,6 +39,7 @@ def speeds_figure(run: Run, trips: Mapping[str, Trip]) -> None:
     speeds = [t.inputs["speed_mps"] / MPH for t in trips.values()]
     ax.boxplot(speeds, tick_labels=[f"trip {t}" for t in trips], showfliers=False, medianprops={"color": AFTER})
     ax.set_ylabel("speed [mph]")
+    ax.set_title("Kia Niro: speeds of the trips")
     tidy(ax)
     save_figure(run, fig, "fig4")
 
@@ -49,7 +50,7 @@ def signals_figure(run: Run, trip: Trip) -> None:
     clock = np.arange(len(trip)) * trip.dt_s
     rows = (
         (trip.inputs["motor_torque_nm"], "torque [Nm]"), (trip.inputs["speed_mps"], "speed [m/s]"),
-        (np.asarray(trip.target), "power [kW]"),
+        (np.asarray(trip.target), "battery power [kW]"),
     )  # fmt: skip
     fig = figure(7.0, 4.6)
     panels = fig.subplots(3, 1, sharex=True)
@@ -57,5 +58,6 @@ def signals_figure(run: Run, trip: Trip) -> None:
         ax.plot(clock, y, color=MEASURED, linewidth=0.5)
         ax.set_ylabel(label)
         tidy(ax)
+    panels[0].set_title(f"Kia Niro, trip {trip.name.removeprefix('trip')}")
     panels[-1].set_xlabel("time [s]")
     save_figure(run, fig, f"trip{trip.name}")

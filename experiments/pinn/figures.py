@@ -5,18 +5,32 @@ from typing import Any
 
 import numpy as np
 
+from experiments.pinn.results import WAYS
 from experiments.pinn.scores import TAUGHT, pooled
 from experiments.runner.figures import save_figure, styled
+from experiments.runner.tables import readable
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn.fit import PAPER_WEIGHTS
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, figure, plain_log, tidy
 from hdev_jax.rundir import Run
 
-__all__ = ["MODELS", "OURS", "PAPER_MODEL", "coefficient_boxes", "learning_curves", "model_bars", "weight_maps"]
+__all__ = [
+    "MODELS", "NAMED", "OURS", "PAPER_MODEL", "coefficient_boxes", "in_words", "learning_curves", "model_bars",
+    "weight_maps",
+]  # fmt: skip
 
 MODELS = ("A", "B", "C", "D")
 PAPER_MODEL = "paper"  # the network as printed, and ours, among the models of a config
 OURS = "ours"
+MOST_BARS = 20
+# Names of the paper's rows in metrics.json.
+NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
+         WAYS["tabular"]: "physics_tabular"}  # fmt: skip
+
+
+def in_words(way: str) -> str:
+    """What readers see of a model's name in tables and figures."""
+    return readable(NAMED.get(way, way))
 
 
 @styled
@@ -31,12 +45,12 @@ def coefficient_boxes(run: Run, quantiles: Mapping[str, Any], name: str, label: 
     for i, m in enumerate(models):
         for j, way in enumerate(ways):
             c = quantiles[way][m]
-            _spread(ax, i + 0.25 * (j - 1), c[name], (BEFORE, AFTER)[way == OURS], way if i == 0 else None)
+            _spread(ax, i + 0.25 * (j - 1), c[name], (BEFORE, AFTER)[way == OURS], in_words(way) if i == 0 else None)
         _spread(ax, i + 0.25, quantiles[ways[0]][m][f"{name}_true"], GREY, "truth (synthetic)" if i == 0 else None)
         table = quantiles.get("tables", {}).get(m)
         if table:
             ax.plot([i - 0.4, i + 0.4], [table[name][2]] * 2, color="#c03030", linewidth=1.4,
-                    label="table" if i == 0 else None)  # fmt: skip
+                    label="value from tables" if i == 0 else None)  # fmt: skip
     ax.set_xticks(range(len(models)), [f"model {m}" for m in models])
     ax.set_ylabel(label)
     ax.set_ylim(bottom=0)
@@ -59,19 +73,22 @@ def _spread(ax: Any, at: float, q: Sequence[float], colour: str, label: str | No
 
 @styled
 def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]], data: str) -> None:
-    """RMSE and PE of every model on test rows."""
+    """RMSE and PE of every model on test rows, the best first; of many models, those with all of their parts."""
     test = [(way, pooled(f)) for (way, use), f in gathered.items() if use == "test"]
+    if len(test) > MOST_BARS:
+        test = [(way, p) for way, p in test if not way.endswith("alone")]
+    test.sort(key=lambda x: x[1]["rmse_wh"])
     fig = figure(9.0, 0.9 + 0.28 * len(test))
     for k, (key, label) in enumerate((("rmse_wh", "RMSE [Wh]"), ("pe_percent", "PE of all trips [%]"))):
         ax = fig.add_subplot(1, 2, k + 1)
         colours = [AFTER if way == OURS else BEFORE if way == PAPER_MODEL else GREY for way, _ in test]
         ax.barh(range(len(test)), [p[key] for _, p in test], color=colours, alpha=0.75)
-        ax.set_yticks(range(len(test)), [way for way, _ in test] if k == 0 else [])
+        ax.set_yticks(range(len(test)), [in_words(way) for way, _ in test] if k == 0 else [])
         ax.invert_yaxis()
         ax.set_xlabel(label)
         ax.axvline(0, color="black", linewidth=0.6)
         tidy(ax)
-    fig.suptitle(f"Test rows, {data}")
+    fig.suptitle(f"Errors on test rows, {data}; colours: ours and the paper's network")
     save_figure(run, fig, "models")
 
 
@@ -87,7 +104,7 @@ def learning_curves(
         for way in dict.fromkeys(k[0] for k in curves if k[1] == use and "alone" not in k[0]):
             points = curves[way, use]
             x = [routes[s] for s, _ in points]
-            drawn = ax.plot(x, [np.median(v) for _, v in points], "o-", markersize=3, label=way)
+            drawn = ax.plot(x, [np.median(v) for _, v in points], "o-", markersize=3, label=in_words(way))
             ax.fill_between(x, [min(v) for _, v in points], [max(v) for _, v in points], alpha=0.2,
                             color=drawn[0].get_color(), linewidth=0)  # fmt: skip
         ax.set_xscale("log")

@@ -7,9 +7,10 @@ import numpy as np
 
 from experiments.pinn.figures import (
     MODELS,
+    NAMED,
     OURS,
-    PAPER_MODEL,
     coefficient_boxes,
+    in_words,
     learning_curves,
     model_bars,
     weight_maps,
@@ -35,9 +36,6 @@ HELD = ("the inputs include the energy of the calibrated kernel and the efficien
         "models called 'no kernel' are without physics")  # fmt: skip
 GIVEN = ("'ours' and the closed form know which effects the fleet hides; models 'as diagnosed' have the effects "
          "that the diagnosis of training routes names")  # fmt: skip
-# Names of the papers' rows in metrics.json.
-NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
-         WAYS["tabular"]: "physics_tabular"}  # fmt: skip
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
 NAMEABLE = {
@@ -52,7 +50,7 @@ def _line(
     """A row of the table; of several seeds, errors are of all of them together."""
     p = pooled(found)
     return {
-        "model": name if use == "test" else f"{name}: {use}",
+        "model": in_words(name) if use == "test" else f"{in_words(name)}: {use}",
         "RMSE [Wh]": p["rmse_wh"], "paper RMSE": paper.get("rmse"),
         "PE [%]": p["pe_percent"], "paper PE": paper.get("pe"), "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
@@ -77,12 +75,14 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     for model, (n, lost) in trainings(results).items():
         if n == lost:
             name, said = NAMED.get(model, model), f"diverged, {lost} of {n} trainings"
-            lines.append({"model": f"{model}: {said}", "n": 0})
+            lines.append({"model": f"{in_words(model)}: {said}", "n": 0})
             rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": said})
     write_tables(run, "table", lines, config.caption)
     at_bound = _at_bound(results)
     if at_bound:
-        bound = [{"model": n, "c_rr": 100 * b["c_rr"], "C_d·A": 100 * b["cda_m2"]} for n, b in at_bound.items()]
+        bound = [
+            {"model": in_words(n), "c_rr": 100 * b["c_rr"], "C_d·A": 100 * b["cda_m2"]} for n, b in at_bound.items()
+        ]
         caption = "Share of predictions at a bound, within 1 % of the range [%], test rows of all trainings"
         write_tables(run, "bounds", bound, caption)
     effects = _effects(results)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from itertools import cycle
 
 import numpy as np
+from matplotlib.patches import Rectangle
 
 from experiments.planted.rivals import comparable
 from experiments.planted.rivals_table import LABELS, outcome
@@ -25,6 +26,7 @@ COLOURS = {
 }
 NOISES = {"white": "white", "ar1": "AR(1)", "ar1_white": "AR(1)\n+ white", "trip_levels": "random\nintercepts",
           "student_t": "Student's t", "trip_variance": "variance\nby trip"}  # fmt: skip
+LEAST_SIZES = 3  # of a curve
 LEVEL = 5.0  # per cent of logs with nothing planted that may be given a name
 
 
@@ -46,7 +48,7 @@ def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     """
     done = _compared(done, rivals)
     single = [(t, r) for t, r in done if t["size"] and len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
-    if len({t["size"] for t, _ in single}) < 2:  # one size is a row of a table
+    if len({t["size"] for t, _ in single}) < LEAST_SIZES:  # fewer are rows of a table
         return
     fig = figure(6.4, 3.8)
     axes = fig.add_subplot()
@@ -85,7 +87,9 @@ def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
 def false_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     """Share of logs with nothing planted in which something was named, by colour of the noise."""
     empty = [(t, r) for t, r in _compared(done, rivals) if not t["effects"]]
-    if not empty:
+    if not any(
+        outcome([], r, m)[1] for _, r in empty for m in _methods(rivals)
+    ):  # a row of zeros is read from the table
         return
     noises = list(dict.fromkeys(t["noise"] for t, _ in empty))
     methods = [m for m in _methods(rivals) if m != "ours_first"]  # no name is right here, with classes or without
@@ -100,7 +104,7 @@ def false_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
             axes.bar(x, 100 * y, 0.75 / len(methods), color=COLOURS[method], label=LABELS[method] if k == 0 else None)
             axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
             highest = max(highest, 102 * high)
-    axes.axhline(LEVEL, color="#333", lw=0.8, ls=":", label=f"{LEVEL:g} %: target, at most")
+    axes.axhline(LEVEL, color="#333", lw=0.8, ls=":", label=f"target: at most {LEVEL:g} %")
     axes.set_xticks(range(len(noises)), [NOISES[n] for n in noises], fontsize=8)
     axes.set(ylabel="something named [%]", ylim=(0, highest), title="Synthetic logs with nothing missing")
     tidy(axes)
@@ -129,22 +133,34 @@ def confusion_figure(run: Run, done: Group) -> None:
             for name in {right[p] if right[p] in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
     share_figure(
-        run, "confusion", rows, columns, share, ylabel="planted (logs)", title="Synthetic logs: what was named [%]"
-    )
+        run, "confusion", rows, columns, share, [[right[p] if right[p] in LIBRARY else "nothing"] for p in planted],
+        ylabel="planted (logs)", title="Synthetic logs: what was named [%]",
+    )  # fmt: skip
 
 
 def share_figure(
-    run: Run, name: str, rows: Sequence[str], columns: Sequence[str], share: np.ndarray, *, ylabel: str, title: str
-) -> None:
-    """What was named (columns), in per cent of the logs of each row: a table in shades."""
+    run: Run, name: str, rows: Sequence[str], columns: Sequence[str], share: np.ndarray, right: Sequence[Sequence[str]],
+    *, ylabel: str, title: str,
+) -> None:  # fmt: skip
+    """What was named (columns), in per cent of the logs of each row: a table in shades.
+
+    **Arguments:** `right`, for each row the columns that are right; they are outlined.
+    """
     fig = figure(max(0.32 * len(columns) + 2.5, 4.9), 0.3 * len(rows) + 1.8)  # the title's at least
     axes = fig.add_subplot()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
-    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(rows)), rows, fontsize=7)
+    axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90, fontsize=7.5)
+    axes.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows], fontsize=7.5)
     for i, k in zip(*np.nonzero(share >= 0.5), strict=True):
         axes.text(k, i, f"{share[i, k]:.0f}", ha="center", va="center", fontsize=6,
                   color="white" if share[i, k] > 55 else "#222")  # fmt: skip
-    axes.set(xlabel="named", ylabel=ylabel, title=title)
+    for i, of_row in enumerate(right):
+        for k in (columns.index(c) for c in of_row if c in columns):
+            axes.add_patch(Rectangle((k - 0.5, i - 0.5), 1, 1, fill=False, edgecolor="#c26a1f", linewidth=1.2))
+    axes.set(
+        xlabel="named (outlined: right); logs with several names make a row sum to more than 100",
+        ylabel=ylabel,
+        title=title,
+    )
     fig.colorbar(image, ax=axes, shrink=0.6, pad=0.02)
     save_figure(run, fig, name)

@@ -151,6 +151,7 @@ def _figure(run: Run, results: Sequence[Any], config: Config) -> None:
                 ax.plot(x, 100 * value, "o", color=AFTER, ms=3)
         ax.axhline(100 * config.payload, color="0.5", lw=0.8)
         ax.set_xticks(range(len(config.altitude_sd_m)), [f"{sd:g}" for sd in config.altitude_sd_m])
-        ax.set(xlabel="noise of the altitude [m]", ylabel="payload error found [%]", ylim=(0, None), title=mode)
+        ax.set(xlabel="noise of the altitude [m]", ylabel="payload error found [%]", title=mode)
         tidy(ax)
+    fig.suptitle("Synthetic logs with a payload error: each estimate with its 90 % interval; grey: the true error")
     save_figure(run, fig, "instruments")

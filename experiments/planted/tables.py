@@ -42,7 +42,7 @@ TABLES = {
 }  # fmt: skip
 WANTED = {  # what may be wanted of a setting: column with the share, in words, column with the least
     "right": ("right", "wanted"),
-    "named_exactly_no_class": ("with no class", "no_class_wanted"),
+    "named_exactly_no_class": ("named alone", "no_class_wanted"),
     "called_unexplained": ("called unexplained", "unexplained_wanted"),
 }
 BY_TWIN = "Planted effects: those without a twin have to be named alone, those with a twin in a class"
@@ -58,9 +58,8 @@ LEGEND = {  # of each table that is there; the first of every page
         "Right: the share of logs with the right answer, with Wilson's 95 % interval. The right answer is: exactly "
         "what was planted, each effect by its id or in a class of at most three; if nothing was planted, no name; if "
         "the cause is outside the library, no wrong name (a constant load counts as right for a load that switches); "
-        "if a coefficient absorbs the effect or more trips are needed, that the diagnosis says so. Met: the share is "
-        "at "
-        "least the wanted one{unexplained}",
+        "if a coefficient absorbs the effect or more trips are needed, that the diagnosis says so. Target met: the "
+        "share reaches its target{unexplained}",
         "False name: share of logs in which an effect is named that was not planted. Called unexplained: share of "
         "logs in which structure is left (random intercepts of trips count, although they are noise in these logs)",
     ),
@@ -71,7 +70,7 @@ LEGEND = {  # of each table that is there; the first of every page
         "the first logs of each kind include compiling",
     ),
     "planted_names": (
-        "Named first: share of logs in which the first name of each entry is the planted effect. Named alone: share "
+        "Top-ranked: share of logs in which the planted effect is the first of each class. Named alone: share "
         "in which each entry is a single name. Separable: share in which, judged by the true effect, no other effect "
         "explains as much under this noise. Drawn anew: number of logs drawn again because the effect acted in only "
         "one training trip, or the noise was beyond what the reader takes",
@@ -79,8 +78,8 @@ LEGEND = {  # of each table that is there; the first of every page
     "planted_names_by_twin": (
         "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "
         "rolling resistance and drag area are fitted. The right answer is a class of at most three that contains "
-        "both. In the first table either name alone counts too, although it is a guess. Met: the share is at least "
-        "the wanted one, and so is the share with no class, if one is wanted",
+        "both. In the first table either name alone counts too, although it is a guess. Target met: both shares reach "
+        "their targets, if they have one",
     ),
     "planted_rivals": (
         "Ours is right if an entry (a name or a class) contains the planted effect; with classes set aside, if the "
@@ -130,10 +129,20 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
         "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k not in ("name", "paper")}}
                  for r in (*rows, *apart, *sized, *against)],
         "better_than_paper": 0, "of": 0,
-        "skipped": skipped, "missed": missed,
+        "skipped": skipped, "missed": missed, "findings": _findings(config, done),
         "notes": [line.format(ar=config.ar_coefficient, unexplained=_unexplained_wanted(config, done))
                   for table in shown for line in LEGEND.get(table, ())],
     }  # fmt: skip
+
+
+def _findings(config: Config, done: Group) -> list[str]:
+    """What leads the page: right answers by case and size."""
+    groups: dict[str, list[bool]] = {}
+    for task, result in done:
+        case = config.cases[task["case"]]
+        groups.setdefault(f"{case.name}{_sized(task)}", []).append(_right(case.asked, task, result))
+    said = [f"{name}, {sum(hits)} of {len(hits)}" for name, hits in groups.items()]
+    return [f"Right answers: {'; '.join(said)}"] if said else []
 
 
 def _unexplained_wanted(config: Config, done: Group) -> str:
@@ -170,12 +179,15 @@ def _short_of(row: dict[str, Any]) -> str:
     )  # fmt: skip
 
 
+def _sized(task: dict[str, Any]) -> str:
+    return f", size {task['size']:g}" if task["effects"] and task["size"] else ""
+
+
 def grouped(config: Config, done: Group) -> list[tuple[str, Group]]:
     """Logs by setting: the case, the size, the number of trips and the noise."""
     groups: dict[tuple[str, str], Group] = {}
     for task, result in done:
-        size = f", size {task['size']:g}" if task["effects"] and task["size"] else ""
-        key = f"{config.cases[task['case']].name}{size}, {task['trips']} trips, {task['noise']}"
+        key = f"{config.cases[task['case']].name}{_sized(task)}, {task['trips']} trips, {task['noise']}"
         key += "" if task["entry"] == "road" else f", {task['entry']}"
         groups.setdefault((task["case"], key), []).append((task, result))
     return [(name, group) for (_, name), group in groups.items()]

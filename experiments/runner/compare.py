@@ -6,10 +6,9 @@ from typing import Any
 
 from experiments.runner.tables import readable
 
-__all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "notes", "numbers"]
+__all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "missed", "notes", "numbers"]
 
-DECIDES = "The number that decides for each model; median and range are over all random starts of its fit"
-MOST_MISSED = 4  # targets that lead a page one by one
+DECIDES = "Main error of each model; median and range are over all random starts of its fit, where it has several"
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
 
@@ -78,8 +77,8 @@ def _number(x: Any) -> float | None:
 
 
 def findings(metrics: Mapping[str, Any]) -> list[str]:
-    """What leads a page: how much data there is, what is missing, which targets are missed, how it compares, and what
-    the run found (`metrics["findings"]`)."""
+    """What leads a page: how much data there is, what is missing, how it compares, what the run found
+    (`metrics["findings"]`), and how many targets it misses."""
     said = []
     if "logs" in metrics:
         n, kind = metrics["logs"], "synthetic" if metrics["synthetic"] else "measured"
@@ -93,17 +92,19 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += _sentences(metrics.get("findings", []))
-    if missed := metrics.get("missed"):
-        few = len(missed) <= MOST_MISSED
-        said.append(f"Target missed: {'; '.join(missed)}." if few else f"{len(missed)} targets missed: see the notes.")
+    if short := metrics.get("missed"):
+        said.append("One target is missed." if len(short) == 1 else f"{len(short)} targets are missed.")
     return said
+
+
+def missed(metrics: Mapping[str, Any]) -> list[str]:
+    """Targets that a run misses, a line each."""
+    return _sentences(metrics.get("missed", []))
 
 
 def notes(metrics: Mapping[str, Any]) -> list[str]:
     """What a reader needs for the tables and figures of a run."""
     said = _sentences(metrics.get("notes", []))
-    if len(missed := metrics.get("missed", [])) > MOST_MISSED:
-        said.append(f"Target missed: {'; '.join(missed)}.")
     if metrics.get("tasks_in_one_program"):
         said.append(f"{metrics['tasks_in_one_program']} tasks ran side by side in one program.")
     return said

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.compare import DECIDES, comparison, findings, headlines, notes
+from experiments.runner.compare import DECIDES, comparison, findings, headlines, missed, notes
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
 from experiments.runner.tables import cells, markdown, read_markdown
@@ -18,6 +18,7 @@ __all__ = ["Section", "folded", "of_run", "part", "write_docs", "write_html", "w
 
 MOST_COLUMNS = 8  # of the table that a page shows
 MOST_ROWS = 20  # of a table that a page of many runs shows; a longer one is folded
+MOST_MISSED = 4  # targets that a page shows; more are folded
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
@@ -80,7 +81,12 @@ def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = ()
         title=metrics["artefact"],
         synthetic=metrics["synthetic"],
         made=made,
-        said=[*findings(metrics), *notes(metrics), f"{metrics['seconds']} s."],
+        said=[
+            *findings(metrics),
+            *(f"Missed: {line}" for line in missed(metrics)),
+            *notes(metrics),
+            f"{metrics['seconds']} s.",
+        ],
         links=links,
         tables=tables,
         figures=[(p.stem.replace("_", " "), base64.b64encode(p.read_bytes()).decode("ascii")) for p in images],
@@ -112,15 +118,11 @@ def write_docs(
     """
     name = Path(config).stem
     every = " ".join([shown(config), *(f"--set {s}" for s in sets)])
-    lines = [
-        f"# {_kind(Path(config))}: {name}",
-        "",
-        _by(f"{' '.join([every, *flags])} --tasks DIR --out OUT --docs docs"),
-        "",
-    ]
+    lines = [f"# {_titled(Path(config))}", ""]
     for k, folder in enumerate(folders):
         lines += ["", f"## {points[k]}", ""] if k < len(points) and points[k] else []
         lines += _lines(folder, Path(config), docs, name, "" if len(folders) == 1 else f"{k}_")
+    lines += ["", _by(f"{' '.join([every, *flags])} --tasks DIR --out OUT --docs docs")]
     (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -138,12 +140,7 @@ def write_list_docs(
     for home in dict.fromkeys(path.parent for path in made):
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
-        lines = [
-            f"# {_kind(next(iter(runs)))}",
-            "",
-            _by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs"),
-            "",
-        ]
+        lines = [f"# {_kind(next(iter(runs)))}", ""]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
         lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
@@ -164,7 +161,8 @@ def write_list_docs(
                 lines += [*_lines(folder, path, docs, home.name, before, most_rows=MOST_ROWS), ""]
         if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
             every_number = markdown(cells(against, 4), "Every number of the paper").rstrip()
-            lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number)]
+            lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number), ""]
+        lines += [_by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs")]
         pages.append(docs / f"{home.name}.md")
         pages[-1].write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     return pages
@@ -202,14 +200,16 @@ def _lines(
         figures.append(f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})")
     files = sorted((folder / "tables").glob("*.md"), key=lambda path: (path.stem != "table", path.stem))
     tables = [path.read_text(encoding="utf-8") for path in files]
-    return part([*_about(config), *findings(metrics)], figures, tables, notes(metrics), most_rows=most_rows)
+    said = [*_about(config), *findings(metrics)]
+    return part(said, figures, tables, notes(metrics), missed(metrics), most_rows=most_rows)
 
 
 def part(
     said: Sequence[str], figures: Sequence[str], tables: Sequence[str], notes: Sequence[str],
-    *, most_rows: int | None = None,
+    missed: Sequence[str] = (), *, most_rows: int | None = None,
 ) -> list[str]:  # fmt: skip
-    """A part of a page: what it shows and found, its figures, its first table; notes and other tables folded.
+    """A part of a page: what it shows and found, its figures, its first table, the targets that it misses; notes and
+    other tables folded.
 
     **Arguments:** `most_rows`, of the first table: a longer one is folded too; None for any number.
     """
@@ -219,6 +219,10 @@ def part(
     first = _narrow(tables[0]) if tables else ""
     more = [t.rstrip() for t in tables if t.rstrip() != first]
     lines += ["", *_open(first, most_rows)] if first else []
+    if missed:
+        short = "\n".join(f"- {line}" for line in missed)
+        many = len(missed) > MOST_MISSED
+        lines += ["", *(folded("Targets missed", short) if many else ("Targets missed:", "", short))]
     if notes:
         lines += ["", *folded("Notes", "\n".join(f"- {line}" for line in notes))]
     if more:
@@ -253,6 +257,13 @@ def _split(row: str) -> list[str]:
 def folded(title: str, text: str) -> list[str]:
     """A part of a page that opens on a click, on the site and where Markdown is shown as it is."""
     return ['<details markdown="1">', f"<summary>{title}</summary>", "", text, "", "</details>"]
+
+
+def _titled(config: Path) -> str:
+    """The title of a config's page: `planted_summary` is "Planted summary", `table1` of paper 1 "Paper 1, table 1"."""
+    words = re.sub(r"(?<=[a-z])(?=\d)", " ", config.stem.replace("_", " "))
+    kind = _kind(config)
+    return words.capitalize() if kind in ("Study", "Experiment") else f"{kind}, {words.replace('fig ', 'figure ')}"
 
 
 def _kind(config: Path) -> str:

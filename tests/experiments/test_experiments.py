@@ -263,9 +263,6 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     ):
         assert (tmp_path / "a" / name).stat().st_size > 200
     assert not (tmp_path / "a/figures/power.png").exists(), "one size is no curve"
-    sizes = ["cases.single.sizes=[1.0, 2.0]"]
-    run_config(STUDIES / "planted_quick.toml", sizes, out=tmp_path / "sizes", kept=tmp_path / "kept")
-    assert (tmp_path / "sizes/figures/power.png").stat().st_size > 200
     monkeypatch.setattr("experiments.planted.study.run", lambda task: pytest.fail(f"run again: {task}"))
     again = once("b")
     assert again["rows"] == first["rows"]

@@ -249,14 +249,34 @@ def test_a_page_explains_the_tables_that_it_has(tmp_path):
 
     single = notes([(t, result(["headwind"])) for t in every("single", effects=["headwind"])], "single")
     assert "one before by 0.97" in single
-    assert "Named first" in single
+    assert "Top-ranked" in single
     twins = single[single.index("Twins:") :]
     assert all(k in twins for pair in scores.TWINS.items() for k in pair)
     undecided = notes([(t, result()) for t in every("undecidable")], "undecided")
     assert "Called unexplained" in undecided
-    assert "Named first" not in undecided, "what cannot be decided is not asked for its name"
+    assert "Top-ranked" not in undecided, "what cannot be decided is not asked for its name"
     assert "Twins:" not in undecided
     assert LABELS["ours_first"] not in single + undecided
+
+
+def test_a_page_says_how_many_answers_are_right_and_has_no_figure_of_zeros_or_of_two_points(tmp_path):
+    def ran(logs, folder) -> tuple[list[str], set[str]]:
+        with open_run(tmp_path / folder, {"a": 1}, seed=1) as run:
+            found = collect(config(), logs, run)["findings"]
+            return found, {p.name for p in run.work.glob("figures/*.png")}
+
+    single = [(t, result(["headwind"])) for t in every("single", effects=["headwind"])]
+    nothing = [(t, result()) for t in every("null")]
+    n, quiet = len(single), len(nothing)
+    two = [({**t, "size": s}, r) for s in (0.25, 0.5) for t, r in single]
+    found, figures = ran([*two, *nothing], "two")
+    assert figures == {"confusion.png"}
+    assert f"one effect, size 0.25, {n} of {n}; one effect, size 0.5, {n} of {n}" in found[0]
+    assert f"nothing planted, {quiet} of {quiet}" in found[0]
+    one_false = [*nothing[1:], (nothing[0][0], result(["headwind"]))]
+    found, figures = ran([*two, *(({**t, "size": 1.0}, r) for t, r in single), *one_false], "three")
+    assert figures == {"confusion.png", "false_discoveries.png", "power.png"}
+    assert f"nothing planted, {quiet - 1} of {quiet}" in found[0]
 
 
 def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):

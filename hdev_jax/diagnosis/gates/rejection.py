@@ -54,13 +54,16 @@ SENTENCES = {
     Kind.IMPLAUSIBLE: "its best estimate has the wrong sign or is out of range",
     Kind.NOT_CONFIRMED: "not confirmed by cross-validation: does not lower the error on {unit} left out of the fit",
     Kind.NOT_SIGNIFICANT: "not significant over the whole library (FDR-adjusted p = {q:.2g})",
-    Kind.CONTRADICTED: "its generalised least-squares estimate is significantly below {share:.0%} of the ordinary one",
+    Kind.CONTRADICTED: (
+        "its generalised least-squares estimate is significantly smaller than {share:.0%} of its ordinary "
+        "least-squares estimate"
+    ),
     Kind.READINGS: "explains {share:.1%} of the error; errors of the readings can explain as much",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
     Kind.FAR: "it would move {name} to {z:+.1f} prior sd from the sheet's value",
     Kind.PLACEBO: "a placebo ({how}) does as well",
-    Kind.UNSTABLE: "comes first in only {percent:.0f} % of resampled sets of {unit}",
+    Kind.UNSTABLE: "ranks first in only {percent:.0f} % of resampled sets of {unit}",
     Kind.SUPERFLUOUS: "not needed beside {beside}",
     Kind.NOT_HELD_OUT: "contradicted: the model with all found effects predicts the held-out trips worse",
     Kind.INSTRUMENT: "no instrument fault is named, as {percent:.0f} % of the remaining variance is not noise",
