@@ -40,7 +40,7 @@ def errors(blocks: Mapping[str, Sequence[tuple[str, float, float]]], title: str,
         ax.set_xlabel(axis_label("RMSE per row on a trip not used for training", unit))
         ax.set_title(title)
         tidy(ax, grid="x")
-        _legend(fig, [("before: declared model", BEFORE), ("after: with what was found", AFTER)])
+        _legend(fig, [("before: declared model", BEFORE), ("after: with the effects found", AFTER)])
         return _small(fig)
 
 
@@ -65,7 +65,7 @@ def sizes(runs: Runs, title: str, head: str) -> bytes:
                     ax.errorbar(value, -i, xerr=bar, fmt="o", color=AFTER, markersize=4.5, capsize=2.5)
                 else:
                     there = {p.partition(".")[0] for p in row.paths} & set(found_ids(runs[label]))
-                    said = "found without this size" if there else "not found"
+                    said = "found, without this parameter" if there else "not found"
                     place: Any = {"transform": ax.get_yaxis_transform(), "ha": "center", "va": "center"}
                     ax.text(0.5, -i, said, color=GREY, fontsize=7.5, **place)
             ax.set_yticks(-np.arange(len(labels)), [f"{head} {label}" for label in labels] if k % columns == 0 else [])

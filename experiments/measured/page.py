@@ -47,15 +47,15 @@ Made by
 
 from the diagnosis.json of each run. All data are measured. Every error is on held-out test trips, and predictions use
 no measured power (free run). The library was extended while looking at both logs, so errors on a new log may be larger;
-planted_summary.md has synthetic logs from seeds not used in development. Cost is the wall-clock time of one run,
-compiling included, on a shared machine, and its peak memory."""
-READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with what was found.
+[planted effects](planted_summary.md) are in synthetic logs from seeds not used in development. Cost is the wall-clock
+time of one run, compiling included, on a shared machine, and its peak memory."""
+READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with the effects found.
 - *found*: the diagnosis added the effect. *one of a class*: it added one of several that this log cannot distinguish.
 - The number after it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
-  the share in which the effect, or one of its class, comes first again.
+  the share in which the effect, or one of its class, ranks first again.
 - Sizes are as in diagnosis.json with their standard deviation. *largest difference*: between two training sets, in
-  standard deviations of the difference as if the two were independent. Sizes *agree* where it is at most what equal
-  ones reach in 95 % of cases: {chance} sets (Tukey's studentized range)."""
+  standard deviations of the difference as if the two were independent. Sizes *agree* if that difference is
+  not significant at 5 %, that is, at most {chance} sets (Tukey's studentized range)."""
 
 
 def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]) -> tuple[str, dict[str, bytes]]:
@@ -205,7 +205,7 @@ def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
     )  # fmt: skip
     lines += [
         "",
-        "The paper's network of 282 parameters, trained on trip 1 (its table VIII): 0.1604 in free run; LSTM 0.2322.",
+        "The paper's best network (NARXS), trained on trip 1 (its table VIII): 0.1604 in free run; LSTM 0.2322.",
     ]
     lines += ["", "### Stability over training trips", "", *found_table(runs, "trip")]
     lines += _picture("niro_sizes.png", "Kia Niro: sizes by training trip with 90 % bars")

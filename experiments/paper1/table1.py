@@ -207,21 +207,29 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             lines.append(line | {"RMSE 90 %": spread[f"rmse_{way}_90"], "PE 90 %": spread.get(f"pe_{way}_90")})
     write_tables(run, "table1", lines, config.caption)
     _figure(run, gathered)
+    measured = [r for r in rows if kinds[r["name"].partition(" (")[0]] != "fleet"]
     synthetic = {k: v for k, v in gathered.items() if kinds[k] == "fleet"}
     return {
         "artefact": config.artefact, "data": "synthetic fleet; ztbus and kia_niro where the row says measured",
-        "synthetic": True, "rows": rows, "better_than_paper": int(better), "of": of, "headline": "pe_bayesian",
+        "synthetic": True, "rows": rows, "better_than_paper": 0, "of": 0, "headline": "pe_bayesian",
         "missed": _missed(synthetic),
-        "findings": _on_measured([r for r in rows if kinds[r["name"].partition(" (")[0]] != "fleet"]),
+        "findings": [*_ranked(int(better), of), *_on_measured(measured)],
         "notes": [
             "Models A-D are synthetic: laps of one track each, the first half calibrates, the second half tests; "
             "medians over tracks",
-            "At least as good as the paper: Bayesian coefficients beat tabular ones in RMSE and in median |PE|, as "
-            "they do in the paper for most models",
             "Buses and car are measured: traction force, sums weighted by distance",
             *(f"{n}: {c} {'total is' if c == 1 else 'totals are'} near 0, without a PE" for n, c in without.items()),
         ],
     }  # fmt: skip
+
+
+def _ranked(better: int, of: int) -> list[str]:
+    """Whether the paper's order of the ways holds; errors on other vehicles are not compared."""
+    if not of:
+        return []
+    return [f"Bayesian coefficients are better than tabular ones in {better} of {of} comparisons (RMSE and median |PE| "
+            "of each synthetic model), as in the paper for most models; its trucks are not public, so errors are not "
+            "comparable"]  # fmt: skip
 
 
 def _on_measured(rows: Sequence[dict[str, Any]]) -> list[str]:

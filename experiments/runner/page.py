@@ -140,7 +140,8 @@ def write_list_docs(
     for home in dict.fromkeys(path.parent for path in made):
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
-        lines = [f"# {_kind(next(iter(runs)))}", ""]
+        kind = _kind(next(iter(runs)))
+        lines = [f"# {kind if kind != 'Study' else _titled(Path(configs))}", "", *_about(Path(configs)), ""]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
         lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
@@ -263,7 +264,7 @@ def _titled(config: Path) -> str:
     """The title of a config's page: `planted_summary` is "Planted summary", `table1` of paper 1 "Paper 1, table 1"."""
     words = re.sub(r"(?<=[a-z])(?=\d)", " ", config.stem.replace("_", " "))
     kind = _kind(config)
-    return words.capitalize() if kind in ("Study", "Experiment") else f"{kind}, {words.replace('fig ', 'figure ')}"
+    return f"{kind}, {words.replace('fig ', 'figure ')}" if kind.startswith("Paper") else words.capitalize()
 
 
 def _kind(config: Path) -> str:

@@ -21,7 +21,8 @@ def file_argument(verb: argparse.ArgumentParser, name: str, metavar: str, text: 
 
 def log_files(verb: argparse.ArgumentParser) -> None:
     """The logs, and the adapter that reads them."""
-    file_argument(verb, "logs", "LOG", "log files (.csv, .csv.gz, .parquet, .mat), read as one log", nargs="+")
+    formats = "text, Excel, Parquet, Feather, JSON lines, MATLAB, MF4, BLF or ASC"
+    file_argument(verb, "logs", "LOG", f"log files ({formats}), read as one log", nargs="+")
     file_argument(verb, "--adapter", "A.toml", "how to read files whose columns have other names or units")
 
 

@@ -137,11 +137,11 @@ class PartLoad(Effect):
     source: ClassVar[str] = "Larminie and Lowry, Electric Vehicle Technology Explained, eq. 7.23 (constant, copper)"
     parameters: ClassVar[Parameters] = (
         # a drive of 100 kW that has 94 % at its best and 75 % at a twentieth of its power loses 1.4 kW more than 6 %
-        Size("standby_w", "W", 0.0, 500.0, 0.0, 1.5e4, least=20.0, label="loss that levels off"),
+        Size("standby_w", "W", 0.0, 500.0, 0.0, 1.5e4, least=20.0, label="loss at high load"),
         # 5 % of 50 kW, of a small machine at its rated power, are 1e-6 per watt; of a truck's 300 kW a sixth of that
         Size("per_w", "1/W", 0.0, 1e-7, 0.0, 5e-6, least=5e-9, label="loss per power squared"),
         # chosen, not fitted: half a step of this grid changes the curve by less than a seventh of P₀
-        Choice("half_w", "W", 3e3, 2e3, 300.0, 1e5, grid=(1e3, 3e3, 1e4, 3e4), of="standby_w", label="load of half"),
+        Choice("half_w", "W", 3e3, 2e3, 300.0, 1e5, grid=(1e3, 3e3, 1e4, 3e4), of="standby_w", label="power at half"),
     )
     variants: ClassVar[tuple[Names, ...]] = (("standby_w",), ("per_w",), ("standby_w", "per_w"))
     mistaken_for: ClassVar[Names] = ("power_gain", "copper_loss", "battery_resistance", "regen_efficiency")

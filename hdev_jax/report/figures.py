@@ -36,7 +36,7 @@ def models(data: ReportData) -> list[tuple[str, str, str]]:
     """(`before` or `after`, what to call it, colour): one model where nothing was added."""
     if same_model(data):
         return [("after", "calibrated model", AFTER)]
-    return [("before", "before: declared model", BEFORE), ("after", "after: with what was found", AFTER)]
+    return [("before", "before: declared model", BEFORE), ("after", "after: with the effects found", AFTER)]
 
 
 def _dumbbells(ax: Any, lines: list[TripLine], key: str, data: ReportData) -> None:

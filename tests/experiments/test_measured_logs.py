@@ -21,7 +21,7 @@ def test_the_niro_is_explained_by_few_parameters(data_dir, tmp_path):
     result = json.loads((out / "diagnosis.json").read_text())
     before, after = (list(result[when]["test_by_trip"].values()) for when in ("before", "after"))
     assert np.mean([m["mse"] for m in before]) == pytest.approx(0.60, abs=0.02)  # kW²; a bad start is no gain
-    # the paper's network of 282 parameters reaches 0.1604 in free run, its LSTM 0.2322
+    # the paper's best network (NARXS) reaches 0.1604 in free run, its LSTM 0.2322
     assert np.mean([m["mse"] for m in after]) <= 0.17
     assert result["parameters_fitted"] <= 14
     assert max(abs(m["pe_percent"]) for m in after) <= 1.2

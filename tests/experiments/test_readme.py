@@ -23,12 +23,12 @@ def test_errors_on_measured_logs_are_those_of_the_page():
     assert f"RMSE {after} kW" in README
     assert f"{before} kW for the calibrated sheet" in README
     pooled = next(x for x in REAL.splitlines() if x.startswith("| pooled |")).split("|")
-    assert f"{pooled[4].strip()} kW given the states of two loads that switch" in README
+    assert f"({pooled[4].strip()} kW if the on and off states of two loads are read" in README
     each = [row(REAL, str(trip)) for trip in (1, 2, 3, 4)]
     mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
     assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} parameters" in README
-    assert "paper's network of 282 parameters, trained on trip 1 (its table VIII): 0.1604" in REAL
-    assert "0.1604 kW² for the paper's network of 282" in README
+    assert "paper's best network (NARXS), trained on trip 1 (its table VIII): 0.1604" in REAL
+    assert "0.1604 kW² for the best network of the paper (NARXS)" in README
 
 
 def test_shares_of_synthetic_logs_are_those_of_the_page():
