@@ -1,5 +1,6 @@
 """The figures about errors and energy: before and after, trips, effects, coefficients, measured and predicted."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ __all__ = [
 ]
 
 WIDTH = 10.0
+NAMED_EFFECTS = 3  # in a title
+TITLE_LETTERS = 100  # of a line as wide as a figure
 NAMED_TRIPS = 16  # more trips than this are drawn by rank, without names
 MOST_TRIPS = 60  # that a box each has room for
 
@@ -70,8 +73,10 @@ def _title(data: ReportData, words: str) -> str:
     return f"{words} – synthetic data" if data.synthetic else words
 
 
-def legend(fig: Any, data: ReportData, *, measured: bool = False, dots: bool = False) -> None:
-    """One legend above the panels, where it covers nothing."""
+def legend(
+    fig: Any, data: ReportData, *, measured: bool = False, dots: bool = False, side: str = "upper"
+) -> None:  # fmt: skip
+    """One legend above the panels, or below them, where it covers nothing."""
     from matplotlib.lines import Line2D
 
     line: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 5} if dots else {"linewidth": 1.8}
@@ -79,14 +84,21 @@ def legend(fig: Any, data: ReportData, *, measured: bool = False, dots: bool = F
     if data.synthetic:
         handles.insert(0, Line2D([], [], linestyle="none", label="synthetic data:"))
     handles += [Line2D([], [], color=colour, label=words, **line) for _, words, colour in models(data)]
-    fig.legend(handles=handles, loc="outside upper right", ncols=len(handles), handlelength=1.6, columnspacing=1.6)
+    fig.legend(handles=handles, loc=f"outside {side} right", ncols=len(handles), handlelength=1.6, columnspacing=1.6)
 
 
 def before_after(data: ReportData) -> Any:
-    """RMSE of each test trip before and after, and a typical stretch of one: measured, predicted, error."""
+    """RMSE of each test trip before and after, and the error along a typical stretch of one, below what was measured:
+    predictions would hide each other and the measurement."""
     lines = [t for t in trip_lines(data) if t.role == "test"] or trip_lines(data)
-    fig = figure(WIDTH, 4.6)
-    grid = fig.add_gridspec(2, 2, width_ratios=[1, 1.9], height_ratios=[1.5, 1])
+    fig = figure(WIDTH, 4.8)
+    if effects := data.summary.get("effects", []):
+        alike = [[e["id"], *(e.get("indistinguishable_from") or [])] for e in effects[:NAMED_EFFECTS]]
+        said = [names.verbose_join([names.effect(x) for x in ids], "or") for ids in alike]
+        more = [f"{len(effects) - len(said)} more"] if len(effects) > len(said) else []
+        title = textwrap.fill(f"Missing in the model: {names.verbose_join([*said, *more])}", TITLE_LETTERS)
+        fig.suptitle(title, x=0.01, ha="left", fontsize=12)
+    grid = fig.add_gridspec(2, 2, width_ratios=[1, 1.9], height_ratios=[1, 1.6])
     left = fig.add_subplot(grid[:, 0])
     _dumbbells(left, lines, "rmse", data)
     worst = [_number(t.before.get("rmse")) for t in lines] + [_number(t.after.get("rmse")) for t in lines]
@@ -100,9 +112,8 @@ def before_after(data: ReportData) -> Any:
         start = data.row("time_s")[here] + 0.5 * data.row("duration_s")[here]
         minutes = float(start[-1] - start[0]) > 600
         t = start / 60 if minutes else start
-        top.plot(t, data.row("measured")[here], color=MEASURED, linewidth=1.6, zorder=2)
+        top.plot(t, data.row("measured")[here], color=MEASURED, linewidth=1.1, zorder=2)
         for when, _, colour in models(data):
-            top.plot(t, data.row(when)[here], color=colour, linewidth=1.1, zorder=3)
             bottom.plot(t, data.residual(when)[here], color=colour, linewidth=1.1, zorder=3)
         trip = int(data.row("trip")[here.start])
         name = data.trip_names[trip] if trip < len(data.trip_names) else f"trip {trip + 1}"
@@ -111,11 +122,11 @@ def before_after(data: ReportData) -> Any:
         top.margins(x=0.01)
     top.set_ylabel(axis_label(names.target(data.summary["target"])[1], data.unit))
     top.tick_params(labelbottom=False)
-    bottom.set_ylabel(f"measured −\npredicted [{data.unit}]")
+    bottom.set_ylabel(f"error: measured −\npredicted [{data.unit}]")
     tidy(top)
     tidy(bottom, zero=True)
     fig.align_ylabels([top, bottom])
-    legend(fig, data, measured=True)
+    legend(fig, data, measured=True, side="lower")
     return fig
 
 
