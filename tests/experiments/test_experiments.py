@@ -192,10 +192,20 @@ def test_each_experiment_has_a_config_that_tests_run():
 
 # Of these the diagnosis is most of the time, and has tests of its own: here it knows few effects. The fleet of
 # `while_driving` has more.
-FEW = ("air_density", "auxiliary_power", "headwind", "mass_scale", "power_gain", "second_switching_load", "switching_load")
+FEW = (
+    "air_density",
+    "auxiliary_power",
+    "headwind",
+    "mass_scale",
+    "power_gain",
+    "second_switching_load",
+    "switching_load",
+)
 OF_FLEET = ("cornering", "crosswind", "hvac_power", "regen_cutoff", "regen_limit", "road_surface", "rolling_speed",
             "rolling_temperature", "time_skew", "tyre_warmup", "wet_road")  # fmt: skip
-EFFECTS = {name: FEW for name in ("instruments", "many", "switching", "watch_months")} | {"while_driving": FEW + OF_FLEET}
+EFFECTS = {name: FEW for name in ("instruments", "many", "switching", "watch_months")} | {
+    "while_driving": FEW + OF_FLEET
+}
 
 
 @pytest.mark.slow

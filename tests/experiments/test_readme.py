@@ -6,9 +6,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TEXT = " ".join(README.split())
-REAL, PLANTED, SIMULATORS = (
+REAL, PLANTED, SIMULATORS, WRONG = (
     (ROOT / "docs" / name).read_text(encoding="utf-8")
-    for name in ("real_logs.md", "planted_summary.md", "simulators_quick.md")
+    for name in ("real_logs.md", "planted_summary.md", "simulators_quick.md", "wrong.md")
 )
 
 
@@ -18,12 +18,28 @@ def row(page: str, name: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
+def cell(page: str, name: str, column: str) -> float:
+    """The number in a column of the first table that has both the column and a row of this name."""
+    head: list[str] = []
+    for line in page.splitlines():
+        cells = [c.strip() for c in line.strip("|").split("|")]
+        head = [] if not line.startswith("|") else head or cells
+        if column in head and cells[0] == name:
+            return float(cells[head.index(column)])
+    raise AssertionError(f"no table has a column {column} and a row {name}")
+
+
+def percent(share: float) -> int:
+    return round(100 * share)
+
+
 def test_errors_on_measured_logs_are_those_of_the_page():
     before, after = re.search(r"\*\*ZTBus\*\*: test RMSE (\S+) → (\S+) kW", REAL).groups()  # pyright: ignore
     assert f"RMSE {after} kW" in README
     assert f"{before} kW for the calibrated sheet" in README
     pooled = next(x for x in REAL.splitlines() if x.startswith("| pooled |")).split("|")
     assert f"({pooled[4].strip()} kW if the on and off states of two loads are read" in README
+    assert f"energy of a mission off by {pooled[5].strip()} in the mean" in README
     each = [row(REAL, str(trip)) for trip in (1, 2, 3, 4)]
     mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
     assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} parameters" in README
@@ -32,23 +48,31 @@ def test_errors_on_measured_logs_are_those_of_the_page():
 
 
 def test_shares_of_synthetic_logs_are_those_of_the_page():
+    alone = []
     for size, words in (
-        (0.5, "half as large as the noise (RMS of what it adds to a row), is named exactly in"),
+        (0.5, "half as large as the noise (RMS of what it adds to a row), is identified in"),
         (0.25, "a quarter as large in"),
     ):
-        _, n, share, *_ = row(PLANTED, f"one effect, size {size}, 12 trips, ar1")
-        assert f"{words} {round(100 * float(share))} % of {n}" in TEXT
-    _, n, share, *_ = row(PLANTED, "nothing planted, all together")
-    assert f"an effect is named in {round((1 - float(share)) * int(n))} of {n} logs" in TEXT
-    outside = [row(PLANTED, f"a {what} outside the library, size 1, 24 trips, ar1") for what in ("cause", "cycle")]
-    at = row(PLANTED, "name").index("false name")
-    wrong, logs = sum(float(r[at]) * int(r[1]) for r in outside), sum(int(r[1]) for r in outside)
-    assert f"a wrong one is named in {round(wrong)} of {logs}." in TEXT
+        name = f"one effect, size {size}, 12 trips, ar1"
+        assert f"{words} {percent(cell(PLANTED, name, 'right'))} % of {cell(PLANTED, name, 'n'):.0f}" in TEXT
+        alone.append(percent(cell(PLANTED, name, "named alone")))
+    assert f"named alone ({alone[0]} and {alone[1]} %)" in TEXT
+    quiet = "nothing planted, all together"
+    n = cell(PLANTED, quiet, "n")
+    assert f"an effect is named in {(1 - cell(PLANTED, quiet, 'right')) * n:.0f} of {n:.0f} logs" in TEXT
+    outside = [f"a {what} outside the library, size 1, 24 trips, ar1" for what in ("cause", "cycle")]
+    wrong = sum(cell(PLANTED, name, "false name") * cell(PLANTED, name, "n") for name in outside)
+    assert f"a wrong one is named in {wrong:.0f} of {sum(cell(PLANTED, name, 'n') for name in outside):.0f}." in TEXT
 
 
 def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
-    _, n, right, false, blamed, *_ = row(SIMULATORS, "any change")
-    assert f"The change is named in {round(100 * float(right))} % of {n} logs" in TEXT
-    assert f"a false name is given in {round(100 * float(false))} %; in {round(100 * float(blamed))} % it is" in TEXT
-    _, _, _, lasso, *_ = row(SIMULATORS, "LassoCV")
-    assert f"LassoCV gives a false name in {round(100 * float(lasso))} %" in TEXT
+    any_change, wind = "any change", "headwind of 4 m/s"
+    n, false = cell(SIMULATORS, any_change, "n"), percent(cell(SIMULATORS, any_change, "false name"))
+    blamed = percent(cell(SIMULATORS, any_change, "instrument or payload falsely named"))
+    assert f"right in {percent(cell(SIMULATORS, any_change, 'right'))} % of {n:.0f} logs" in TEXT
+    assert f"{false} % of these logs get a false name, in {blamed} % it is" in TEXT
+    winds = cell(SIMULATORS, wind, "n")
+    assert f"a headwind is missed in {(1 - cell(SIMULATORS, wind, 'right')) * winds:.0f} of {winds:.0f}" in TEXT
+    rivals = [percent(cell(SIMULATORS, name, "false name")) for name in ("LassoCV", "STLSQ (PySINDy)")]
+    assert f"give a false name in {rivals[0]} and {rivals[1]} % of all logs" in TEXT
+    assert f"a false name is given in {false} % of the logs" in " ".join(WRONG.split())
