@@ -5,13 +5,14 @@ is three quarters of the time, and programs that are not optimised bring the ans
 rows both take as long. Results differ in the last bits of a double.
 """
 
+import contextlib
 import itertools
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-__all__ = ["compile_quickly", "compiles_long", "crowded", "keep_compiled", "make_room"]
+__all__ = ["compile_quickly", "compiles_long", "crowded", "environment", "keep_compiled", "make_room", "of_threads"]
 
 FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
@@ -36,6 +37,26 @@ def compiles_long(logs: Iterable[str | Path]) -> bool:
     """Whether compiling is most of what these logs take; what is no file counts as nothing."""
     paths = [p for p in map(Path, logs) if p.is_file()]
     return sum(p.stat().st_size * (PACKED if p.suffix in _COMPRESSED else 1) for p in paths) < SMALL_BYTES
+
+
+def of_threads(count: int) -> dict[str, str]:
+    """The environment of a process that is to use so many threads: OpenMP, BLAS, XLA's pool and its linear algebra."""
+    one = "--xla_cpu_multi_thread_eigen=false"
+    asked = os.environ.get("XLA_FLAGS", "")
+    flags = {"XLA_FLAGS": f"{asked} {one}".strip()} if count == 1 and one not in asked else {}
+    return dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC"), str(count)) | flags
+
+
+@contextlib.contextmanager
+def environment(values: Mapping[str, str]) -> Iterator[None]:
+    """These variables for the processes that start inside."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def crowded(calls: int, maps: Path = Path("/proc/self/maps")) -> bool:

@@ -4,7 +4,6 @@ A job is a module and the tasks that it runs together. Each way yields `(index, 
 end; an outcome is the tasks' results and the seconds that they took, or the exception that stopped them.
 """
 
-import contextlib
 import importlib
 import json
 import multiprocessing
@@ -19,11 +18,10 @@ from typing import Any
 
 from experiments.runner.store import sources
 from hdev_jax import progress
-from hdev_jax.compiling import make_room
+from hdev_jax.compiling import environment, make_room, of_threads
 
 __all__ = ["ClusterError", "Job", "Outcome", "call", "in_turn", "on_cluster", "on_cores"]
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NPROC")  # the last: XLA's pool
 PATIENCE = 30  # seconds for a scheduler to answer
 
 Job = tuple[str, list[dict[str, Any]]]
@@ -70,7 +68,9 @@ def on_cores(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
         spawn = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(workers, spawn, _prepare_worker, (compiled, threads))
         try:
-            with _threads(threads):  # they start with the first jobs, and load NumPy before anything of ours runs
+            with environment(
+                of_threads(threads)
+            ):  # they start with the first jobs, and load NumPy before anything of ours runs
                 futures = {pool.submit(call, job): i for i, job in enumerate(jobs)}
             for future in as_completed(futures):
                 yield futures[future], _outcome(future)
@@ -85,18 +85,6 @@ def on_cores(jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Outcome]]
             raise
 
 
-@contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """So many threads for the linear algebra of processes that start inside."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, str(count)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
 def _outcome(future: Any) -> Outcome:
     try:
         return future.result()
@@ -109,10 +97,7 @@ def _prepare_worker(compiled: str, threads: int) -> None:
 
     A cache for each worker: JAX does not write an entry in one step.
     """
-    if threads == 1:
-        one = "--xla_cpu_multi_thread_eigen=false"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {one}".strip()
-    os.environ.update(dict.fromkeys(_THREADS, str(threads)))
+    os.environ.update(of_threads(threads))
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hdev_jax.compiling import keep_compiled, make_room
+from hdev_jax.compiling import environment, keep_compiled, make_room, of_threads
 from hdev_jax.errors import InputError
 
 __all__ = ["Workers", "computed"]
@@ -22,7 +22,6 @@ RETRIES = 3  # of a vehicle whose worker was lost
 # Arrays of a log are megabytes. Given back to the system after each use, as Dask has it (65,536 bytes), they cost
 # page faults: a quarter of a vehicle's time is then spent in the operating system, with these a thirtieth.
 _KEEPS_MEMORY = {"MALLOC_TRIM_THRESHOLD_": "268435456", "MALLOC_MMAP_THRESHOLD_": "33554432"}
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NPROC": "1"}  # the last: XLA's pool
 _NO_DASK = "needs Dask: pip install 'hdev_jax[fleet]'"
 
 Work = Callable[[Mapping[str, Any]], dict[str, Any]]
@@ -58,7 +57,8 @@ def computed(work: Work, tasks: Sequence[Mapping[str, Any]], where: Workers) -> 
     with contextlib.ExitStack() as stack:
         if where.scheduler is None:
             # threads are set before the processes start: they load NumPy before anything of ours runs
-            stack.enter_context(_environment({**_KEEPS_MEMORY, **_ONE_THREAD, "XLA_FLAGS": _one_thread_xla()}))
+            keeps = {k: os.environ.get(k, v) for k, v in _KEEPS_MEMORY.items()}
+            stack.enter_context(environment(keeps | of_threads(1)))
             cluster = distributed.LocalCluster(
                 n_workers=min(where.count, len(tasks)), threads_per_worker=1, processes=True, memory_limit=0,
                 silence_logs=50,
@@ -98,23 +98,6 @@ def _client_of(address: str, option: str) -> Any:
         return distributed.Client(at, timeout=PATIENCE_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as e:
         raise InputError(f"{option}: no scheduler answers there ({type(e).__name__})") from e
-
-
-def _one_thread_xla() -> str:
-    one = "--xla_cpu_multi_thread_eigen=false"
-    asked = os.environ.get("XLA_FLAGS", "")
-    return asked if one in asked else f"{asked} {one}".strip()
-
-
-@contextlib.contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def _there(work: Work, task: dict[str, Any]) -> dict[str, Any]:

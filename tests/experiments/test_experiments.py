@@ -203,9 +203,7 @@ FEW = (
 )
 OF_FLEET = ("cornering", "crosswind", "hvac_power", "regen_cutoff", "regen_limit", "road_surface", "rolling_speed",
             "rolling_temperature", "time_skew", "tyre_warmup", "wet_road")  # fmt: skip
-EFFECTS = {name: FEW for name in ("instruments", "many", "switching", "watch_months")} | {
-    "while_driving": FEW + OF_FLEET
-}
+EFFECTS = dict.fromkeys(("instruments", "many", "switching", "watch_months"), FEW) | {"while_driving": FEW + OF_FLEET}
 
 
 @pytest.mark.slow
