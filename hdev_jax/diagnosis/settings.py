@@ -44,7 +44,7 @@ class Settings:
         "collinearity: standard error 18 times that of an orthogonal column",
     )  # fmt: skip
     agreed: float = _number(
-        0.25, "least size by generalised least squares, over that by ordinary least squares, two standard errors added",
+        0.25, "smallest ratio of the estimate by generalised least squares, plus two standard errors, to that by ordinary",
         "1", "chosen on seeds 1-99",
     )  # fmt: skip
     placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
@@ -53,11 +53,11 @@ class Settings:
         19, "placebos shifted in time, none of which may gain as much", "draws", "permutation test, 5 %"
     )
     stable: float = _number(
-        0.25, "share of resampled sets of clusters in which the effect, or its class, comes first again", "1",
+        0.25, "share of resampled sets of clusters in which the effect, or its class, ranks first again", "1",
         "Meinshausen and Bühlmann, JRSS B 72 (2010), far below their 0.6: sets of 8 trips differ much",
     )  # fmt: skip
     switch_low: float = _number(
-        0.4, "least estimate of a switch, over its full difference, and 1 over the largest", "1",
+        0.4, "smallest estimate of a switch, as a share of its full step; the largest is 1 over it", "1",
         "half, less two standard errors",
     )  # fmt: skip
 
@@ -148,7 +148,7 @@ class Settings:
     )
 
     instrument_share: float = _number(
-        0.5, "share of the test variance left unexplained above which no instrument is named", "1",
+        0.5, "share of the remaining test variance that is structure, above which no instrument is named", "1",
         "more structure than noise: the model's form is wrong",
     )  # fmt: skip
 
@@ -161,7 +161,10 @@ class Settings:
         0.1, "p-value, before any correction, above which there is no sign of a candidate", "1", "a test at 10 %"
     )
     half: float = _number(
-        0.5, "share of the trips' differences, and adjusted p-value, of effects reported as undecided", "1", "half"
+        0.5,
+        "share of the differences between trips that an undecided effect may explain; its adjusted p-value is below",
+        "1",
+        "half",
     )
 
 
