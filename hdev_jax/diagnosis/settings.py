@@ -44,8 +44,8 @@ class Settings:
         "collinearity: standard error 18 times that of an orthogonal column",
     )  # fmt: skip
     agreed: float = _number(
-        0.25, "smallest ratio of the estimate by generalised least squares, plus two standard errors, to that by ordinary",
-        "1", "chosen on seeds 1-99",
+        0.25, "smallest ratio of the GLS estimate, plus two standard errors, to the OLS estimate", "1",
+        "chosen on seeds 1-99",
     )  # fmt: skip
     placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
     placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
