@@ -116,8 +116,9 @@ class Alarm:
         at = "".join(f", {k} = {v:.4g}" for k, v in self.shapes)
         error = f" ± {self.sd:.2g}" if np.isfinite(self.sd) else ""
         other = f"; or {', '.join(self.instead)}" if self.instead else ""
+        unit = "" if self.unit == "1" else f" {self.unit}"
         return (
-            f"{self.effect}: {self.name} = {self.size:.4g}{error} {self.unit}{at}; since row {self.since_row}, certain "
+            f"{self.effect}: {self.name} = {self.size:.4g}{error}{unit}{at}; since row {self.since_row}, certain "
             f"at row {self.certain_row}; {self.wh_per_day:+.4g} Wh in {SHIFT_S / 3600:g} h of driving{other}"
         )
 
