@@ -119,7 +119,7 @@ class Alarm:
         unit = "" if self.unit == "1" else f" {self.unit}"
         return (
             f"{self.effect}: {self.name} = {self.size:.4g}{error}{unit}{at}; since row {self.since_row}, certain "
-            f"at row {self.certain_row}; {self.wh_per_day:+.4g} Wh in {SHIFT_S / 3600:g} h of driving{other}"
+            f"at row {self.certain_row}; {self.wh_per_day / 1e3:+.3g} kWh in {SHIFT_S / 3600:g} h of driving{other}"
         )
 
 
