@@ -18,7 +18,7 @@ __all__ = ["tabulate"]
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 Line = dict[str, Any]
 GREEN = "#009E73"  # the third of Okabe and Ito's colours
-SHEETS = {"declared": "declared sheet", "diagnosed": "diagnosed sheet", "plain": "complete sheet"}
+SHEETS = {"declared": "declared sheet", "diagnosed": "diagnosed sheet", "plain": "declared sheet, plain fleet"}
 
 
 def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[str], list[Line]]:

@@ -47,8 +47,9 @@ class Config(Strict):
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
     """A drive each."""
     for k in range(config.drives):
-        for noise in config.noises:
-            yield {"noise": noise, "seed": config.seed + k, "trips": config.trips, "vehicles": config.vehicles,
+        for n, noise in enumerate(config.noises):
+            seed = config.seed + k * len(config.noises) + n
+            yield {"noise": noise, "seed": seed, "trips": config.trips, "vehicles": config.vehicles,
                    "rows_per_trip": config.rows_per_trip, "ar_coefficient": config.ar_coefficient}  # fmt: skip
 
 
@@ -85,13 +86,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     total = _line("all", [r for _, r in results])
     write_tables(run, "months", [*lines, total], config.caption)
     _figure(run, config, results)
-    # a noise has few months: one alarm too many is chance, and only a significant excess is said
-    over = [x for x in lines if wilson(x["with_alarm"], x["vehicle_months"])[0] > config.at_most]
-    over += [total] if total["with_alarm"] > config.at_most * total["vehicle_months"] else []
-    missed = [
-        f"{x['name']}: {x['with_alarm']} of {x['vehicle_months']} have an alarm, target {config.at_most:.0%}"
-        for x in over
-    ]
+    said = f"{total['with_alarm']} of {total['vehicle_months']} have an alarm, target {config.at_most:.0%}"
+    missed = [said] if total["with_alarm"] > config.at_most * total["vehicle_months"] else []  # a noise has too few
     findings = [f"Nothing planted: {total['with_alarm']} of {total['vehicle_months']} vehicle-months of "
                 f"{total['km_a_month']:.0f} km have an alarm (95 % interval {total['interval_95']})"]  # fmt: skip
     rows = [{"name": x["name"], "paper": None, "ours": x} for x in (*lines, total)]
@@ -119,7 +115,16 @@ def _figure(run: Run, config: Config, results: Sequence[tuple[dict[str, Any], di
     at = [0.0, *(had / 10.0), max(r["rows"] for _, r in results) / 10.0]
     counts = [*range(len(had) + 1), len(had)]
     low, high = np.transpose([wilson(k, len(alarms)) for k in counts])
-    ax.fill_between(at, 100 * low, 100 * high, step="post", color=AFTER, alpha=0.2, lw=0, label="95 % interval")
+    ax.fill_between(
+        at,
+        100 * low,
+        100 * high,
+        step="post",
+        color=AFTER,
+        alpha=0.2,
+        lw=0,
+        label="95 % interval, as if drives were independent",
+    )
     ax.step(at, 100 * np.array(counts) / len(alarms), where="post", color=AFTER, label=f"{len(alarms)} vehicles")
     ax.axhline(100.0 * config.at_most, color=BEFORE, ls="--", lw=1, label=f"target: at most {config.at_most:.0%}")
     ax.set(xlabel="driven [km]", ylabel="vehicles with an alarm [%]", ylim=(0, None), xlim=(0, at[-1]))

@@ -76,7 +76,7 @@ def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]
     """RMSE and PE of every model on test rows, the best first; of many models, those with all of their parts."""
     test = [(way, pooled(f)) for (way, use), f in gathered.items() if use == "test"]
     if len(test) > MOST_BARS:
-        test = [(way, p) for way, p in test if not way.endswith("alone")]
+        test = [(way, p) for way, p in test if way in NAMED or not way.endswith("alone")]
     test.sort(key=lambda x: x[1]["rmse_wh"])
     fig = figure(9.0, 0.9 + 0.28 * len(test))
     for k, (key, label) in enumerate((("rmse_wh", "RMSE [Wh]"), ("pe_percent", "PE of all trips [%]"))):
@@ -88,7 +88,7 @@ def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]
         ax.set_xlabel(label)
         ax.axvline(0, color="black", linewidth=0.6)
         tidy(ax)
-    fig.suptitle(f"Errors on test rows, {data}; colours: ours and the paper's network")
+    fig.suptitle(f"Errors on test rows, {data}; blue: ours, orange: the paper's network")
     save_figure(run, fig, "models")
 
 

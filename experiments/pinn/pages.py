@@ -9,6 +9,7 @@ from experiments.pinn.figures import (
     MODELS,
     NAMED,
     OURS,
+    PAPER_MODEL,
     coefficient_boxes,
     in_words,
     learning_curves,

@@ -1,14 +1,15 @@
 """Figures of the planted study: power against size, false discoveries against noise, confusion between causes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 from matplotlib.patches import Rectangle
 
 from experiments.planted.rivals import comparable
 from experiments.planted.rivals_table import LABELS, outcome
-from experiments.planted.scores import Group, names
+from experiments.planted.scores import MOST, PLANTABLE, Group, names
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import wilson
 from hdev_jax.physics import LIBRARY
@@ -48,11 +49,11 @@ def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     """
     done = _compared(done, rivals)
     single = [(t, r) for t, r in done if t["size"] and len(t["effects"]) == 1 and t["effects"][0] in LIBRARY]
-    if len({t["size"] for t, _ in single}) < LEAST_SIZES:  # fewer are rows of a table
-        return
+    lengths = sorted({t["trips"] for t, _ in single})
+    if not any(len({t["size"] for t, _ in single if t["trips"] == n}) >= LEAST_SIZES for n in lengths):
+        return  # fewer are rows of a table
     fig = figure(6.4, 3.8)
     axes = fig.add_subplot()
-    lengths = sorted({t["trips"] for t, _ in single})
     series = [(m, trips) for m in _methods(rivals) for trips in lengths]
     dashes = dict(zip(lengths, cycle(("--", "-", ":", "-."))))
     colours, lowest = list(COLOURS.values()), 0.0 if rivals else 50.0
@@ -130,12 +131,17 @@ def confusion_figure(run: Run, done: Group) -> None:
         logs = [r for t, r in single if t["effects"][0] == p]
         rows.append(f"{p} ({len(logs)})")
         for r in logs:
-            for name in {right[p] if right[p] in n["class"] else n["id"] for n in r["named"]} or {"nothing"}:
+            for name in {right[p] if _answers(n, right[p]) else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
+    outlined = [[right[p] if right[p] in LIBRARY else "nothing", *PLANTABLE[p].partly] for p in planted]
     share_figure(
-        run, "confusion", rows, columns, share, [[right[p] if right[p] in LIBRARY else "nothing"] for p in planted],
+        run, "confusion", rows, columns, share, outlined,
         ylabel="planted (logs)", title="Synthetic logs: what was named [%]",
     )  # fmt: skip
+
+
+def _answers(entry: Mapping[str, Any], right: str) -> bool:
+    return right in entry["class"] and entry["class_size"] <= MOST
 
 
 def share_figure(

@@ -16,7 +16,7 @@ NEAR_ORACLE = 1.05
 TELLING = 0.5
 CAPTION = (
     "Planted effects: intervals of sizes (n sizes, of effects named by their own id) and test errors (n logs), over "
-    "all logs with an effect to be named; met: the share is in the wanted range"
+    "all logs with an effect to be named; target met: the share is in the target range"
 )
 
 

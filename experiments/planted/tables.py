@@ -45,6 +45,7 @@ WANTED = {  # what may be wanted of a setting: column with the share, in words, 
     "named_exactly_no_class": ("named alone", "no_class_wanted"),
     "called_unexplained": ("called unexplained", "unexplained_wanted"),
 }
+MOST_SAID = 6  # counts that a page begins with
 BY_TWIN = "Planted effects: those without a twin have to be named alone, those with a twin in a class"
 LEGEND = {  # of each table that is there; the first of every page
     "": (
@@ -136,13 +137,15 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
 
 
 def _findings(config: Config, done: Group) -> list[str]:
-    """What leads the page: right answers by case and size."""
+    """What leads the page: right answers where nothing was planted and where one effect is to be named, by size."""
     groups: dict[str, list[bool]] = {}
     for task, result in done:
-        case = config.cases[task["case"]]
-        groups.setdefault(f"{case.name}{_sized(task)}", []).append(_right(case.asked, task, result))
+        case, planted = config.cases[task["case"]], task["effects"]
+        if case.asked == "named" and (not planted or (len(planted) == 1 and scores.nameable(planted))):
+            name = f"{case.name}{_sized(task)}" + (f", {task['trips']} trips" if planted else "")
+            groups.setdefault(name, []).append(_right(case.asked, task, result))
     said = [f"{name}, {sum(hits)} of {len(hits)}" for name, hits in groups.items()]
-    return [f"Right answers: {'; '.join(said)}"] if said else []
+    return [f"Right answers: {'; '.join(said)}"] if 0 < len(said) <= MOST_SAID else []
 
 
 def _unexplained_wanted(config: Config, done: Group) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 from experiments.runner.compare import DECIDES, comparison, findings, headlines, missed, notes
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
+from experiments.runner.store import HERE
 from experiments.runner.tables import cells, markdown, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
@@ -141,7 +142,7 @@ def write_list_docs(
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
         kind = _kind(next(iter(runs)))
-        lines = [f"# {kind if kind != 'Study' else _titled(Path(configs))}", "", *_about(Path(configs)), ""]
+        lines = [f"# {kind if kind != 'Study' else _titled(home)}", "", *_about(Path(configs)), ""]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
         lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
@@ -261,10 +262,12 @@ def folded(title: str, text: str) -> list[str]:
 
 
 def _titled(config: Path) -> str:
-    """The title of a config's page: `planted_summary` is "Planted summary", `table1` of paper 1 "Paper 1, table 1"."""
-    words = re.sub(r"(?<=[a-z])(?=\d)", " ", config.stem.replace("_", " "))
-    kind = _kind(config)
-    return f"{kind}, {words.replace('fig ', 'figure ')}" if kind.startswith("Paper") else words.capitalize()
+    """The title of a config's page: as the site's navigation has it, else the config's name in words."""
+    site = HERE.parent / "mkdocs.yml"
+    nav = site.read_text(encoding="utf-8") if site.is_file() else ""
+    if found := re.search(rf'- "?([^"\n]+?)"?: {re.escape(config.stem)}\.md', nav):
+        return found[1].removesuffix(" (older code)")
+    return config.stem.replace("_", " ").capitalize()
 
 
 def _kind(config: Path) -> str:

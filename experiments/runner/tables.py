@@ -35,6 +35,7 @@ _WORDS = {
     "no_class_of_separable": "named alone, of the separable ones", "no_class_interval_95": "named alone, 95 % interval",
     "no_class_wanted": "named alone, target", "wanted": "target", "met": "target met", "named_first": "top-ranked",
     "blamed": "instrument or payload falsely named", "impossible": "impossible size",
+    "blamed_when_nothing": "instrument or payload falsely named, nothing changed", "wanted_range": "target range",
     "redrawn": "drawn anew", "worst_percent": "largest error [%]",
     "worst_at_kw": "at a power of [kW]", "test_mean": "test MSE, mean [kW²]", "physics_tabular": "physics, tables",
     "physics_predicted": "physics, predicted coefficients", "step_worst_energy_percent": "energy of a step, worst [%]",

@@ -10,7 +10,7 @@ from experiments.runner.figures import styled
 from experiments.runner.tables import wilson, write_tables
 from experiments.simulators import scores as scores
 from experiments.simulators.config import Config
-from experiments.simulators.plants import PLANTS
+from experiments.simulators.plants import FORMS, PLANTS
 from hdev_jax.rundir import Run
 
 __all__ = ["Group", "change_row", "collect", "confusion", "rival_rows"]
@@ -59,8 +59,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     if against:
         write_tables(run, "table_rivals", against, "Rivals on the same logs")
     write_tables(run, "table_said", said_rows(results), "What was said of each log: names with sizes, held-out error")
-    rows_of, columns, share = confusion(results)
-    _figure(run, rows_of, columns, share, _right(results))
+    _figure(run, *confusion(results))
     missed = [f"{r['name']} ({r['short_of']})" for r in rows if r["name"] in ("nothing", ANY) and r["short_of"]]
     return {
         "artefact": ARTEFACT, "data": "FASTSim 3.1, SUMO 1.28", "synthetic": True, "logs": len(results),
@@ -130,8 +129,8 @@ def _at_most(value: float, wanted: float) -> tuple[float, bool]:
     return wanted, value <= wanted
 
 
-def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray]:
-    """Changes with their number of logs, what was named, and its share of each change's logs [%].
+def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray, list[list[str]]]:
+    """Changes with their number of logs, what was named, its share of each change's logs [%], which names are right.
 
     An entry that holds the change is shown as it; so is a declared coefficient that tells it; a log without a name
     is "nothing", or "unexplained" where it is called so.
@@ -151,19 +150,22 @@ def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray]:
     wanted = [k for plant, _ in groups for k in (*sorted(PLANTS[plant].names), *PLANTS[plant].coefficients[:1])]
     named = {k for row in cells for k in row}
     ends = [k for k in ("unexplained", "nothing") if k in named]
-    columns = [k for k in dict.fromkeys(wanted) if k in named]
+    own = {k for plant, _ in groups for k in PLANTS[plant].names}  # what was changed has a column, named or not
+    columns = [k for k in dict.fromkeys(wanted) if k in named | own]
     columns += [*sorted(named - set(columns) - set(ends)), *ends]
     share = np.array([[row.get(k, 0.0) for k in columns] for row in cells]).reshape(len(cells), len(columns))
-    return [f"{PLANTS[plant].words} ({len(g)})" for plant, g in groups], columns, share
+    return [f"{PLANTS[plant].words} ({len(g)})" for plant, g in groups], columns, share, _right(results)
 
 
 def _right(results: Group) -> list[list[str]]:
-    """The names that are right, by change; where nothing was changed, none and "unexplained"."""
-    return [
-        [*PLANTS[p].names, *PLANTS[p].coefficients[:1]]
-        or (["unexplained"] if PLANTS[p].missing else ["nothing", "unexplained"])
-        for p, _ in _by(results, lambda t: t["plant"])
-    ]
+    """The columns that are right, by change: it, or the coefficient that takes it up; with nothing changed, the form of
+    the efficiency; without a slope, that something is unexplained."""
+    out = []
+    for key, group in _by(results, lambda t: t["plant"]):
+        plant = PLANTS[key]
+        forms = {k for t, _ in group for k in FORMS[t["simulator"]]} if key == "nothing" else set()
+        out.append([*plant.names, *plant.coefficients[:1], *forms, *(["unexplained"] if plant.missing else [])])
+    return out
 
 
 @styled

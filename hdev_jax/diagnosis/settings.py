@@ -162,7 +162,7 @@ class Settings:
     )
     half: float = _number(
         0.5,
-        "share of the differences between trips that an undecided effect may explain; its adjusted p-value is below",
+        "for undecided effects: share of the differences between trips to be ruled out, and largest adjusted p-value",
         "1",
         "half",
     )

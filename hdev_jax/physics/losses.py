@@ -141,7 +141,7 @@ class PartLoad(Effect):
         # 5 % of 50 kW, of a small machine at its rated power, are 1e-6 per watt; of a truck's 300 kW a sixth of that
         Size("per_w", "1/W", 0.0, 1e-7, 0.0, 5e-6, least=5e-9, label="loss per power squared"),
         # chosen, not fitted: half a step of this grid changes the curve by less than a seventh of P₀
-        Choice("half_w", "W", 3e3, 2e3, 300.0, 1e5, grid=(1e3, 3e3, 1e4, 3e4), of="standby_w", label="power at half"),
+        Choice("half_w", "W", 3e3, 2e3, 300.0, 1e5, grid=(1e3, 3e3, 1e4, 3e4), of="standby_w", label="half-loss power"),
     )
     variants: ClassVar[tuple[Names, ...]] = (("standby_w",), ("per_w",), ("standby_w", "per_w"))
     mistaken_for: ClassVar[Names] = ("power_gain", "copper_loss", "battery_resistance", "regen_efficiency")

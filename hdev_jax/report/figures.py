@@ -87,16 +87,21 @@ def legend(
     fig.legend(handles=handles, loc=f"outside {side} right", ncols=len(handles), handlelength=1.6, columnspacing=1.6)
 
 
+def _of_class(e: dict[str, Any]) -> str:
+    """An effect, with those that the log cannot tell from it in brackets."""
+    others = [names.effect(x) for x in e.get("indistinguishable_from") or []]
+    return names.effect(e["id"]) + (f" (or {names.verbose_join(others, 'or')})" if others else "")
+
+
 def before_after(data: ReportData) -> Any:
     """RMSE of each test trip before and after, and the error along a typical stretch of one, below what was measured:
     predictions would hide each other and the measurement."""
     lines = [t for t in trip_lines(data) if t.role == "test"] or trip_lines(data)
     fig = figure(WIDTH, 4.8)
     if effects := data.summary.get("effects", []):
-        alike = [[e["id"], *(e.get("indistinguishable_from") or [])] for e in effects[:NAMED_EFFECTS]]
-        said = [names.verbose_join([names.effect(x) for x in ids], "or") for ids in alike]
+        said = [_of_class(e) for e in effects[:NAMED_EFFECTS]]
         more = [f"{len(effects) - len(said)} more"] if len(effects) > len(said) else []
-        title = textwrap.fill(f"Missing in the model: {names.verbose_join([*said, *more])}", TITLE_LETTERS)
+        title = textwrap.fill(f"Missing in the model: {'; '.join([*said, *more])}", TITLE_LETTERS)
         fig.suptitle(title, x=0.01, ha="left", fontsize=12)
     grid = fig.add_gridspec(2, 2, width_ratios=[1, 1.9], height_ratios=[1, 1.6])
     left = fig.add_subplot(grid[:, 0])

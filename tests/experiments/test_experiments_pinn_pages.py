@@ -116,8 +116,8 @@ def test_the_table_counts_rows_once_and_bounds_over_all_trainings(run, no_figure
     ]
     out = pinn_pages.table(config(), results, run)
     paper, unseen, tables, _, lost = written(run, "table")
-    assert (paper["model"], paper["n"], paper["trips"]) == ("paper", "6", "4")
-    assert (unseen["model"], unseen["n"]) == ("paper: unseen", "2")
+    assert (paper["model"], paper["n"], paper["trips"]) == ("PINN", "6", "4")
+    assert (unseen["model"], unseen["n"]) == ("PINN: unseen", "2")
     assert (tables["model"], tables["n"]) == ("physics, tables", "6")
     assert lost["model"] == "network without physics: diverged, 1 of 1 trainings"
     rows = {r["name"]: r for r in out["rows"]}

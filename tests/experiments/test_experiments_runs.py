@@ -68,6 +68,20 @@ def test_a_process_forgets_what_it_compiled_before_its_memory_maps_run_out(tmp_p
     assert [compiling.crowded(calls, nowhere) for calls in (1, compiling.FORGET_EVERY)] == [False, True]
 
 
+def test_processes_that_start_inside_have_the_environment_and_ours_is_as_it_was(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
+    monkeypatch.setenv("NPROC", "7")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    one = compiling.of_threads(1)
+    assert one["XLA_FLAGS"].split() == ["--xla_a=1", "--xla_cpu_multi_thread_eigen=false"]
+    with compiling.environment(one):
+        assert (os.environ["NPROC"], os.environ["OPENBLAS_NUM_THREADS"]) == ("1", "1")
+        assert "XLA_FLAGS" not in compiling.of_threads(1), "the flag once"
+    assert (os.environ["NPROC"], os.environ["XLA_FLAGS"]) == ("7", "--xla_a=1")
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    assert "XLA_FLAGS" not in compiling.of_threads(2)
+
+
 def test_what_was_killed_resumes(tmp_path, config, monkeypatch):
     real = squares.run
 

@@ -271,7 +271,7 @@ def test_a_page_says_how_many_answers_are_right_and_has_no_figure_of_zeros_or_of
     two = [({**t, "size": s}, r) for s in (0.25, 0.5) for t, r in single]
     found, figures = ran([*two, *nothing], "two")
     assert figures == {"confusion.png"}
-    assert f"one effect, size 0.25, {n} of {n}; one effect, size 0.5, {n} of {n}" in found[0]
+    assert f"one effect, size 0.25, 12 trips, {n} of {n}; one effect, size 0.5, 12 trips, {n} of {n}" in found[0]
     assert f"nothing planted, {quiet} of {quiet}" in found[0]
     one_false = [*nothing[1:], (nothing[0][0], result(["headwind"]))]
     found, figures = ran([*two, *(({**t, "size": 1.0}, r) for t, r in single), *one_false], "three")

@@ -70,9 +70,9 @@ def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
     n, false = cell(SIMULATORS, any_change, "n"), percent(cell(SIMULATORS, any_change, "false name"))
     blamed = percent(cell(SIMULATORS, any_change, "instrument or payload falsely named"))
     assert f"right in {percent(cell(SIMULATORS, any_change, 'right'))} % of {n:.0f} logs" in TEXT
-    assert f"{false} % of these logs get a false name, in {blamed} % it is" in TEXT
+    assert f"{false} % of these logs get a false name, {blamed} % a false instrument fault or payload error" in TEXT
     winds = cell(SIMULATORS, wind, "n")
     assert f"a headwind is missed in {(1 - cell(SIMULATORS, wind, 'right')) * winds:.0f} of {winds:.0f}" in TEXT
     rivals = [percent(cell(SIMULATORS, name, "false name")) for name in ("LassoCV", "STLSQ (PySINDy)")]
     assert f"give a false name in {rivals[0]} and {rivals[1]} % of all logs" in TEXT
-    assert f"a false name is given in {false} % of the logs" in " ".join(WRONG.split())
+    assert f"a false name is given in {false} % of the logs in which one thing was changed" in " ".join(WRONG.split())

@@ -130,9 +130,15 @@ def test_the_table_shows_shares_and_what_is_short_of_its_target():
 def test_the_confusion_shows_what_was_named_instead():
     c_rr = result(coefficients={"road.c_rr": coefficient(0.012, 0.001, 0.01)})
     group = [(task("nothing"), result()), (task("nothing"), result(GAIN)), (task("payload"), result(MASS)),
-             (task("payload"), result(entry("power_gain", "mass_scale"))), (task("rolling"), c_rr)]  # fmt: skip
-    rows, columns, share = confusion(group)
-    assert rows == ["nothing (2)", "mass +10 % (2)", "c_rr +20 % (1)"]
+             (task("payload"), result(entry("power_gain", "mass_scale"))), (task("rolling"), c_rr),
+             (task("headwind"), result()), (task("slope"), result(unexplained=True))]  # fmt: skip
+    rows, columns, share, right = confusion(group)
+    assert rows[:3] == ["nothing (2)", "mass +10 % (2)", "c_rr +20 % (1)"]
+    assert "constant_headwind" in columns, "what was changed has a column, named or not"
+    assert "regen_efficiency" in right[0]
+    assert "nothing" not in right[0], "a sheet of one efficiency lacks its form"
+    assert right[1:3] == [["mass_scale"], ["road.c_rr"]]
+    assert sorted(map(tuple, right[3:])) == [("constant_headwind",), ("unexplained",)]
     shown = {(r, c): share[i, k] for i, r in enumerate(rows) for k, c in enumerate(columns)}
     assert shown["nothing (2)", "nothing"] == shown["nothing (2)", "power_gain"] == 50.0
     assert shown["mass +10 % (2)", "mass_scale"] == shown["c_rr +20 % (1)", "road.c_rr"] == 100.0

@@ -52,7 +52,7 @@ def test_a_planted_effect_of_half_the_noise_is_named(watching, effect):
     assert alarm.since_row < alarm.certain_row
     assert alarm.sd > 0
     assert f"{effect}: {alarm.name} = " in alarm.line()
-    assert alarm.line().endswith("Wh in 9 h of driving")
+    assert alarm.line().endswith(" kWh in 9 h of driving")
 
 
 def test_an_effect_that_begins_later_is_dated(watching):

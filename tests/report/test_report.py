@@ -16,6 +16,7 @@ from hdev_jax.report import data as report_data
 from hdev_jax.report import names as shown
 from hdev_jax.report import page, statistics, words
 from hdev_jax.report.data import ReportData
+from hdev_jax.report.figures import before_after
 from hdev_jax.report.page import write_calibration_report, write_report
 from hdev_jax.report.residuals import panels
 from hdev_jax.report.words import answer
@@ -279,6 +280,20 @@ def test_one_of_a_class_names_the_others_and_how_to_separate_them(tmp_path):
     text = plain(written(data, tmp_path))
     assert "headwind (scale 0.98 ± 0.03) or crosswind or drafting, which this log cannot distinguish: on" in text
     assert "To separate them: headings all around on one windy day" in text
+
+
+def test_the_first_figure_names_what_was_missing_classes_in_brackets():
+    data = fake()
+    first = data.summary["effects"][0]
+    title = lambda: (before_after(data).get_suptitle() or "").replace("\n", " ")  # noqa: E731
+    assert title() == "Missing in the model: headwind"
+    first["indistinguishable_from"] = ["crosswind", "drafting"]
+    data.summary["effects"] = [
+        first,
+        *({**first, "id": k, "indistinguishable_from": []} for k in ("wet_road", "x", "y")),
+    ]
+    assert title() == "Missing in the model: headwind (or crosswind or drafting); wet road; x; 1 more"
+    assert before_after(fake("nothing_missing")).get_suptitle() == ""
 
 
 @pytest.mark.parametrize(("scale", "said"), [("distance", "distance"), (None, "neither time, distance nor energy")])
