@@ -84,10 +84,10 @@ def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]
         colours = [AFTER if way == OURS else BEFORE if way == PAPER_MODEL else GREY for way, _ in test]
         ax.barh(range(len(test)), [p[key] for _, p in test], color=colours, alpha=0.75)
         ax.set_yticks(range(len(test)), [in_words(way) for way, _ in test] if k == 0 else [])
-        ax.invert_yaxis()
+        ax.set_ylim(len(test) - 0.4, -0.6)
         ax.set_xlabel(label)
         ax.axvline(0, color="black", linewidth=0.6)
-        tidy(ax)
+        tidy(ax, grid="x")
     fig.suptitle(f"Errors on test rows, {data}; blue: ours, orange: the paper's network")
     save_figure(run, fig, "models")
 

@@ -65,6 +65,7 @@ def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
         ax.set_xticks([t for t in ticks if low <= t <= high])
         plain_log(ax.xaxis)
         ax.minorticks_off()
-        ax.set_xlabel("our error over the paper's (below 1: smaller); grey: all random starts")
+        ax.set_xlabel("ratio; grey: range over random starts")
+        fig.suptitle("Our error over the paper's: below 1 ours is smaller", fontsize=10)
         tidy(ax, grid="x")
         return png(fig)
