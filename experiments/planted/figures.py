@@ -129,7 +129,7 @@ def confusion_figure(run: Run, done: Group) -> None:
     rows = []
     for i, p in enumerate(planted):
         logs = [r for t, r in single if t["effects"][0] == p]
-        rows.append(f"{p} ({len(logs)})")
+        rows.append(f"{p.replace('_', ' ')} ({len(logs)})")
         for r in logs:
             for name in {right[p] if _answers(n, right[p]) else n["id"] for n in r["named"]} or {"nothing"}:
                 share[i, columns.index(name)] += 100 / len(logs)
@@ -156,7 +156,7 @@ def share_figure(
     axes = fig.add_subplot()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
     axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90, fontsize=7.5)
-    axes.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows], fontsize=7.5)
+    axes.set_yticks(range(len(rows)), rows, fontsize=7.5)
     for i, k in zip(*np.nonzero(share >= 0.5), strict=True):
         axes.text(k, i, f"{share[i, k]:.0f}", ha="center", va="center", fontsize=6,
                   color="white" if share[i, k] > 55 else "#222")  # fmt: skip
