@@ -124,6 +124,7 @@ def write_docs(
         lines += ["", f"## {points[k]}", ""] if k < len(points) and points[k] else []
         lines += _lines(folder, Path(config), docs, name, "" if len(folders) == 1 else f"{k}_")
     lines += ["", _by(f"{' '.join([every, *flags])} --tasks DIR --out OUT --docs docs")]
+    docs.mkdir(parents=True, exist_ok=True)  # a page without figures has made no folder
     (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -138,6 +139,7 @@ def write_list_docs(
     Figures go to `docs/figures/FOLDER/`.
     """
     pages = []
+    docs.mkdir(parents=True, exist_ok=True)
     for home in dict.fromkeys(path.parent for path in made):
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
