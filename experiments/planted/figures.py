@@ -88,10 +88,8 @@ def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
 def false_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
     """Share of logs with nothing planted in which something was named, by colour of the noise."""
     empty = [(t, r) for t, r in _compared(done, rivals) if not t["effects"]]
-    if not any(
-        outcome([], r, m)[1] for _, r in empty for m in _methods(rivals)
-    ):  # a row of zeros is read from the table
-        return
+    if not any(outcome([], r, m)[1] for _, r in empty for m in _methods(rivals)):
+        return  # a row of zeros is read from the table
     noises = list(dict.fromkeys(t["noise"] for t, _ in empty))
     methods = [m for m in _methods(rivals) if m != "ours_first"]  # no name is right here, with classes or without
     fig = figure(6.8, 3.6)
