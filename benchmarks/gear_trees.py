@@ -96,8 +96,9 @@ def page(m: dict[str, Any]) -> str:
     command = f"python benchmarks/gear_trees.py --routes {m['routes']} --rows {m['rows']} --write"
     lines = [
         "# The gear's trees: time", "",
-        f"Made by `{command}`: two models of the [gear table](fig5.md), trained again on {m['routes']} routes, timed in "
-        f"several inference libraries, one thread, load of the machine before it {m['load']:.1f}. Accuracies are of routes not trained on.", "",
+        f"Made by `{command}`: two models of the [gear table](fig5.md), trained again on {m['routes']} routes, timed "
+        f"in several inference libraries, one thread, load of the machine before it {m['load']:.1f}. Accuracies are of "
+        "routes not trained on.", "",
     ]  # fmt: skip
     for name, part in m["models"].items():
         sizes = [str(n) for n in (*BATCHES, m["rows"])]
