@@ -95,16 +95,17 @@ def page(m: dict[str, Any]) -> str:
     """The measurements as a page of the site."""
     command = f"python benchmarks/gear_trees.py --routes {m['routes']} --rows {m['rows']} --write"
     lines = [
-        "# The gear's trees: time", "",
+        "# Gear classifiers: time of a prediction", "",
         f"Made by `{command}`: two models of the [gear table](fig5.md), trained again on {m['routes']} routes, timed "
-        f"in several inference libraries, one thread, load of the machine before it {m['load']:.1f}. Accuracies are of "
-        "routes not trained on.", "",
+        f"in several inference libraries, on one thread (load average before the run: {m['load']:.1f}). Accuracies "
+        "are on routes not trained on.", "",
     ]  # fmt: skip
     for name, part in m["models"].items():
         sizes = [str(n) for n in (*BATCHES, m["rows"])]
         lines += [f"## {name}", "", f"{part['trees']} trees, accuracy {100 * part['accuracy']:.1f} %.", ""]
-        lines += ["| | one row [µs] | " + " | ".join(f"{int(n):,} rows [µs a row]" for n in sizes[1:]) +
-                  " | to make it [s] | largest difference |", "|---|" + "---:|" * (len(sizes) + 2)]  # fmt: skip
+        lines += ["| | one row [µs] | " + " | ".join(f"{int(n):,} rows [µs per row]" for n in sizes[1:]) +
+                  " | compiling [s] | largest difference in probability |",
+                  "|---|" + "---:|" * (len(sizes) + 2)]  # fmt: skip
         for who, row in part["predictors"].items():
             if "missing" in row:
                 lines.append(f"| {who} | {row['missing']} |" + " |" * (len(sizes) + 1))
@@ -118,8 +119,9 @@ def page(m: dict[str, Any]) -> str:
         f"A call from Python of a compiled JAX function that does nothing takes {m['empty_call_us']:.1f} µs here. "
         "lleaves is faster for two reasons: thresholds and leaves are constants in its machine code, and a row "
         "follows one path of a tree, while arrays within jit evaluate every node. In oblivious trees (CatBoost) a "
-        "single path saves nothing: there ours is faster, and the gear table's best model is of this kind; no "
-        "compiler here reads CatBoost's file. On board the trees are part of the one program that updates the "
+        "single path saves nothing: there ours is faster, and the model of [figure 5](fig5.md) is of this kind; "
+        "none of the compilers compared reads CatBoost's file. On board the trees are part of the one program that "
+        "updates the "
         "[estimates](online.md), so there is no second call, and the gear's probabilities stay in JAX.", "",
     ]  # fmt: skip
     return "\n".join(lines)

@@ -46,23 +46,26 @@ def page(m: dict[str, Any]) -> str:
     """The measurements as a page of the site."""
     rows = [
         ("one row from Python (`Live`), median", f"{m['one_row_us']:.0f} µs", f"{LIMITS['one_row_us']:.0f} µs"),
-        (f"the same with {m['candidates']} forms of effects watched", f"{m['one_row_watched_us']:.0f} µs", ""),
-        ("what these would add to one row, by the kernel", f"{m['columns_of_one_row_us'] / 1e3:.1f} ms", ""),
+        (f"the same with {m['candidates']} forms of effects watched, their columns given",
+         f"{m['one_row_watched_us']:.0f} µs", ""),
+        ("computing these columns for one row, not included above", f"{m['columns_of_one_row_us'] / 1e3:.1f} ms", ""),
         ("one row of a log, by `scan`", f"{m['scan_us']:.1f} µs", ""),
-        ("the same by the recursive closed form of `inference/linear.py`: white noise, no levels, no kernel",
+        ("recursive least squares alone, for comparison: white noise, no random intercepts, no kernel "
+         "(`inference/linear.py`)",
          f"{m['closed_form_scan_us']:.1f} µs", ""),
         (f"{m['vehicles']:,} vehicles at once, by `vmap`", f"{m['vehicles_rows_per_s']:,.0f} rows a second", ""),
-        ("10,000 vehicles at 1 Hz", f"{m['vehicles_core']:.2f} of a core", f"{LIMITS['vehicles_core']:g}"),
+        ("10,000 vehicles at 1 Hz, CPU time alone", f"{m['vehicles_core']:.2f} of a core",
+         f"{LIMITS['vehicles_core']:g}"),
         ("compiling: one row, one row watched, many vehicles",
          ", ".join(f"{m[f'{k}_compile_s']:.1f} s" for k in ("one_row", "one_row_watched", "vehicles")), ""),
     ]  # fmt: skip
     lines = [
-        "# Row by row: time", "",
+        "# Estimates row by row: time", "",
         "Made by `python benchmarks/online.py --write`: a truck with four coefficients and seven channels, float64, "
-        f"{m['cores']} cores, one thread, load of the machine before it {m['load']:.1f}. Each row is predicted "
-        f"and weighted by {m['members']} models of the noise, and updates each. Cores count processor time, rows a "
-        "second the time that passed on the busy machine.", "",
-        "| | measured | at most |", "|---|---:|---:|",
+        f"{m['cores']} cores, one thread (load average before the run: {m['load']:.1f}). Each row is predicted by "
+        f"{m['members']} models of the noise, which are weighted and updated. *Cores* counts CPU time; *rows a second* "
+        "is by the clock, on a machine with other work.", "",
+        "| | measured | target, at most |", "|---|---:|---:|",
         *(f"| {what} | {value} | {limit} |" for what, value, limit in rows),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"

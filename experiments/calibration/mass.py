@@ -191,8 +191,11 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     said = [f"Fleet: median error {np.median(every):.2f} % over {len(every)} trips"] if every else []
     shares = [line["inside_90"] for line in lines if "inside_90" in line]
     if shares:
-        low = "; they do not cover effects that the sheet lacks and that differ by trip" if min(shares) < 85.0 else ""
-        said.append(f"90 % intervals hold the true mass in {min(shares):.0f} to {max(shares):.0f} % of trips{low}")
+        low = "; they ignore effects that the sheet lacks and that differ by trip" if min(shares) < 85.0 else ""
+        said.append(
+            f"90 % intervals cover the true mass in {min(shares):.0f} to {max(shares):.0f} % of the trips of a "
+            f"model{low}"
+        )
     return {
         "artefact": config.artefact, "data": "synthetic fleet; ztbus where the row says measured", "synthetic": True,
         "rows": rows, "better_than_paper": 0, "of": 0, "missed": missed, "findings": said,
@@ -210,9 +213,10 @@ def _figure(run: Run, results: Any, drawn: Any) -> None:
     ends = (
         [min(min(r["against"]) for r in fleet) / 1e3, max(max(r["against"]) for r in fleet) / 1e3] if fleet else [0, 1]
     )
-    ax.plot(ends, ends, color=GREY)
+    ax.plot(ends, ends, color=GREY, label="equal")
     ax.set_xlabel("true mass [t]")
-    ax.set_ylabel("posterior, 90 % [t]")
+    ax.set_ylabel("estimated mass, 90 % interval [t]")
+    ax.legend()
     ax.set_title("By trip, synthetic fleet")
     tidy(ax)
     ax = fig.add_subplot(1, 2, 2)
@@ -221,7 +225,7 @@ def _figure(run: Run, results: Any, drawn: Any) -> None:
         reach = np.array([0.0, np.max(passengers)])
         ax.plot(reach, (line[0] + line[1] * reach) / 1e3, color=dots[0].get_color())
     ax.set_xlabel("passengers counted")
-    ax.set_ylabel("posterior mean [t]")
+    ax.set_ylabel("estimated mass [t]")
     ax.set_title("By stop, measured (ZTBus), held out")
     if drawn:
         ax.legend()

@@ -231,9 +231,9 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         middle = np.mean(np.abs(away) < 0.45 * (DRAWS + 1))
         ours = {"worlds": len(values), **ps, "in_middle_90": float(middle), "mean_rank": float(np.mean(values))}
         rows.append({"name": f"{kind}, {name}", "paper": None, "ours": ours})
-        lines.append({"posterior": kind, "coefficient": name, "worlds": len(values), "p, histogram": ps["p"],
-                      "p, mean": ps["p_mean"], "p, spread": ps["p_spread"], "in the middle 90 %": middle,
-                      "mean rank": np.mean(values)})  # fmt: skip
+        lines.append({"posterior": kind, "coefficient": name, "data sets": len(values), "p, χ² of ranks": ps["p"],
+                      "p, mean rank": ps["p_mean"], "p, spread of ranks": ps["p_spread"],
+                      "share of ranks in the middle 90 %": middle, "mean rank": np.mean(values)})  # fmt: skip
     tests = [r["ours"][k] for r in rows for k in ("p", "p_mean", "p_spread")]
     least, passed = min(tests), min(tests) * len(tests) > LEAST_P
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
@@ -243,13 +243,13 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "better_than_paper": 0, "of": 0, "logs": sum(len(next(iter(result.values()))) for _, result in results),
         "missed": [] if passed else [f"ranks that are not uniform: p {least:.2g} among {len(tests)} tests"],
         "findings": [
-            f"{'Passed' if passed else 'Not passed'}: the smallest p-value of {len(tests)} tests is {least:.2g}; one "
-            f"below {LEAST_P / len(tests):.1g} would be significant at {100 * LEAST_P:.0f} %",
+            f"{'Passed' if passed else 'Not passed'}: the smallest of {len(tests)} p-values is {least:.2g}; after "
+            f"Bonferroni's correction, one below {LEAST_P / len(tests):.1g} is significant at {100 * LEAST_P:.0f} %",
         ],
         "notes": [
-            f"{DRAWS} draws of each world, {APART} apart in a chain: ranks run from 0 to {DRAWS}",
-            "The prior of the noise, and the size that the noise grows with, are fixed before the rows are seen; "
-            "without them, hdev takes both from the same rows",
+            f"{DRAWS} draws for each data set, {APART} apart in a chain: ranks run from 0 to {DRAWS}",
+            "Here the prior of the noise, and the energy with which the noise grows, are fixed in advance; in use, "
+            "hdev estimates both from the same rows",
         ],
     }  # fmt: skip
 

@@ -17,8 +17,10 @@ __all__ = ["tabulate"]
 
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 Line = dict[str, Any]
+DETECTED = "logs with a saving detected"
 GREEN = "#009E73"  # the third of Okabe and Ito's colours
-SHEETS = {"declared": "declared sheet", "diagnosed": "diagnosed sheet", "plain": "declared sheet, plain fleet"}
+SHEETS = {"declared": "declared sheet", "diagnosed": "diagnosed sheet",
+          "plain": "declared sheet, fleet without hidden effects"}  # fmt: skip
 
 
 def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[str], list[Line]]:
@@ -26,7 +28,7 @@ def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[s
     ledger, coasting, service, saved = ([(t, r) for t, r in results if t["kind"] == k]
                                         for k in ("ledger", "coasting", "service", "saved"))  # fmt: skip
     causes, left = list(_causes(ledger)), _unexplained(ledger)
-    whole = _line("ledger, all causes", [x for _, r in ledger for x in r["causes"].values()])
+    whole = _line("energy by cause, all", [x for _, r in ledger for x in r["causes"].values()])
     coasted, driven, after = list(_coasted(coasting)), list(_driven(service)), list(_saved(saved))
     lines = [whole, left, *coasted, *driven, *after]
     write_tables(run, "table", [_shown(x) for x in lines], config.caption)
@@ -42,30 +44,31 @@ def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[s
     bands += [(x, config.coasting_percent) for x in coasted]
     for x, (low, high) in bands:
         if not low <= x["inside_90"] <= high:
-            missed.append(f"{x['name']}: 90 % intervals hold {x['inside_90']:.0f} %, target {low:g} to {high:g}")
+            missed.append(f"{x['name']}: 90 % intervals cover {x['inside_90']:.0f} %, target {low:g} to {high:g}")
     for x in driven:
         if x["median_error_percent"] > config.service_percent:
             missed.append(f"{x['name']}: {x['median_error_percent']:.2g} % in the median, "
                           f"target {config.service_percent:g}")  # fmt: skip
     found = [
-        f"The causes of {len(ledger)} ledgers and what is unexplained add up to the measured energy of the log and of "
-        f"each trip within {max(off, 1e-9):.0e} %",
-        f"The ledgers' 90 % intervals hold {whole['inside_90']:.0f} % of the planted causes",
-        f"In coast-downs the intervals hold {np.mean([x['inside_90'] for x in coasted]):.0f} % of the true forces",
+        f"In {len(ledger)} logs the energies by cause and the unexplained rest add up to the measured energy of the "
+        "log and of each trip, to rounding",
+        f"90 % intervals cover {whole['inside_90']:.0f} % of the true energies by cause and, in coast-downs, "
+        f"{np.mean([x['inside_90'] for x in coasted]):.0f} % of the true forces",
     ]
     for words in SHEETS.values():
         if mine := [x for x in driven if x["name"].endswith(words)]:
             error, held = ([x[k] for x in mine] for k in ("median_error_percent", "inside_90"))
+            one = mine[0]["n"] == 1
             found.append(
-                f"From driving in service, {words}: the force is off by {_both(error, '.2g')} % in the median at "
-                f"{_both(SHOWN_KMH, 'g')} km/h ({count(mine[0]['n'], 'vehicle')}), "
-                f"and the intervals hold {_both(held, '.0f')} %"
+                f"From driving in service, {words}: the force at {_both(SHOWN_KMH, 'g')} km/h is off by "
+                f"{_both(error, '.2g')} %{'' if one else ' in the median'} ({count(mine[0]['n'], 'vehicle')})"
+                + ("" if one else f", and the intervals cover {_both(held, '.0f')} %")
             )
     share = 100.0 * config.share
-    shown = [f"{x['found']} of {x['n']} logs of {x['trips']} trips" for x in after if x["planted"]]
-    false = [f"{x['found']} of {x['n']}" for x in after if not x["planted"]]
-    found.append(f"A saving of {share:g} % is found in {' and '.join(shown)}; where nothing changed, one is shown in "
-                 f"{' and '.join(false)}")  # fmt: skip
+    shown = [f"{x[DETECTED]} of {x['n']} logs of {x['trips']} trips" for x in after if x["planted"]]
+    false = [f"{x[DETECTED]} of {x['n']}" for x in after if not x["planted"]]
+    found.append(f"A saving of {share:g} % is detected in {' and '.join(shown)}; where nothing changed, the interval "
+                 f"excludes 0 in {' and '.join(false)}")  # fmt: skip
     return found, missed, [*lines, *causes]
 
 
@@ -93,14 +96,14 @@ def _shown(line: Line) -> Line:
 
 def _causes(ledger: Results) -> Iterator[Line]:
     for cause in ledger[0][1]["causes"]:
-        yield _line(f"ledger, {names.effect(cause)}", [r["causes"][cause] for _, r in ledger])
+        yield _line(f"energy by cause, {names.effect(cause)}", [r["causes"][cause] for _, r in ledger])
 
 
 def _unexplained(ledger: Results) -> Line:
     """Nearly always, and no target: the vehicle is fitted to the same trips, so little of their noise is left over."""
     inside = [r["unexplained"][0] <= 0 <= r["unexplained"][1] for _, r in ledger]
     between = wilson(sum(inside), len(inside))
-    return {"name": "ledger, unexplained: 0 inside", "n": len(inside), "median_error_percent": None,
+    return {"name": "energy by cause, rest: interval holds 0", "n": len(inside), "median_error_percent": None,
             "inside_90": 100.0 * float(np.mean(inside)), "interval_95": [100.0 * x for x in between]}  # fmt: skip
 
 
@@ -132,13 +135,13 @@ def _driven(service: Results) -> Iterator[Line]:
 
 def _vehicles(service: Results) -> Iterator[Line]:
     for t, r in service:
-        row: Line = {"vehicle": t["variant"], "world": t["seed"], "sheet": SHEETS[t["sheet"]]}
+        row: Line = {"vehicle": t["variant"].replace("_", " "), "fleet": t["seed"], "sheet": SHEETS[t["sheet"]]}
         for kmh, driven, (value, low, high, true) in zip(SHOWN_KMH, r["driven"], r["force"], strict=True):
             row |= {
-                f"true N at {kmh:g} km/h": f"{true:.0f}",
-                f"N at {kmh:g} km/h": f"{value:.0f}",
-                f"90 % at {kmh:g}": f"{low:.0f} to {high:.0f}{'' if driven else ', not driven'}",
-                f"error % at {kmh:g}": 100.0 * (value / true - 1.0),
+                f"true force at {kmh:g} km/h [N]": f"{true:.0f}",
+                f"estimate at {kmh:g} km/h [N]": f"{value:.0f}",
+                f"90 % interval at {kmh:g} km/h": f"{low:.0f} to {high:.0f}{'' if driven else ', extrapolated'}",
+                f"error at {kmh:g} km/h [%]": 100.0 * (value / true - 1.0),
             }
         yield row
 
@@ -151,11 +154,11 @@ def _saved(saved: Results) -> Iterator[Line]:
             mine = [(t["share"] if what == "planted" else 0.0, r[what]) for t, r in saved if t["trips"] == trips]
             inside = [low <= true <= high for true, (_, low, high) in mine]
             shown = sum(low > 0 if true > 0 else low > 0 or high < 0 for true, (_, low, high) in mine)
-            planted = f"{100 * mine[0][0]:g} %" if what == "planted" else "nothing"
+            planted = f"{100 * mine[0][0]:g} %" if what == "planted" else "no change"
             between = wilson(sum(inside), len(inside))
             half = [100.0 * (high - low) / 2.0 for _, (_, low, high) in mine]
             yield {
-                "name": f"saved, {planted}, {trips} trips", "n": len(mine), "found": shown,
+                "name": f"saving, {planted}, {trips} trips", "n": len(mine), "logs with a saving detected": shown,
                 "median_half_interval_percent": float(np.median(half)),
                 "inside_90": 100.0 * float(np.mean(inside)), "interval_95": [100.0 * x for x in between],
                 "planted": what == "planted", "trips": trips,

@@ -41,14 +41,11 @@ COLD_C = 12.0  # heating runs below: splits the missions of ZTBus into about a t
 HEAD = """# Measured logs
 
 What the diagnosis finds in two public logs, how much that depends on the training trips, and what stays unexplained.
-Made by
-
-    python -m experiments.measured.logs --work DIR --write
-
-from the diagnosis.json of each run. All data are measured. Every error is on held-out test trips, and predictions use
-no measured power (free run). The library was extended while looking at both logs, so errors on a new log may be larger;
-[planted effects](planted_summary.md) are in synthetic logs from seeds not used in development. Cost is the wall-clock
-time of one run, compiling included, on a shared machine, and its peak memory."""
+`python -m experiments.measured.logs --work DIR --write` makes this page from the diagnosis.json of each run. All data
+are measured. Errors are on held-out test trips and, unless a table says otherwise, in free run: without measured power.
+The library was extended while looking at both logs, so errors on a new log may be larger; logs whose true effects are
+known, with seeds not used in development, are in [planted effects](planted_summary.md). Cost: wall-clock time of one
+run, compiling included, on a shared machine, and its peak memory."""
 READING = """- **before** is the declared sheet, calibrated; **after** is the sheet with the effects found.
 - *found*: the diagnosis added the effect. *one of a class*: it added one of several that this log cannot distinguish.
 - The number after it is its *stability*: of {draws} resampled training sets (drawn with replacement from {clusters}),
@@ -110,7 +107,7 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             if len(by_trip) > 1:
                 low, high = pooled_interval(by_trip)
                 within = f" (90 %: {low:.2f} to {high:.2f}, over {len(by_trip)} test trips)"
-            found = f"All find {named(always)}." if always else "No effect is found by all."
+            found = f"All {len(runs)} find {named(always)}." if always else "No effect is found by all."
             if turned := [r for r in size_rows(runs) if len({np.sign(v) for _, v, _ in r.cells.values()}) > 1]:
                 said = names.verbose_join([" or ".join(f"`{p}`" for p in row.paths) for row in turned])
                 found += f" The sign of {said} differs."
@@ -173,11 +170,11 @@ def _agreeing(runs: Runs) -> str:
     apart = sorted((row for row in rows if not row.agrees()), key=lambda row: -row.furthest())
     bound = any(row.at_bound for row in size_rows(runs))
     close = len(rows) - len(apart)
-    text = f"Of {len(rows)} sizes found more than once{', none at a bound,' if bound else ','} "
-    text += f"{close} {'agrees' if close == 1 else 'agree'}."
+    text = f"Of {len(rows)} sizes found in more than one training set{', none at a bound,' if bound else ','} "
+    text += f"{close} {'agrees' if close == 1 else 'agree'} within chance."
     if apart:
         said = names.verbose_join([f"{' or '.join(f'`{p}`' for p in r.paths)} ({r.furthest():.1f} sd)" for r in apart])
-        text += f" These differ by more: {said}."
+        text += f" These do not: {said}."
     return text
 
 
@@ -188,7 +185,11 @@ def _left_notes(runs: Runs) -> list[str]:
 
 def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
     lines = ["## Kia Niro: battery power from motor torque and speed", ""]
-    lines += ["The sheet declares two efficiencies. Each trip in turn is the training trip; the others are tested.", ""]
+    lines += [
+        "The sheet declares an efficiency for driving and one for braking. Each trip in turn is the training trip; "
+        "the others are tested.",
+        "",
+    ]
     rows = []
     for trip, r in runs.items():
         before, after = ([m["mse"] for m in r[when]["test_by_trip"].values()] for when in ("before", "after"))
@@ -199,13 +200,14 @@ def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
         )  # fmt: skip
     lines += _picture("niro_errors.png", "Kia Niro: test error before and after, by trip")[1:]
     lines += table(
-        ["trained on trip", "before, mean test MSE [kW²]", "after", "parameters", "worst trip energy", "effects found",
-         "cost"],
+        ["trained on trip", "test MSE before [kW²]", "test MSE after [kW²]", "parameters", "energy error, worst trip",
+         "effects found", "cost"],
         rows,
     )  # fmt: skip
     lines += [
         "",
-        "The paper's best network (NARXS), trained on trip 1 (its table VIII): 0.1604 in free run; LSTM 0.2322.",
+        "Paper 2's best network (NARXS, its table VIII), trained on trip 1: MSE 0.1604 kW² in free run; its LSTM: "
+        "0.2322 kW².",
     ]
     lines += ["", "### Stability over training trips", "", *found_table(runs, "trip")]
     lines += _picture("niro_sizes.png", "Kia Niro: sizes by training trip with 90 % bars")
@@ -253,7 +255,8 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     before = {n: m for r in runs.values() for n, m in r["before"]["test_by_trip"].items()}
     lines = ["## ZTBus: electric power from traction force and speed", ""]
     lines += [
-        "Two trolleybuses in Zurich; their sheet declares two efficiencies. Each fold holds every third mission out.",
+        "Two trolleybuses in Zurich; their sheet declares an efficiency for driving and one for braking. Each fold "
+        "holds every third mission out.",
         "",
     ]
     rows = [
@@ -269,7 +272,7 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
     lines += ["", *_pooled(before, after, warm), "", *loads_section(runs, "fold", "kW")]
     lines += ["### Stability over folds", "", *found_table(runs, "fold")]
     lines += _picture("ztbus_sizes.png", "ZTBus: sizes by fold with 90 % bars")
-    caution = "Folds share training missions, so differences in sd are larger than given."
+    caution = "Folds share training missions, so the differences in sd are lower limits."
     lines += _details(runs, "fold", caution)
     lines += ["### What stays unexplained", "", *left_table(runs, "fold", "kW"), *_left_notes(runs), ""]
     lines += folded("Where the remaining error is", "\n".join(["Test RMSE [kW] before → after:", "", *_subsets(runs)]))
@@ -296,7 +299,7 @@ def _pooled(before: Mapping[str, Any], after: Mapping[str, Any], warm: Mapping[s
             rows.append([f"{label} ({len(chosen)}), RMSE after", f"{pooled_rmse(chosen):.2f} kW"])
     worst = max(after, key=lambda n: after[n]["rmse"])
     rows.append(["worst mission", f"{worst}, {after[worst]['rmse']:.2f} kW, {after[worst]['pe_percent']:+.1f} %"])
-    return table([f"pooled, {len(after)} missions", ""], rows)
+    return table([f"all {len(after)} missions", "value"], rows)
 
 
 def _subsets(runs: Runs) -> list[str]:

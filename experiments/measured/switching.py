@@ -31,8 +31,15 @@ def loads_section(runs: Runs, head: str, unit: str) -> list[str]:
         "No channel of the log says when these loads are on: their states are decoded from the measured power.",
         "",
     ]
-    lines += table([head, "load", "power [kW]", *(f"on at {c:.0f} °C" for c in temps), "stays on"], rows)
-    lines += ["", "Errors on held-out test trips, by the measured power that the prediction may use:", ""]
+    lines += table(
+        [head, "load", "power [kW]", *(f"share of time on at {c:.0f} °C (90 %)" for c in temps), "mean time on"], rows
+    )
+    lines += [
+        "",
+        "Errors on held-out test trips. Free run: no measured power; one step ahead: measured power up to the row "
+        "before; given the states: on and off decoded from the measured power.",
+        "",
+    ]
     errors = [[k, *_errors(r)] for k, r in runs.items() if "given_states" in r["after"]]
     with_states = [r for r in runs.values() if "given_states" in r["after"]]
     every = [
@@ -43,7 +50,8 @@ def loads_section(runs: Runs, head: str, unit: str) -> list[str]:
         _energy([m for r in with_states for m in _by_trip(r, "given_states_by_trip")]),
     ]
     columns = [
-        f"free run, RMSE [{unit}]", "one step ahead", "given the states", "trip energy, free run", "given the states",
+        f"RMSE, free run [{unit}]", "RMSE, one step ahead", "RMSE, given the states",
+        "mean absolute energy error, free run", "the same, given the states",
     ]  # fmt: skip
     return [*lines, *table([head, *columns], [*errors, ["pooled", *every]]), ""]
 

@@ -210,7 +210,7 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
         )  # fmt: skip
     return table(
         [head, "verdict", f"test RMSE after [{unit}]", f"noise floor [{unit}]",
-         "share that a learner predicts", "depends on", "signature", "best rejected candidate"],
+         "share of it that LightGBM predicts", "depends on", "what is left", "best rejected candidate"],
         rows,
     )  # fmt: skip
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.runner.figures import save_figure, styled
-from experiments.runner.tables import wilson, write_tables
+from experiments.runner.tables import wilson, worded, write_tables
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
 from hdev_jax.rundir import Run
 
@@ -44,28 +44,30 @@ def tabulate(
     missed = []
     for line in (*rests, *estimates):
         if not low <= line["inside_90"] <= high:
-            missed.append(f"{line['name']}: 90 % intervals hold {line['inside_90']:.0f} %, target {low:g} to {high:g}")
+            missed.append(f"{worded(line['name'])}: 90 % intervals cover {line['inside_90']:.0f} %, target {low:g} to "
+                          f"{high:g}")  # fmt: skip
         most = within_percent.get(line["name"])
         if most is not None and (line["median_error_percent"] or 0.0) > most:
             missed.append(f"{line['name']}: {line['median_error_percent']:.2g} % in the median, target {most:g}")
     for line in alarms:
         late = line["batch_logs"] - line["within_twice"]
         if late:
-            missed.append(f"{line['name']}: in {late} of {line['batch_logs']} logs that a diagnosis names it in, no "
-                          "alarm within twice the rows")  # fmt: skip
+            missed.append(f"{worded(line['name'])}: no alarm within twice the rows in {late} of the "
+                          f"{line['batch_logs']} logs in which a diagnosis finds it")  # fmt: skip
     false = sum(round(a["false_percent"] * a["n"] / 100.0) for a in quiet)
     lap, before, after = (each[len(shares) // 2] for each in rest.values())
     named, soon = (sum(a[k] for a in alarms) for k in ("batch_logs", "within_twice"))
     found = [
-        f"After {lap['driven_so_far_percent']:.0f} % of a trip of laps on one track (the first paper's table 1), the "
-        f"forecast of its remaining energy has a median error of {lap['median_error_percent']:.2g} % ({lap['n']} "
-        f"trips); 90 % intervals contain {lap['inside_90']:.0f} %",
-        f"On routes it is {before['median_error_percent']:.2g} %, and {after['median_error_percent']:.2g} % with the "
-        f"sheet that a diagnosis of {forecasts[0][0]['routes_before']} earlier routes writes ({after['n']} trips); "
-        f"intervals contain {before['inside_90']:.0f} and {after['inside_90']:.0f} %",
-        f"Nothing planted: {false} of {sum(a['n'] for a in quiet)} streams have an alarm",
-        f"Of {named} logs in which a diagnosis names the planted effect, {soon} raise its alarm within twice the rows "
-        "that the diagnosis needs",
+        f"After {lap['driven_so_far_percent']:.0f} % of a trip of laps on one track (as in table 1 of paper 1), the "
+        f"forecast of the remaining energy has a median error of {lap['median_error_percent']:.2g} % ({lap['n']} "
+        f"trips; 90 % intervals cover {lap['inside_90']:.0f} %)",
+        f"At the same point of a route it is {before['median_error_percent']:.2g} % with the declared sheet and "
+        f"{after['median_error_percent']:.2g} % with the sheet that a diagnosis of "
+        f"{forecasts[0][0]['routes_before']} earlier routes writes ({after['n']} trips; coverage "
+        f"{before['inside_90']:.0f} and {after['inside_90']:.0f} %)",
+        f"With nothing planted, {false} of {sum(a['n'] for a in quiet)} logs have an alarm",
+        f"A diagnosis of the whole log finds the planted effect in {named} logs; in {soon} of them the alarm comes "
+        "within twice the rows that the diagnosis needs",
     ]
     return found, missed, [*rests, *estimates, *quiet, *alarms]
 
@@ -73,7 +75,7 @@ def tabulate(
 def _rest(results: Results, kind: str, sheet: str, share: float) -> Line:
     every = _errors(results, kind, sheet, share)
     return {
-        "name": f"{TRIPS[kind]}, {sheet} sheet, rest after {100 * share:.0f} %", "driven_so_far_percent": 100.0 * share,
+        "name": f"{TRIPS[kind]}, {sheet} sheet, {100 * share:.0f} % driven", "driven_so_far_percent": 100.0 * share,
         "n": len(every),
         "median_error_percent": float(np.median(np.abs(every[:, 0]))),
         "error_90_percent": float(np.quantile(np.abs(every[:, 0]), 0.9)),
@@ -90,7 +92,7 @@ def _of_noise(results: Results, noise: str) -> list[Line]:
     mine = [r for t, r in results if t["noise"] == noise]
     within, z = stats.norm.ppf(0.95), np.array([r["z"] for r in mine])
     mass_z, percent = (np.concatenate([r[k] for r in mine]) for k in ("mass_z", "mass_percent"))
-    over = {"c_rr": z[:, 0], "C_dA": z[:, 1], "mass": mass_z}
+    over = {"c_rr": z[:, 0], "C_d·A": z[:, 1], "mass": mass_z}
     out = []
     for name, each in over.items():
         inside = np.abs(each) < within
@@ -98,7 +100,7 @@ def _of_noise(results: Results, noise: str) -> list[Line]:
         error = float(np.median(np.abs(percent))) if name == "mass" else None
         out.append({"name": f"{name}, {noise}", "n": len(each), "median_error_percent": error,
                     "inside_90": 100.0 * float(np.mean(inside)),
-                    "interval_95": f"{100 * low:.0f}–{100 * high:.0f}"})  # fmt: skip
+                    "interval_95": f"{100 * low:.0f} to {100 * high:.0f} %"})  # fmt: skip
     return out
 
 

@@ -58,10 +58,10 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     short = config.artefact.rpartition("/")[2]
     write_tables(run, short, [_line(r) for r in rows], config.caption)
     if lines := [*_beside_bound(config, found, bound)]:
-        write_tables(run, f"{short}_bounds", lines, f"{config.figure}/{config.sets[-1]} against its bound, in %")
-    write_tables(
-        run, f"{short}_speed", [*_speed(found)], "Time of a prediction on this machine, with other processes running"
-    )
+        write_tables(
+            run, f"{short}_bounds", lines, f"{_named(f'{config.figure}/{config.sets[-1]}')} beside the reference [%]"
+        )
+    write_tables(run, f"{short}_speed", [*_speed(found)], "Time of a prediction, on a machine that also did other work")
     write_tables(run, f"{short}_energy", [*_energy(found)], _ENERGY)
     shown = found.get(f"{config.figure}/{config.sets[-1]}") or next(iter(found.values()))
     write_tables(
@@ -81,23 +81,23 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         "notes": [
             "rows of training, of unseen routes and of unseen variants "
             f"({', '.join(config.held_variants)}): {', '.join(map(str, counts))}; single-speed vehicles are left out",
-            "bound: outside the hysteresis band the gear is certain; inside it, the bound is the held-out accuracy of "
-            "a classifier that knows the two possible gears and every deciding input without noise. Bayes' accuracy "
-            "is at least this",
-            "equation 1, as printed in the paper, counts true negatives in the sum of every class: it is the accuracy "
+            "reference: accuracy of a classifier that knows the two possible gears in the hysteresis band and every "
+            "deciding input without noise; outside the band the gear is certain. The best possible (Bayes) accuracy "
+            "from one row is at least this; a filter, which uses earlier rows, may exceed it",
+            "equation 1, as printed in the paper, divides by the true negatives of every class too: it is the accuracy "
             "over the number of classes (12), at most 1/12; the paper's 'over 90 %' is the usual accuracy",
-            "inputs: 'paper' has speed, requested torque and mass, which cannot distinguish variants (the same speed "
-            "is another gear in another gearbox); 'sheet' adds motor speed by gear, power over rated power and the "
+            "inputs: 'paper' has speed, requested torque and mass, which do not tell gearboxes apart, so that one "
+            "speed may mean different gears; 'sheet' adds motor speed by gear, power over rated power and the "
             "number of gears; 'relative' also adds the slope, and predicts the distance from the gear of rated motor "
             "speed",
-            "filter: a hidden Markov filter over the row-by-row probabilities; previous_gear: the measured previous "
-            "gear is an input; chain: the same classifier, with its own last prediction as the previous gear",
+            "filter: a hidden Markov filter over the row-by-row probabilities; previous gear known: the measured "
+            "previous gear is an input; previous gear predicted: the same classifier, with its own last prediction as "
+            "the previous gear",
             f"searches: Optuna, {config.trials} trials, {config.folds} folds of whole routes, on at most "
             f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
-            "balanced: the same probabilities, divided by how common each gear is in training, give the likeliest gear "
-            "(class weights in the decision, not in the fit). A gear rarer than a share chosen in the search counts as "
-            f"that common. Gears with fewer than {LEAST_ROWS} scored rows are left out, of bounds too. For a bound, "
-            "gears are as common as in the scored rows, which can only raise it",
+            "balanced: each probability is divided by the gear's share of the training rows before the likeliest gear "
+            "is taken; shares below a limit chosen in the search are raised to that limit. Gears with fewer than "
+            f"{LEAST_ROWS} scored rows are left out, of the reference too, which takes the shares of the scored rows",
         ],
     }  # fmt: skip
 
@@ -115,17 +115,28 @@ def _beside_bound(config: Any, found: Mapping[str, Any], bound: Mapping[str, flo
                 key = f"{kind}_{split}{end}"
                 if key in bound:
                     own = found[name]["scores"][key]
-                    line |= {kind: f"{100 * own:.1f}", f"{kind} bound": f"{100 * bound[key]:.1f}"}
-                    line[f"{kind}, points below bound"] = f"{100 * (bound[key] - own):.1f}"
+                    line |= {kind: f"{100 * own:.1f}", f"{kind}, reference": f"{100 * bound[key]:.1f}"}
+                    line[f"{kind}, points below it"] = f"{100 * (bound[key] - own):.1f}"
                     line[f"{kind}, previous gear known"] = f"{100 * memory[key]:.1f}" if key in memory else None
             yield {**line, "rows of rare gears": bound.get(f"rare_rows_{split}{end}")}
 
 
 _ENERGY = (
-    "What a wrong gear costs (synthetic): energy added to that with the true gear (worst vehicle, mean of vehicles), "
-    "and errors against the measured energy; hard: the likeliest gear; soft: probabilities in the kernel; none: always "
-    "the highest gear"
+    "Energy with a predicted gear (synthetic): difference from that with the true gear, and errors against the "
+    "measured energy"
 )
+_GEARS = {"true": "true", "hard": "likeliest gear", "soft": "gear probabilities", "none": "always the highest gear"}
+_KINDS = {"catboost": "CatBoost", "lightgbm": "LightGBM", "xgboost": "XGBoost", "knn": "kNN", "svm": "SVM",
+          "decision_tree": "decision tree", "random_forest": "random forest", "mlp": "network"}  # fmt: skip
+
+
+def _named(row: str) -> str:
+    """A classifier, its inputs and its memory in words: `catboost/relative+filter`."""
+    kind, _, rest = row.partition("/")
+    inputs, *memory = rest.split("+")
+    how = {(): "", ("filter",): ", filter", ("previous_gear",): ", previous gear known",
+           ("previous_gear", "chain"): ", previous gear predicted"}[tuple(memory)]  # fmt: skip
+    return f"{_KINDS.get(kind, kind)}, {inputs} inputs{how}"
 
 
 def _ours(result: Mapping[str, Any], bound: Mapping[str, float], scores: Mapping[str, float]) -> dict[str, Any]:
@@ -146,11 +157,13 @@ def _line(row: Mapping[str, Any]) -> dict[str, Any]:
     o = row["ours"]
     percent = lambda k: None if o.get(k) is None else f"{100 * o[k]:.1f}"  # noqa: E731
     return {
-        "model": row["name"],
+        "model": _named(row["name"]),
         "paper": f"{100 * row['paper']['accuracy_unseen_routes']:.0f}" if row["paper"] else None,
-        "unseen routes": percent("accuracy_unseen_routes"), "bound": percent("bound"),
-        "unseen variants": percent("accuracy_unseen_variants"), "balanced, routes": percent("balanced_unseen_routes"),
-        "balanced bound": percent("bound_balanced"), "balanced, variants": percent("balanced_unseen_variants"),
+        "unseen routes": percent("accuracy_unseen_routes"), "reference": percent("bound"),
+        "unseen types of vehicle": percent("accuracy_unseen_variants"),
+        "balanced, unseen routes": percent("balanced_unseen_routes"),
+        "balanced, reference": percent("bound_balanced"),
+        "balanced, unseen types": percent("balanced_unseen_variants"),
         "12 speeds": percent("accuracy_unseen_routes_12_speeds"),
         "12 speeds, balanced": percent("balanced_unseen_routes_12_speeds"),
         "2-4 speeds": percent("accuracy_unseen_routes_2_to_4_speeds"), "macro F1": percent("macro_f1"),
@@ -162,10 +175,10 @@ def _speed(found: Mapping[str, Any]) -> Any:
     for name, r in found.items():
         s = r["speed"]
         yield {
-            "model": name, "library, s per million rows": s["library_s_per_million"],
-            "kernel, s per million rows": s.get("kernel_s_per_million"),
-            "library, one row [µs]": s["library_us_one_row"], "kernel, one row [µs]": s.get("kernel_us_one_row"),
-            "largest difference": s.get("kernel_difference"),
+            "model": _named(name), "library, s per million rows": s["library_s_per_million"],
+            "in JAX, s per million rows": s.get("kernel_s_per_million"),
+            "library, one row [µs]": s["library_us_one_row"], "in JAX, one row [µs]": s.get("kernel_us_one_row"),
+            "largest difference in probability": s.get("kernel_difference"),
         }  # fmt: skip
 
 
@@ -176,8 +189,10 @@ def _energy(found: Mapping[str, Any]) -> Any:
             added = {k: c["added_percent"][way] for k, c in cars.items()} if way != "true" else {}
             worst = max(added, key=lambda k: abs(added[k])) if added else None
             yield {
-                "model": name, "gear": way, "added, worst [%]": added[worst] if worst else None, "worst vehicle": worst,
-                "added, mean absolute [%]": float(np.mean(np.abs([*added.values()]))) if added else None,
+                "model": _named(name), "gear": _GEARS[way],
+                "difference, worst vehicle [%]": added[worst] if worst else None,
+                "worst vehicle": worst.replace("_", " ") if worst else None,
+                "mean absolute difference [%]": float(np.mean(np.abs([*added.values()]))) if added else None,
                 "RMSE [Wh]": float(np.mean([c["rmse_wh"][way] for c in cars.values()])),
                 "trip error [%]": float(np.mean([c["trip_percent"][way] for c in cars.values()])),
                 "s per million rows": r["speed"].get("kernel_s_per_million", r["speed"]["library_s_per_million"])
@@ -202,9 +217,10 @@ def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -
             for kind in ("accuracy", "balanced"):
                 key = f"{kind}_{split}{end}"
                 if key in bound and r["scores"][key] < bound[key] - points:
-                    yield f"{name}: {key} {100 * r['scores'][key]:.1f} %, bound {100 * bound[key]:.1f} %"
+                    own = f"{_key(key)} {100 * r['scores'][key]:.1f} %"
+                    yield f"{_named(name)}: {own}, reference {100 * bound[key]:.1f} %"
     if r["scores"]["accuracy_unseen_routes"] < min(POOLED, bound["accuracy_unseen_routes"]):
-        yield f"{name}: pooled {100 * r['scores']['accuracy_unseen_routes']:.1f} %, target 90 %"
+        yield f"{_named(name)}: pooled {100 * r['scores']['accuracy_unseen_routes']:.1f} %, target 90 %"
     with_memory = {f"{name}+filter": r["memory"]}
     if (other := f"{name}+previous_gear") in found:
         with_memory |= {other: found[other]["scores"], f"{other}+chain": found[other]["memory"]}
@@ -213,11 +229,16 @@ def _missed(config: Any, found: Mapping[str, Any], bound: Mapping[str, float]) -
         f"{kind}_{split}{end}" for kind in ("accuracy", "balanced") for split in POINTS for end in GROUPS.values()
     ):
         if with_memory[best].get(key, 1.0) < WITH_MEMORY:
-            yield f"{best}: {key} {100 * with_memory[best][key]:.1f} %, target 98 %"
+            yield f"{_named(best)}: {_key(key)} {100 * with_memory[best][key]:.1f} %, target 98 %"
     for way in ("hard", "soft"):
         for car, c in r["energy"].items():
             if abs(c["added_percent"][way]) >= WORST_PERCENT:
-                yield f"{name}: {way} gear adds {c['added_percent'][way]:.2f} % to the energy of {car}"
+                adds = f"{c['added_percent'][way]:.2f} % to the energy of {car.replace('_', ' ')}"
+                yield f"{_named(name)}: {_GEARS[way]} adds {adds}"
+
+
+def _key(key: str) -> str:
+    return key.replace("_", " ").replace("variants", "types")
 
 
 @styled

@@ -67,7 +67,7 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             "Unless stated otherwise, the ridge is 1e-3 and the loss is Huber's with its corner at 0.4 kW; orders are "
             "tried with NARXP's units and ridge",
             *_recurrent_notes(config),
-            *([f"At the edge of the grid: {'; '.join(edges)}"] if edges else []),
+            *([f"Chosen values at the edge of their grid: {'; '.join(edges)}"] if edges else []),
             "Networks and NARX are chosen from these grids, the classical models by Optuna on trip 1",
         ],
     }  # fmt: skip
@@ -79,7 +79,7 @@ def _at_the_edge(best: str, tried: Mapping[str, Mapping[str, Any]]) -> list[str]
     for key in CHOSEN:
         values = {s[key] for s in tried.values() if key in s}
         if len(values) > 1 and (own := tried[best][key]) in (min(values), max(values)):
-            out.append(f"{key} {own:g} is the {'least' if own == min(values) else 'largest'}")
+            out.append(f"{key} {own:g} ({'smallest' if own == min(values) else 'largest'})")
     return out
 
 
@@ -88,8 +88,8 @@ def _recurrent_notes(config: Any) -> list[str]:
     own = [g.model for g in config.picked.values() if config.models[g.model].kind == "recurrent"]
     if not own:
         return []
-    steps = " and ".join(f"{config.models[n].steps} ({n})" for n in own)
+    steps = " and ".join(f"{config.models[n].steps} steps ({n})" for n in own)
     return [
         f"{' and '.join(own)} are validated on blocks of time only, with {config.recurrent_starts} starts of "
-        f"{config.recurrent_steps} steps; in the tables they train for {steps}"
+        f"{config.recurrent_steps} steps; for the tables they are trained for {steps}"
     ]

@@ -80,11 +80,11 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     }  # fmt: skip
     paper = config.paper.get(config.model, {})
     lines = [
-        {"number": readable(k), "paper": paper.get(k), "ours": x, "ratio": x / paper[k] if k in paper else None}
+        {"quantity": readable(k), "paper": paper.get(k), "ours": x, "ratio": x / paper[k] if k in paper else None}
         for k, x in ours.items()
     ]
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
-    compared = "fit_percent" in paper
+    compared = "fit_percent" in paper and config.window is None  # the same number: it is compared once
     return {
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False,
         "rows": [{"name": config.model, "paper": paper or None, "ours": ours}],

@@ -105,6 +105,15 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
+_HEADS = {
+    f"{k}_{q}": f"{'MSE' if q.endswith('mse') else 'energy error [%]'}, {words}"
+    + (", last third" if "last_third" in q else "")
+    for k, words in (("frozen", "fixed"), ("before", "coefficients at the start"), ("followed", "updated"),
+                     ("after", "coefficients at the end"))
+    for q in ("mse", "pe", "last_third_mse", "last_third_pe")
+}  # fmt: skip
+
+
 def aged(trip: Trip, share: float) -> Trip:
     """The trip with losses that grow by `share` from its first row to its last [kW]."""
     shaft = trip.inputs["motor_torque_nm"] * trip.inputs["motor_speed_radps"] / 1000.0
@@ -140,9 +149,9 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         for trip, m in result["trips"].items():
             if task["aged_trip"] and not m["aged"]:
                 continue
-            name = f"trip {trip}" + (f", losses +{100 * config.ageing:g} %" if m["aged"] else "")
+            name = f"trip {trip}" + (f", losses rising to +{100 * config.ageing:g} %" if m["aged"] else "")
             rows.append({"name": name, "paper": None, "ours": {**m, "memory_min": result["memory_min"]}})
-            lines.append({"trip": name, "paper": None, **{k: v for k, v in m.items() if k != "aged"}})
+            lines.append({"trip": name, **{_HEADS.get(k, k): v for k, v in m.items() if k != "aged"}})
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     memory = next((result["memory_min"] for _, result in results), None)
     edge = memory in (min(config.memories_min), max(config.memories_min)) and len(config.memories_min) > 1
@@ -150,14 +159,16 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
         "better_than_paper": 0, "of": 0, "logs": 4,
         "notes": [
-            "Ageing is simulated by raising the losses in the measured power; everything else is as measured. A row's "
-            "loss is battery power minus shaft power where that is positive, timing differences included",
+            "Ageing is simulated: the losses in the measured power rise from the first row of the trip to its last; "
+            "everything else is as measured. A row's loss is battery power minus shaft power where that is positive, "
+            "timing differences included",
             *([] if memory is None else [
-                f"memory: {memory:g} min, the best of {', '.join(f'{m:g}' for m in config.memories_min)} when followed "
-                f"from the first half of trip 1 through the second{', at the edge of the grid' if edge else ''}",
-                "frozen: coefficients of trip 1; followed: each row is predicted from the rows before it; before and "
-                "after: the whole trip with the coefficients known at its first row and at its last",
-                "A short memory follows the driving as well as the car's age",
+                f"memory: {memory:g} min, the best of {', '.join(f'{m:g}' for m in config.memories_min)} when the "
+                "model starts from the first half of trip 1 and is updated through the "
+                f"second{', at the edge of the grid' if edge else ''}",
+                "fixed: coefficients of trip 1; updated: each row is predicted from the rows before it; at the start "
+                "and at the end: the whole trip with the coefficients known at its first row and at its last",
+                "With a short memory the coefficients follow the driving, not only the car's age",
             ]),
         ],
     }  # fmt: skip

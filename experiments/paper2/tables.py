@@ -98,10 +98,10 @@ def _line(
     several = spread if spread.get("starts", 0) > 1 else {}
     theirs, own = paper.get(key), ours.get(key)
     return {
-        "model": name, "number": readable(key), "paper": _digits(theirs), "ours": _digits(own),
+        "model": name, "quantity": readable(key), "paper": _digits(theirs), "ours": _digits(own),
         "ratio": own / theirs if theirs and own is not None else None,
         "median": _digits(several.get("median")),
-        "least to most": f"{_digits(several['least'])}–{_digits(several['most'])}" if several else None,
+        "range over starts": f"{_digits(several['least'])} to {_digits(several['most'])}" if several else None,
         "ensemble": _digits(several.get("ensemble")),
     }  # fmt: skip
 
@@ -130,9 +130,8 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
         if (names := [n for n in several if config.models[n].rule == rule])
     ]
     if several:
-        said.append("median, least to most: over all random starts, for each number separately")
+        said.append("median and range: over all random starts, for each number separately")
         said.append("ensemble: error of the mean prediction of all starts")
-        said.append("all starts of a model are fitted in one program (vmap)")
     for n in found:
         if found[n]["converged"] and not all(found[n]["converged"]):
             ended, steps = found[n]["converged"], config.models[n]
@@ -145,7 +144,9 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
         if settings := found[n]["settings_found"]:
             best = ", ".join(f"{k.replace('_', ' ')} {_words(x)}" for k, x in settings.items())
             searched = f"the best of {config.models[n].trials} settings (Optuna, on held-out rows of trip 1)"
-            said.append(f"{n}: {searched if config.models[n].kind == 'classical' else 'found on trip 1'}: {best}")
+            said.append(
+                f"{readable(n)}: {searched if config.models[n].kind == 'classical' else 'found on trip 1'}: {best}"
+            )
     if "change_percent" in config.show and config.order[0] in found:
-        said.append(f"change percent: of the test mean, relative to {config.order[0]}")
-    return [*said, *(f"{n}: {config.models[n].why}" for n in found if config.models[n].why)]
+        said.append(f"change [%]: of the test mean, relative to {config.order[0]}")
+    return [*said, *(f"{readable(n)}: {config.models[n].why}" for n in found if config.models[n].why)]

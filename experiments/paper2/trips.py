@@ -67,7 +67,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         if name in config.reasons:
             rows.append({"name": name, "paper": paper, "ours": None, "reason": config.reasons[name]})
             beside = _beside({}, paper or {})
-            lines.append({"quantity": readable(name), **beside, "why not": config.reasons[name]})
+            lines.append({"quantity": readable(name), **beside, "why no value": config.reasons[name]})
             continue
         ours = {f"trip{t}": found[t][name] for t in found}
         rows.append({"name": name, "paper": paper, "ours": ours})
@@ -76,7 +76,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
         speeds_figure(run, {t: kia_trips(config.rows or None)[t] for t in found})
         rows = [{"name": f"trip{t}", "paper": None, "ours": {"speed_quartiles_mph": r["speed_quartiles_mph"]}}
                 for t, r in found.items()]  # fmt: skip
-        words = ("least", "lower quartile", "median", "upper quartile", "most")
+        words = ("minimum", "lower quartile", "median", "upper quartile", "maximum")
         lines = [{"trip": t, **dict(zip(words, r["speed_quartiles_mph"], strict=True))} for t, r in found.items()]
     elif config.figure == "signals":
         signals_figure(run, kia_trips(config.rows or None)[config.trip])
@@ -86,7 +86,7 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     return {
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
-        "better_than_paper": 0, "of": 0, "logs": len(found),
+        "better_than_paper": 0, "of": 0, "logs": 1 if config.figure == "signals" else len(found),
     }  # fmt: skip
 
 

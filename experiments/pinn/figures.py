@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.pinn.results import WAYS
+from experiments.pinn.results import PHYSICS, WAYS
 from experiments.pinn.scores import TAUGHT, pooled
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import readable
@@ -24,7 +24,7 @@ PAPER_MODEL = "paper"  # the network as printed, and ours, among the models of a
 OURS = "ours"
 MOST_BARS = 20
 # Names of the paper's rows in metrics.json.
-NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, its physics alone": "physics_predicted",
+NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, {PHYSICS}": "physics_predicted",
          WAYS["tabular"]: "physics_tabular"}  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from experiments.pinn.figures import (
 )
 from experiments.pinn.results import (
     FORM,
+    PHYSICS,
     WAYS,
     Results,
     distinct,
@@ -29,19 +30,21 @@ from experiments.pinn.results import (
 from experiments.pinn.scores import QUANTILES, TAUGHT, pooled
 from experiments.runner.tables import write_tables
 from hdev_jax.errors import InputError
+from hdev_jax.report import names
 from hdev_jax.rundir import Run
 
 __all__ = ["coefficients", "grid", "shares", "table"]
 
 HELD = ("the inputs include the energy of the calibrated kernel and the efficiencies at its operating point, so only "
-        "models called 'no kernel' are without physics")  # fmt: skip
-GIVEN = ("'ours' and the closed form know which effects the fleet hides; models 'as diagnosed' have the effects "
-         "that the diagnosis of training routes names")  # fmt: skip
+        "models with 'log columns only' are without physics")  # fmt: skip
+GIVEN = "'ours' and the linear fits know which effects the fleet hides"
+DIAGNOSED = "models 'as diagnosed' have the effects that the diagnosis of training routes names"
+RATIO = "coefficient error: median ratio of predicted to true value, minus one; drag by spray counts as air drag"
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
 NAMEABLE = {
-    WAYS["kernel"]: "the given effects in closed form",
-    f"{OURS}, effects as diagnosed, {FORM}": "the effects named by diagnosis, in closed form for all vehicles,",
+    WAYS["kernel"]: "a linear fit of the known effects",
+    f"{OURS}, effects as diagnosed, {FORM}": "a linear fit of the effects named by diagnosis, for all vehicles,",
 }
 
 
@@ -55,7 +58,8 @@ def _line(
         "RMSE [Wh]": p["rmse_wh"], "paper RMSE": paper.get("rmse"),
         "PE [%]": p["pe_percent"], "paper PE": paper.get("pe"), "|PE| of a trip, median [%]": p["trip_pe_median"],
         "c_rr error, median of vehicles [%]": p.get("c_rr_error_percent"),
-        "C_d·A error, median of vehicles [%]": p.get("cda_m2_error_percent"), "in 90 %": p.get("share_inside_90"),
+        "C_d·A error, median of vehicles [%]": p.get("cda_m2_error_percent"),
+        "coverage of 90 % interval": p.get("share_inside_90"),
         "PE of a trip, mean [%]": p["trip_pe_mean"], "n": of[0], "trips": of[1],
     }  # fmt: skip
 
@@ -84,12 +88,12 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
         bound = [
             {"model": in_words(n), "c_rr": 100 * b["c_rr"], "C_d·A": 100 * b["cda_m2"]} for n, b in at_bound.items()
         ]
-        caption = "Share of predictions at a bound, within 1 % of the range [%], test rows of all trainings"
+        caption = "Test rows whose predicted coefficient lies within 1 % of the end of its range, over all seeds [%]"
         write_tables(run, "bounds", bound, caption)
     effects = _effects(results)
     if effects:
         write_tables(
-            run, "effects", effects, "Effects found by diagnosing single vehicles: in how many, and the median size"
+            run, "effects", effects, "Effects found by diagnosing single vehicles: in how many, median of parameters"
         )
     model_bars(run, gathered, data)
     used = {t["name"]: r["effects"] for t, r in results if "effects" in r and t["model"].get("effects")}
@@ -102,11 +106,12 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             "training, validation and test sets are split by route" if config.data == "fleet"
             else "the test missions of each fold are held out",
             HELD,
-            "coefficient error: median of predicted over true, minus one; spray counts as air drag",
+            *([RATIO] if any(x.get("c_rr error, median of vehicles [%]") is not None for x in lines) else []),
             *diverged(results),
             *still_better(results),
             *([GIVEN] if config.data == "fleet" else []),
-            *(f"effects in {name}: {', '.join(effects) or 'none'}" for name, effects in used.items()),
+            *([DIAGNOSED] if any("diagnosed" in way for way, _ in gathered) else []),
+            *(f"effects in '{way}': {', '.join(map(names.effect, e)) or 'none'}" for way, e in used.items()),
             *_nameable(gathered),
         ],
     }  # fmt: skip
@@ -121,14 +126,14 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     if base is None or learned is None or base - learned < LEAST_LEARNED * base:
         return []
     what = (
-        f"'{LEARNED}' lowers the RMSE of the calibrated declared physics from {base**0.5:.4g} to {learned**0.5:.4g} Wh"
+        f"'{LEARNED}' reduces the RMSE of the calibrated declared physics from {base**0.5:.4g} to {learned**0.5:.4g} Wh"
     )
     out = []
     for way, whose in NAMEABLE.items():
         if way in square:
             share = 100 * (base - square[way]) / (base - learned)
-            removed = f"{share:.0f} % of that gain in squared error" if share > 0 else "nothing of that gain"
-            out.append(f"{what}; {whose} reach {removed} without any network")
+            removed = f"by {share:.0f} % of that amount" if share > 0 else "not at all"
+            out.append(f"{what}; {whose} reduces the squared error {removed}, without a network")
     return out
 
 
@@ -142,7 +147,8 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
             if way not in ("tables", PAPER_MODEL, OURS) or m not in found:
                 continue
             q, t = found[m][name], found[m][f"{name}_true"]
-            lines.append({"model": m, "by": way, **{f"{k} %": x for k, x in zip(QUANTILES, q, strict=True)},
+            lines.append({"vehicle": m, "method": in_words(way),
+                          **{f"{k} %": x for k, x in zip(QUANTILES, q, strict=True)},
                           "error of the median [%]": 100 * found[m][f"{name}_error"]})  # fmt: skip
             rows.append({"name": f"{m}, {way}", "paper": None, "ours": {"median": q[2], "true_median": t[2]}})
     write_tables(run, "coefficients", lines, config.caption)
@@ -157,8 +163,8 @@ def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound:
     """What ours is meant to reach, and does not."""
     test = {way: pooled(f) for (way, use), f in gathered.items() if use == "test"}
     out = []
-    if {PAPER_MODEL, f"{PAPER_MODEL}, its physics alone", WAYS["tabular"]} <= set(test) and config.data == "fleet":
-        order = [test[k]["rmse_wh"] for k in (PAPER_MODEL, f"{PAPER_MODEL}, its physics alone", WAYS["tabular"])]
+    if {PAPER_MODEL, f"{PAPER_MODEL}, {PHYSICS}", WAYS["tabular"]} <= set(test) and config.data == "fleet":
+        order = [test[k]["rmse_wh"] for k in (PAPER_MODEL, f"{PAPER_MODEL}, {PHYSICS}", WAYS["tabular"])]
         if not order[0] < order[1] < order[2]:
             out.append("RMSE is not in the order of table 2: " + ", ".join(f"{x:.2f}" for x in order))
     if OURS in test:
@@ -168,7 +174,7 @@ def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound:
         if abs(pe) > limit:
             out.append(f"ours: PE {pe:+.2f} %, target ±{limit:g}")
         if PAPER_MODEL in test and mine["rmse_wh"] > 0.9 * test[PAPER_MODEL]["rmse_wh"]:
-            out.append(f"ours: RMSE {mine['rmse_wh'] / test[PAPER_MODEL]['rmse_wh']:.2f} of the paper's, target 0.9")
+            out.append(f"ours: RMSE {mine['rmse_wh'] / test[PAPER_MODEL]['rmse_wh']:.3g} times the paper's, target 0.9")
         best = min(test, key=lambda k: test[k]["rmse_wh"])
         if config.data == "ztbus" and best != OURS:
             out.append(f"ours: RMSE {mine['rmse_wh']:.1f} Wh, the best is {best} with {test[best]['rmse_wh']:.1f}")
@@ -199,10 +205,10 @@ def _effects(results: Results) -> list[dict[str, Any]]:
     out = []
     for id in sorted({e for f in found for e in f}, key=lambda e: -sum(e in f for f in found)):
         having = [f[id] for f in found if id in f]
-        names = sorted({k for h in having for k in h})
-        values = {k: float(np.median([h[k] for h in having if k in h])) for k in names}
+        keys = sorted({k for h in having for k in h})
+        values = {k: float(np.median([h[k] for h in having if k in h])) for k in keys}
         text = ", ".join(f"{k} {x:.3g}" for k, x in values.items())
-        out.append({"effect": id, "vehicles": f"{len(having)} of {len(found)}", "median": text})
+        out.append({"effect": names.effect(id), "vehicles": f"{len(having)} of {len(found)}", "median": text})
     return out
 
 
@@ -234,16 +240,17 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
         for (way, use), found in gathered.items():
             seeds = [pooled([f])["rmse_wh"] for f in found]
             curves.setdefault((way, use), []).append((share, seeds))
-            lines.append({"share": share, "training routes": counts and counts["routes"], "model": way, "rows of": use,
-                          "RMSE [Wh]": float(np.median(seeds)), "least": min(seeds), "most": max(seeds),
-                          "PE [%]": pooled(found)["pe_percent"], "training rows": counts and counts["training"],
+            lines.append({"share [%]": 100.0 * share, "training routes": counts and counts["routes"],
+                          "model": in_words(way), "evaluated on": use, "RMSE [Wh]": float(np.median(seeds)),
+                          "smallest": min(seeds), "largest": max(seeds), "PE [%]": pooled(found)["pe_percent"],
+                          "training rows": counts and counts["training"],
                           "n": found[0]["rows"], "seeds": len(seeds)})  # fmt: skip
     write_tables(run, "shares", lines, config.caption)
-    routes = {x["share"]: x["training routes"] for x in lines if x["training routes"]}
+    routes = {x["share [%]"] / 100.0: x["training routes"] for x in lines if x["training routes"]}
     learning_curves(run, curves, routes)
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "better_than_paper": 0, "of": 0,
-        "rows": [{"name": f"{x['model']}, {x['share']:g}, {x['rows of']}", "paper": None,
+        "rows": [{"name": f"{x['model']}, {x['share [%]']:g} %, {x['evaluated on']}", "paper": None,
                   "ours": {"rmse_wh": x["RMSE [Wh]"], "pe_percent": x["PE [%]"]}} for x in lines],
         "missed": _against_black_boxes(config, curves),
         "notes": [
@@ -272,7 +279,8 @@ def _against_black_boxes(config: Any, curves: Mapping[tuple[str, str], list[tupl
                 ratio = float(np.median(mine_at[share]) / np.median(others[share]))
                 if ratio > 0.7:
                     out.append(
-                        f"{100 * share:g} % of the routes, {use}: RMSE {ratio:.2f} of that of {other}, target 0.7"
+                        f"{100 * share:g} % of the routes, {use}: RMSE {ratio:.3g} times that of {in_words(other)}, "
+                        "target 0.7"
                     )
     return out
 
@@ -292,7 +300,12 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
     best = min(lines, key=lambda x: x["RMSE [Wh]"])
     lost = sum("diverged" in r for _, r in results)
     where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"
-    note = f"Best at λ = {where}: {best['RMSE [Wh]']:.2f} Wh; {lost} of {len(results)} trainings diverged"
+    medians, spread = [x["RMSE [Wh]"] for x in lines], max(x["most"] - x["least"] for x in lines)
+    note = (
+        f"The lowest median RMSE is {best['RMSE [Wh]']:.2f} Wh, at λ = {where}; the {len(lines)} settings lie within "
+        f"{max(medians) - min(medians):.1f} Wh, the seeds of one setting within up to {spread:.1f} Wh; {lost} of "
+        f"{len(results)} trainings diverged"
+    )
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "better_than_paper": 0, "of": 0,
         "rows": [{"name": f"{x['λ₁']:g}, {x['λ₂']:g}, {x['λ₃']:g}", "paper": None, "ours": {"rmse_wh": x["RMSE [Wh]"]}}

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["FORM", "WAYS", "Results", "distinct", "diverged", "gathered_scores", "still_better", "trainings"]
+__all__ = ["FORM", "PHYSICS", "WAYS", "Results", "distinct", "diverged", "gathered_scores", "still_better", "trainings"]
 
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
-        "kernel": "physics, effects by closed form", "diagnosed": "physics, as diagnosed"}  # fmt: skip
-FORM = "its closed form alone"
+        "kernel": "physics, known effects, linear fit", "diagnosed": "physics, diagnosed effects"}  # fmt: skip
+FORM = "its linear fit before training"
+PHYSICS = "its physics part alone"
 
 
 def gathered_scores(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
@@ -23,7 +24,7 @@ def gathered_scores(results: Results) -> dict[tuple[str, str], list[dict[str, An
             if task["model"]["kind"] == "vehicles":
                 way = WAYS[key]
             else:
-                way = name + {"physics": ", its physics alone", "form": f", {FORM}"}.get(key, "")
+                way = name + {"physics": f", {PHYSICS}", "form": f", {FORM}"}.get(key, "")
             for use, scored in found.items():
                 if key != "form" or (way, use, task["data"].get("fold")) not in once:
                     out.setdefault((way, use), []).append(scored)

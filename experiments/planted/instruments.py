@@ -15,7 +15,7 @@ from pydantic import Field
 
 from experiments.runner.config import Strict
 from experiments.runner.figures import save_figure, styled
-from experiments.runner.tables import wilson, write_tables
+from experiments.runner.tables import readable, wilson, write_tables
 from hdev_jax import calibrate, diagnose
 from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.inference.sheet import read_sheet
@@ -105,13 +105,16 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     for key, want in config.wanted.items():
         value = total[key]
         if value is not None and (abs(value) > want if key in ("false_percent", "c_rr_bias_percent") else value < want):
-            missed.append(f"{key.replace('_', ' ')}: {value:.3g}, target {want:g}")
+            missed.append(f"{readable(key)}: {value:.3g}, target {want:g}")
+    bias = [x["c_rr_bias_percent"] for x in lines]
     findings = [
-        f"Nothing planted: {total['false_percent']:.2g} % of {total['null_logs']} logs have a name (95 % interval "
-        f"{total['false_95']})",
-        f"The calibrated c_rr is off by {total['c_rr_bias_percent']:.2g} % in the mean",
-        f"A payload error of {100 * config.payload:g} % is found, or its class, in {total['found_percent']:.0f} % of "
-        f"{total['payload_logs']} logs; 90 % intervals contain it in {total['inside_90']:.0f} %",
+        f"Without a payload error, a cause is named in {total['false_percent']:.2g} % of {total['null_logs']} logs "
+        f"(95 % interval {total['false_95']})",
+        f"The mean bias of the calibrated c_rr is {total['c_rr_bias_percent']:+.1f} % ({min(bias):+.1f} to "
+        f"{max(bias):+.1f} % by kind of log)",
+        f"A payload error of {100 * config.payload:g} % is found, alone or in its class, in "
+        f"{total['found_percent']:.0f} % of {total['payload_logs']} logs; 90 % intervals cover it in "
+        f"{total['inside_90']:.0f} %",
     ]
     rows = [{"name": x["name"], "paper": None, "ours": x} for x in (*lines, total)]
     return {"artefact": config.artefact, "data": "synthetic logs", "synthetic": True, "rows": rows,
@@ -128,7 +131,7 @@ def _line(mode: str, sd: float | None, results: Sequence[Any]) -> dict[str, Any]
     return {
         "name": mode if sd is None else f"{mode}, altitude ± {sd:g} m",
         "null_logs": len(null), "false_percent": 100.0 * named / len(null),
-        "false_95": "–".join(f"{100 * x:.0f}" for x in wilson(named, len(null))),
+        "false_95": " to ".join(f"{100 * x:.0f}" for x in wilson(named, len(null))) + " %",
         "c_rr_bias_percent": float(np.mean(bias)),
         "payload_logs": len(planted),
         "found_percent": 100.0 * sum(any(PAYLOAD in c for c in r["named"]) for _, r in planted) / len(planted),
@@ -153,5 +156,5 @@ def _figure(run: Run, results: Sequence[Any], config: Config) -> None:
         ax.set_xticks(range(len(config.altitude_sd_m)), [f"{sd:g}" for sd in config.altitude_sd_m])
         ax.set(xlabel="noise of the altitude [m]", ylabel="payload error found [%]", title=mode)
         tidy(ax)
-    fig.suptitle("Synthetic logs with a payload error: each estimate with its 90 % interval; grey: the true error")
+    fig.suptitle("Synthetic logs with a payload error: estimates with 90 % intervals; grey line: the true error")
     save_figure(run, fig, "instruments")

@@ -12,13 +12,13 @@ from experiments.runner.tables import readable
 
 __all__ = ["LABELS", "outcome", "rival_rows"]
 
-LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, classes set aside", "stlsq": "STLSQ (PySINDy)",
+LABELS = {"ours": "hdev_jax", "ours_first": "hdev_jax, first name only", "stlsq": "STLSQ (PySINDy)",
           "lasso_cv": "LassoCV", "forward_bic": "forward BIC"}  # fmt: skip
 
 
 def outcome(planted: Sequence[str], result: dict[str, Any], method: str) -> tuple[bool, bool]:
     """Whether a method named exactly what was planted, and whether it named anything else; `ours_first` is ours with
-    classes set aside: what each entry is called."""
+    the first name of each entry alone."""
     if method == "ours":
         return scores.exact(planted, result["named"]), scores.false(planted, result["named"])
     if method == "ours_first":

@@ -28,9 +28,8 @@ sets `--fdr`; from Python, `diagnose(…, settings=Settings(close=0.9))` sets an
 
 Made by `{command}`.
 
-Half and double: the study of planted effects (synthetic logs), run again with one setting changed. A cell has the new
-value, logs with the right answer of all logs, and logs in which an effect is named that was not planted. Whole numbers
-are rounded up; a share or probability is not doubled beyond 1. {result}
+Columns *half* and *double*: the values with which the study of planted effects (synthetic logs) is run again, one
+setting changed at a time. {result} Whole numbers are rounded up; a share or probability is not doubled beyond 1.
 
 The study runs all of them, or one:
 
@@ -60,12 +59,26 @@ def page(found: Sequence[Mapping[str, Any]] = (), *, command: str) -> str:
     """The page in Markdown; `found` holds the metrics of the study's runs, each with its point of the sweep."""
     counts = {_key(m["sweep"]["settings"]): _counts(m["rows"]) for m in found}
     by_default = counts.get(_key({}))
-    result = f"With the defaults: {_shown(by_default)}." if by_default else "No results are on this page yet."
+    result = "No results are on this page yet."
+    if by_default:
+        result = (
+            "Beside each value: logs with the right answer of all logs, and logs in which an effect is named that was "
+            f"not planted; with the defaults, {_shown(by_default)}."
+        )
     rows = [["setting", "default", "half", "double", "unit", "meaning", "source"]]
     for s in described():
         ways = changed(s["default"], s["unit"])
         cells = [_cell(s["name"], ways.get(way), counts) for way in ("half", "double")]
-        rows.append([f"`{s['name']}`", f"{s['default']:g}", *cells, s["unit"], s["meaning"], s["source"]])
+        rows.append(
+            [
+                f"`{s['name']}`",
+                f"{s['default']:g}",
+                *cells,
+                "–" if s["unit"] == "1" else s["unit"],
+                s["meaning"],
+                s["source"],
+            ]
+        )
     return f"{_INTRO.format(command=command, result=result)}\n{markdown(rows, 'All settings')}"
 
 

@@ -49,7 +49,7 @@ def _near_oracle(able: Group) -> list[dict[str, Any]]:
 
     The oracle of what the library holds in another form is the noise itself.
     """
-    name = "test error within 5 % of the oracle's"
+    name = "test error within 5 % of that of a fit that knows the cause"
     near = [
         (t["size"], _in_library(t), r["test_rmse"]["after"] < NEAR_ORACLE * r["oracle_rmse"])
         for t, r in able if t["size"] and scores.nameable(t["effects"])

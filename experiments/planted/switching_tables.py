@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.planted.scores import exact, names
+from experiments.planted.scores import exact
+from experiments.planted.scores import names as names_of
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import wilson, write_tables
+from hdev_jax.report import names
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
 from hdev_jax.rundir import Run
 
@@ -52,7 +54,7 @@ def scored(effects: Sequence[str], result: dict[str, Any]) -> Scored:
     found, loads = result["found"], result["loads"]
     pairs = _matched([f["power_w"] for f in found], [x["power_w"] for x in loads])
     others = [e for e in result["named"] if e["id"] not in LOADS]
-    known = set(names(effects))
+    known = set(names_of(effects))
     wrong = [e["id"] for e in others if not set(e["class"]) & known]
     missed = len(pairs) < len(loads)
     instead = [k for k in wrong if k in INSTEAD] if missed else []
@@ -121,17 +123,18 @@ def collect(config: Any, results: Sequence[Log], run: Run) -> dict[str, Any]:
         "findings": [*_found_sentences(planted), *_interval_sentence(planted), *_false_sentences(empty, planted),
                      *_beside_sentence(beside)],
         "notes": [
-            "Size: the power of the load divided by that of the noise. The noise's power is its RMS in samples; in "
-            "segments it is the RMS of its energy divided by the median duration of a row. Samples have the battery's "
-            "power each second, with torque and motor speed measured; segments have energy, and the chain is entered "
-            "at the road. The noise is ar1, 0.9 from row to row, unless the line says otherwise; random_walk is a "
-            "random walk in each trip plus ar1 of the same RMS",
+            "Size: the power of the load divided by the RMS of the noise; in segments, by the RMS of the noise's "
+            "energy over the median duration of a row. Samples have the battery's power each second, with torque "
+            "and motor speed measured; segments have the energy of each row, and the model goes from speed and "
+            "slope to the battery. The noise is AR(1), 0.9 from row to row, unless the row of the table says "
+            "otherwise; random walk: a random walk in each trip plus AR(1) of the same RMS",
             "Found: all loads of the log are named. For the loads that are found, the table has the share whose power "
             "is within 10 % of the true one; the share whose time on in the training trips is within 3 points of the "
             "true one; the mean share of rows whose state is right; and the mean share of trips whose 90 % interval of "
             "energy holds the true one",
-            "False name: the share of logs in which something is named that is not planted. If a load is not found, "
-            "auxiliary_power, hvac_power and periodic_load are not false names: they stand for its mean or its cycle",
+            "False name: the share of logs in which something is named that is not planted. If a load is missed, a "
+            "constant load, heating and cooling or a periodic load do not count as false: they describe its mean or "
+            "its cycle",
         ],
     }  # fmt: skip
 
@@ -163,16 +166,18 @@ def _rows(logs: Sequence[Log], key: Callable[[dict[str, Any]], str], more: bool 
             "line": name, "n": len(group),
             "found": _mean([s.all_found for s in every]) if group[0][0]["loads"] else None,
             "power within 10 %": _mean([abs(x - 1.0) <= POWER for x in power]),
-            "time on within 3 points": _mean([abs(x) <= SHARE for x in off]),
-            "states right": _mean([x for s in every for x in s.right]),
-            "energy covered": _mean([x for s in every for x in s.covered]),
+            "share of time on within 3 points": _mean([abs(x) <= SHARE for x in off]),
+            "rows with the right state": _mean([x for s in every for x in s.right]),
+            "trips whose energy is covered": _mean([x for s in every for x in s.covered]),
             "false name": _mean([bool(s.false) for s in every]),
         }  # fmt: skip
         if more:
             row["mean or cycle named instead"] = _mean([bool(s.instead) for s in every])
             row["power covered"] = _mean([x for s in every for x in s.power_covered])
             row["median power over true"] = float(np.median(power)) if power else None
-            row["median error of time on [points]"] = 100.0 * float(np.median(np.abs(off))) if off else None
+            row["median error of the share of time on [points]"] = (
+                100.0 * float(np.median(np.abs(off))) if off else None
+            )
         rows.append(row)
     return rows
 
@@ -224,8 +229,8 @@ def _found_sentences(planted: Sequence[Log]) -> list[str]:
     parts = []
     for size in sorted({t["loads"][0]["size"] for t, _ in one}):
         every = [scored(t["effects"], r).all_found for t, r in one if t["loads"][0]["size"] == size]
-        parts.append(f"{sum(every)} of {len(every)} at {size:g}")
-    return [f"One load is found in {', '.join(parts)} times the noise"] if parts else []
+        parts.append(f"{sum(every)} of {len(every)} logs at size {size:g}")
+    return [f"A single load is found in {names.verbose_join(parts)}"] if parts else []
 
 
 def _interval_sentence(planted: Sequence[Log]) -> list[str]:
@@ -234,8 +239,8 @@ def _interval_sentence(planted: Sequence[Log]) -> list[str]:
     power, energy = [x for s in every for x in s.power_covered], [x for s in every for x in s.covered]
     if not power:
         return []
-    trips = f"the energy of {100.0 * np.mean(energy):.0f} % of trips"
-    return [f"Of loads that are found, the 90 % interval holds the power of {sum(power)} of {len(power)} and {trips}"]
+    trips = f"their energy in {100.0 * np.mean(energy):.0f} % of the trips"
+    return [f"90 % intervals cover the power of {sum(power)} of the {len(power)} loads found, and {trips}"]
 
 
 def _false_sentences(empty: Sequence[Log], planted: Sequence[Log]) -> list[str]:
@@ -247,7 +252,7 @@ def _false_sentences(empty: Sequence[Log], planted: Sequence[Log]) -> list[str]:
         out = [f"With nothing planted a load is named in {wrong} of {n} logs ({most})"]
     others = [(t, r["without"]) for t, r in planted if "named" in r.get("without", {})]
     if others:
-        out.append(f"With another effect alone a load is named in {_with_load(others)} of {len(others)}")
+        out.append(f"With another effect and no load, a load is named in {_with_load(others)} of {len(others)} logs")
     return out
 
 
@@ -256,7 +261,7 @@ def _beside_sentence(rows: Sequence[dict[str, Any]]) -> list[str]:
         return []
     a, b = (round(sum(r["n"] * r[k] for r in rows)) for k in ("effect named, with the load", "effect named, without"))
     n = sum(r["n"] for r in rows)
-    return [f"Another effect is named in {a} of {n} logs beside a load, in {b} of the same logs without it"]
+    return [f"With a load added, that effect is named in {a} of {n} logs, without the load in {b} of them"]
 
 
 @styled
@@ -287,13 +292,14 @@ def _figure(run: Run, logs: Sequence[Log]) -> None:
                 x, y = np.array(dots).T
                 label = kind if mode == "samples" else None
                 right.plot(x * beside, y, marker, color=colour, ms=4, alpha=0.8, mew=0, label=label)
+    right.plot([], [], "o", color=GREY, ms=4, label="circles: samples")
     right.plot([], [], "s", color=GREY, ms=4, label="squares: segments")
     right.set_ylabel("estimated power over the true one")
     for ax in (left, right):
         ax.set_xscale("log")
         ax.set_xticks(sizes, [f"{s:g}" for s in sizes])
         ax.minorticks_off()
-        ax.set_xlabel("power of the load over that of the noise")
+        ax.set_xlabel("power of the load over the RMS of the noise")
         tidy(ax)
     left.set_title("Synthetic logs with one load")
     right.set_title(f"Power of the loads found; band: ± {POWER:.0%}")

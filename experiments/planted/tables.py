@@ -26,7 +26,7 @@ TABLES = {
         ("right", "interval_95", "wanted", "met", "false_name", "called_unexplained"),
     ),
     "planted_errors": (
-        "Planted effects: sizes of what was named, errors, time",
+        "Planted effects: errors, sizes, time",
         ("within_5_percent_of_oracle", "after_over_noise", "size_within_3_sd", "size_covered_90", "seconds"),
     ),
     "planted_names": (
@@ -46,35 +46,35 @@ WANTED = {  # what may be wanted of a setting: column with the share, in words, 
     "called_unexplained": ("called unexplained", "unexplained_wanted"),
 }
 MOST_SAID = 6  # counts that a page begins with
-BY_TWIN = "Planted effects: those without a twin have to be named alone, those with a twin in a class"
+BY_TWIN = "Planted effects: one that the log can tell apart has to be named alone, one with a twin in a class with it"
 LEGEND = {  # of each table that is there; the first of every page
     "": (
-        "Size: RMS of the planted effect's column, after projecting out the columns of the declared model, divided by "
-        "the RMS of the noise. Noise: white; ar1, each row follows the one before by {ar:g}; ar1_white, a fifth of the "
-        "variance is white; trip_levels, half of it is a random intercept of each trip; student_t, ar1 with "
-        "innovations of 3 degrees of freedom; trip_variance, ar1 whose size differs by trip. Logs hold energy by road "
-        "segment; logs called shaft hold samples of electric power with the motor's torque and speed",
+        "Size: RMS of what the effect adds to a row and the declared coefficients cannot absorb, divided by the RMS "
+        "of the noise. Noise: white; AR(1) with a coefficient of {ar:g}; AR(1) + white, a fifth of the variance is "
+        "white; random intercepts of trips, half of the variance; Student's t, AR(1) with innovations of 3 degrees "
+        "of freedom; variance by trip, AR(1) whose variance differs by trip. Logs hold energy by road segment; logs "
+        "called shaft hold samples of electric power with the motor's torque and speed",
     ),
     "planted": (
-        "Right: the share of logs with the right answer, with Wilson's 95 % interval. The right answer is: exactly "
-        "what was planted, each effect by its id or in a class of at most three; if nothing was planted, no name; if "
-        "the cause is outside the library, no wrong name (a constant load counts as right for a load that switches); "
-        "if a coefficient absorbs the effect or more trips are needed, that the diagnosis says so. Target met: the "
-        "share reaches its target{unexplained}",
+        "Right: the share of logs with the right answer, with Wilson's 95 % interval. If effects of the library were "
+        "planted, the answer is right if it names exactly them, each alone or in a class of at most three. If nothing "
+        "was planted, it has no name. If the cause is outside the library, it has no wrong name (a constant load is "
+        "right for a load that switches). If a coefficient absorbs the effect or more trips are needed, it says so. "
+        "Target met: the share reaches its target{unexplained}",
         "False name: share of logs in which an effect is named that was not planted. Called unexplained: share of "
-        "logs in which structure is left (random intercepts of trips count, although they are noise in these logs)",
+        "logs in which significant structure remains (random intercepts of trips count, although they are noise here)",
     ),
     "planted_errors": (
-        "Within 5 % of a refit: share of logs whose test RMSE is at most 5 % above that of a fit on the same training "
-        "trips that knows the cause. Test RMSE over noise: test RMSE divided by the RMS of the noise, median. Sizes: "
-        "of effects named by their own id. Seconds: of one diagnosis, median, with others running on the same machine; "
-        "the first logs of each kind include compiling",
+        "Within 5 % of a fit that knows the cause: share of logs whose test RMSE is at most 5 % above that of such "
+        "a fit on the same training trips. Test RMSE over noise: test RMSE divided by the RMS of the noise, median. "
+        "Sizes: of effects named by their own name. Seconds: of one diagnosis, median, with others running on the "
+        "same machine; the first logs of each kind include compiling",
     ),
     "planted_names": (
         "Top-ranked: share of logs in which the planted effect is the first of each class. Named alone: share "
-        "in which each entry is a single name. Separable: share in which, judged by the true effect, no other effect "
-        "explains as much under this noise. Drawn anew: number of logs drawn again because the effect acted in only "
-        "one training trip, or the noise was beyond what the reader takes",
+        "in which each entry is a single name. Separable: share in which no other effect fits as well as the true one "
+        "under this noise. Drawn anew: number of logs simulated again because the effect acted in only one training "
+        "trip, or because a value of the noise was outside the range that the reader of logs accepts",
     ),
     "planted_names_by_twin": (
         "Twins: mass_scale and power_gain cannot be distinguished by any log of road segments under this sheet, once "
@@ -83,8 +83,8 @@ LEGEND = {  # of each table that is there; the first of every page
         "their targets, if they have one",
     ),
     "planted_rivals": (
-        "Ours is right if an entry (a name or a class) contains the planted effect; with classes set aside, if the "
-        "first name of each entry is the planted effect, so a twin named first is false. A rival's name is right if it "
+        "Ours is right if an entry (a name or a class) contains the planted effect; *first name only*: if the first "
+        "name of each entry is the planted effect, so a twin named first is false. A rival's name is right if it "
         "is the planted effect, its twin, an effect that this log cannot distinguish from it, or in our class. Our "
         "seconds include compiling, which weighs more where there are few logs of a kind",
     ),
@@ -102,7 +102,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
         if case.wanted_pooled is not None and group:
             row = _row(config, f"{case.name}, all together", group)
             rows.append(_met({**row, "wanted": case.wanted_pooled}))
-    shown, drawn = [""], f"synthetic logs, seed {config.seed} on, --fdr {config.fdr}"
+    shown, drawn = [""], f"synthetic logs, seeds from {config.seed}, FDR {100 * config.fdr:g} %"
     for table, (caption, columns) in TABLES.items():
         part = [{k: r[k] for k in ("name", "n", *columns)} for r in rows if r[columns[0]] is not None]
         if part:
@@ -144,8 +144,8 @@ def _findings(config: Config, done: Group) -> list[str]:
         if case.asked == "named" and (not planted or (len(planted) == 1 and scores.nameable(planted))):
             name = f"{case.name}{_sized(task)}" + (f", {task['trips']} trips" if planted else "")
             groups.setdefault(name, []).append(_right(case.asked, task, result))
-    said = [f"{name}, {sum(hits)} of {len(hits)}" for name, hits in groups.items()]
-    return [f"Right answers: {'; '.join(said)}"] if 0 < len(said) <= MOST_SAID else []
+    said = [f"{sum(hits)} of {len(hits)} with {name}" for name, hits in groups.items()]
+    return [f"Right answers, of logs: {'; '.join(said)}"] if 0 < len(said) <= MOST_SAID else []
 
 
 def _unexplained_wanted(config: Config, done: Group) -> str:
@@ -161,7 +161,8 @@ def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:
     what = sorted({k for effects in left for k in effects if not comparable([k])})
     if not left:
         return ""
-    out = f"; without {len(left)} logs of {' or '.join(what)}, which are searched by trip and have no column"
+    words = " or ".join(k.replace("_", " ") for k in what)
+    out = f"; without {len(left)} logs of {words}, which is no column that could be offered to the other methods"
     return f"{out}; the first table has all logs"
 
 

@@ -6,9 +6,10 @@ from typing import Any
 
 from experiments.runner.tables import readable
 
-__all__ = ["DECIDES", "check", "comparison", "findings", "headlines", "missed", "notes", "numbers"]
+__all__ = ["check", "comparison", "decides", "findings", "headlines", "missed", "notes", "numbers"]
 
-DECIDES = "Main error of each model; median and range are over all random starts of its fit, where it has several"
+DECIDES = "Main error of each model"
+OVER_STARTS = "; median and range are over the random starts of its fit"
 KEYS = ("artefact", "data", "synthetic", "rows", "better_than_paper", "of", "seconds", "tasks_left_out")
 
 
@@ -66,10 +67,16 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "name": readable(row["name"]), "quantity": readable(quantity), "paper": paper, "ours": own,
                 "ratio": own / paper if own is not None and paper else None,
                 "median": spread.get("median"),
-                "least to most": [spread["least"], spread["most"]] if spread else None, "why_not": row.get("reason"),
+                "range over starts": [spread["least"], spread["most"]] if spread else None,
+                "why_not": row.get("reason"),
             }
         )  # fmt: skip
     return lines
+
+
+def decides(lines: Sequence[Mapping[str, Any]]) -> str:
+    """The caption of a table of headlines."""
+    return DECIDES + (OVER_STARTS if any(x["range over starts"] for x in lines) else "")
 
 
 def _number(x: Any) -> float | None:
@@ -83,13 +90,15 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if "logs" in metrics:
         n, kind = metrics["logs"], "synthetic" if metrics["synthetic"] else "measured"
         said.append(f"{n} {kind} {'log' if n == 1 else 'logs'}.")
-    elif metrics["synthetic"]:
-        said.append("Synthetic data.")
+
     if metrics["tasks_left_out"]:
         said.append(f"Not run: {metrics['tasks_left_out']} more tasks of the config.")
     if metrics.get("skipped"):
-        said.append(f"Logs that could not be made as the config says: {len(metrics['skipped'])}.")
-    if metrics["of"]:
+        n = len(metrics["skipped"])
+        said.append(f"{n} {'log' if n == 1 else 'logs'} could not be simulated as configured.")
+    if metrics["of"] == 1:
+        said.append("At least as good as the paper." if metrics["better_than_paper"] else "Not as good as the paper.")
+    elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += _sentences(metrics.get("findings", []))
     if short := metrics.get("missed"):
@@ -104,10 +113,7 @@ def missed(metrics: Mapping[str, Any]) -> list[str]:
 
 def notes(metrics: Mapping[str, Any]) -> list[str]:
     """What a reader needs for the tables and figures of a run."""
-    said = _sentences(metrics.get("notes", []))
-    if metrics.get("tasks_in_one_program"):
-        said.append(f"{metrics['tasks_in_one_program']} tasks ran side by side in one program.")
-    return said
+    return _sentences(metrics.get("notes", []))
 
 
 def _sentences(lines: Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.compare import DECIDES, comparison, findings, headlines, missed, notes
+from experiments.runner.compare import comparison, decides, findings, headlines, missed, notes
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
 from experiments.runner.store import HERE
@@ -148,22 +148,22 @@ def write_list_docs(
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
         lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
-        first = [{"config": stem, **x} for stem, m in every for x in headlines(m)]
+        first = [{"of": _heading(stem), **x} for stem, m in every for x in headlines(m)]
         with_paper = [x for x in first if x["paper"] is not None]
         alone = [x for x in first if x["paper"] is None]
-        measured = {stem for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
-        lines += _against([x for x in with_paper if x["config"] in measured], docs, home.name)
+        measured = {_heading(stem) for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
+        lines += _against([x for x in with_paper if x["of"] in measured], docs, home.name)
         if with_paper:
             lines += [*_open(_decides(with_paper)), ""]
         if alone:
             title = "Models that the paper does not have" if with_paper else "Every model"
             lines += [*folded(title, _decides(alone)), ""]
         for path, folders in runs.items():
-            lines += [f"## {path.stem}", ""]
+            lines += [f"## {_heading(path.stem)}", ""]
             for k, folder in enumerate(folders):
                 before = f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"
                 lines += [*_lines(folder, path, docs, home.name, before, most_rows=MOST_ROWS), ""]
-        if against := [{"config": stem, **x} for stem, m in every for x in comparison(m)]:
+        if against := [{"of": _heading(stem), **x} for stem, m in every for x in comparison(m)]:
             every_number = markdown(cells(against, 4), "Every number of the paper").rstrip()
             lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number), ""]
         lines += [_by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs")]
@@ -172,9 +172,17 @@ def write_list_docs(
     return pages
 
 
+def _heading(stem: str) -> str:
+    """What a page calls a config: `table2` is Table 2, `pinn_data` is Data."""
+    if m := re.fullmatch(r"(table|fig)(\d+)", stem):
+        return f"{'Table' if m[1] == 'table' else 'Figure'} {m[2]}"
+    kind, _, rest = stem.removeprefix("pinn_").partition("_")
+    return f"{kind.capitalize()}: {rest.replace('_', ' ')}" if rest else kind.capitalize()
+
+
 def _decides(rows: Sequence[Mapping[str, Any]]) -> str:
     """The table of what decides."""
-    return _narrow(markdown(cells(rows, 4), DECIDES))
+    return _narrow(markdown(cells(rows, 4), decides(rows)))
 
 
 def _against(rows: Sequence[Mapping[str, Any]], docs: Path, name: str) -> list[str]:

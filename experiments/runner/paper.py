@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.compare import DECIDES, comparison, headlines
+from experiments.runner.compare import comparison, decides, headlines
 from experiments.runner.compute import Where, compute
 from experiments.runner.config import artefact, changes, shown, shown_point
 from experiments.runner.engine import Plan, claim_folder, plan, refuse_hurry, run_config, unfinished
@@ -98,7 +98,7 @@ def _blame(came: Outcomes, path: Path, error: Exception, log: Log) -> None:
 def against(came: Outcomes) -> list[dict[str, Any]]:
     """A line for each number of the papers: config, name, quantity, paper, ours, ratio, why there is none."""
     pairs = [(path, run) for path, every in came.made.items() for run in every]
-    return [{"config": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
+    return [{"of": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
 
 
 def _title(path: Path, run: Mapping[str, Any]) -> str:
@@ -129,9 +129,9 @@ def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
         for path, runs in came.made.items() for run in runs
     ]  # fmt: skip
     lines, every = against(came), [(path, run) for path, runs in came.made.items() for run in runs]
-    first = [{"config": _title(path, run), **line} for path, run in every for line in headlines(run)]
+    first = [{"of": _title(path, run), **line} for path, run in every for line in headlines(run)]
     tables = [("Runs", cells(rows))] if rows else []
-    tables += [(DECIDES, cells(first, 4))] if first else []
+    tables += [(decides(first), cells(first, 4))] if first else []
     tables += [("Paper against ours", cells(lines, 4))] if lines else []
     said = [] if came.made else ["No config of the list has been run."]
     said += [f"Not made: {why}." for why in came.reasons()]

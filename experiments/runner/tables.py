@@ -10,7 +10,7 @@ from scipy import stats
 
 from hdev_jax.rundir import Run
 
-__all__ = ["cells", "markdown", "read_markdown", "readable", "tex", "wilson", "write_tables"]
+__all__ = ["cells", "markdown", "read_markdown", "readable", "tex", "wilson", "worded", "write_tables"]
 
 _TEX = {
     "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
@@ -21,26 +21,39 @@ _TEX = {
 
 # What readers see of a key, a column's, a quantity's or a model's, where the key's own words and unit do not say it.
 _WORDS = {
-    "inside_90": "90 % interval holds [%]", "size_covered_90": "share of sizes in 90 % intervals",
+    "inside_90": "coverage of 90 % interval [%]", "size_covered_90": "share of sizes in 90 % intervals",
     "nodes_in_90": "share of nodes in 90 % intervals", "interval_95": "95 % interval", "false_95": "95 % interval",
-    "false_percent": "falsely named [%]", "c_rr": "c_rr", "c_rr_bias_percent": "bias of c_rr [%]",
-    "null_logs": "logs, nothing planted", "payload_logs": "logs, payload error",
-    "error_90_percent": "error, 90th percentile [%]", "median_half_interval_percent": "half of the interval [%]",
-    "half_interval_percent": "half of the interval [%]",
-    "median_row": "row of the alarm, median", "batch_logs": "named by a diagnosis",
-    "batch_median_row": "rows that this takes, median", "within_twice": "alarm within twice those rows",
-    "after_over_noise": "test RMSE over noise", "within_5_percent_of_oracle": "within 5 % of a refit",
-    "test_over_oracle": "test RMSE over a refit", "error_over_refit": "test RMSE over a refit",
+    "false_percent": "false names [%]", "c_rr": "c_rr", "c_rr_bias_percent": "bias of c_rr [%]",
+    "null_logs": "logs without payload error", "payload_logs": "logs with payload error",
+    "error_90_percent": "error, 90th percentile [%]",
+    "median_half_interval_percent": "half width of 90 % interval [%]",
+    "half_interval_percent": "half width of 90 % interval [%]",
+    "median_row": "row of the alarm, median", "batch_logs": "logs in which a diagnosis finds it",
+    "batch_median_row": "rows that the diagnosis needs, median", "within_twice": "alarm within twice those rows",
+    "after_over_noise": "test RMSE over noise",
+    "within_5_percent_of_oracle": "within 5 % of a fit that knows the cause",
+    "test_over_oracle": "test RMSE over that of a fit that knows the cause",
+    "error_over_refit": "test RMSE over that of a fit that knows the cause",
     "named_exactly": "named, or its class", "named_exactly_no_class": "named alone", "mean_class": "names in a class",
     "no_class_of_separable": "named alone, of the separable ones", "no_class_interval_95": "named alone, 95 % interval",
     "no_class_wanted": "named alone, target", "wanted": "target", "met": "target met", "named_first": "top-ranked",
     "blamed": "instrument or payload falsely named", "impossible": "impossible size",
     "blamed_when_nothing": "instrument or payload falsely named, nothing changed", "wanted_range": "target range",
     "redrawn": "drawn anew", "worst_percent": "largest error [%]",
-    "worst_at_kw": "at a power of [kW]", "test_mean": "test MSE, mean [kW²]", "physics_tabular": "physics, tables",
-    "physics_predicted": "physics, predicted coefficients", "step_worst_energy_percent": "energy of a step, worst [%]",
-    "duration_min": "duration [min]",
+    "test_mean": "test MSE, mean [kW²]", "step_test_mean": "test MSE, one step ahead, mean [kW²]",
+    "free_test_mean": "test MSE, free run, mean [kW²]",
+    "free_worst_energy_percent": "energy error in free run, worst trip [%]", "physics_tabular": "physics, tables",
+    "physics_predicted": "physics, predicted coefficients",
+    "step_worst_energy_percent": "energy error one step ahead, worst trip [%]",
+    "network without physics": "network, physics as input only", "LightGBM, no kernel": "LightGBM, log columns only",
+    "network, no kernel": "network, log columns only",
+    "duration_min": "duration [min]", "of": "table or figure", "why_not": "why no value",
 }  # fmt: skip
+NOISES = {  # of the generator, in words
+    "white": "white", "ar1": "AR(1)", "ar1_white": "AR(1) + white", "trip_levels": "random intercepts of trips",
+    "student_t": "Student's t", "trip_variance": "variance by trip", "random_walk": "random walk",
+}  # fmt: skip
+_NOISE = re.compile(rf"\b({'|'.join(sorted(NOISES, key=len, reverse=True))})\b")
 _UNITS = {
     "percent": "%", "wh": "Wh", "kw": "kW", "kwh": "kWh", "kg": "kg", "mrad": "mrad", "seconds": "s", "mph": "mph",
     "miles": "miles", "mps2": "m/s²", "mps3": "m/s³", "ms": "ms", "c": "°C",
@@ -55,6 +68,11 @@ def readable(key: str) -> str:
     *words, last = key.split("_")
     unit = f" [{_UNITS[last]}]" if words and last in _UNITS else ""
     return " ".join(_SHORT.get(w, w) for w in (words if unit else [*words, last])) + unit
+
+
+def worded(text: str) -> str:
+    """A name that holds the generator's name of a noise, in words."""
+    return _NOISE.sub(lambda m: NOISES[m.group()], text)
 
 
 def wilson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
@@ -114,7 +132,14 @@ def _cell(x: Any, digits: int) -> str:
     if isinstance(x, bool):
         return "yes" if x else "no"
     if isinstance(x, float):
-        return f"{x:.{digits}g}"
+        return _plain(x, digits)
     if isinstance(x, list | tuple):
-        return "–".join(_cell(v, digits) for v in x)
-    return str(x)
+        return " to ".join(_cell(v, digits) for v in x)
+    return worded(str(x))
+
+
+def _plain(x: float, digits: int) -> str:
+    """Without an exponent up to a billion."""
+    if 10.0**digits <= abs(x) < 1e9:
+        return f"{float(f'{x:.{digits}g}'):,.0f}"
+    return f"{x:.{digits}g}"

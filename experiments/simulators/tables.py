@@ -20,20 +20,21 @@ ARTEFACT = "studies/simulators"
 NOTES = (
     "Right, if nothing changed: no false name, and either the form of the efficiency is named (regenerating "
     "efficiency, losses by load), or the sheet already declares two efficiencies, or the diagnosis reports "
-    "unexplained structure. Right, with one change: an entry or a class of at most three contains it, or the declared "
-    "coefficient that takes it up has a 90 % interval that excludes the sheet's value, on the right side. Right, with "
-    "no slope in the log: no false name, and the diagnosis reports unexplained structure or that the slope is missing",
+    "unexplained structure. Right, with one change: an entry or a class of at most three contains it, or the "
+    "declared coefficient that absorbs it moves the right way, with a 90 % interval that excludes the sheet's "
+    "value. Right, with no slope in the log: no false name, and the diagnosis reports unexplained structure or that "
+    "the slope is missing",
     "False name: an entry that is neither the change nor the form of the efficiency. (The sheet declares one "
     "efficiency; FASTSim's depends on load and direction, SUMO's on direction.) In logs whose samples are means of "
     "the past second, a late slope, a time skew or a filter is not false either. Impossible size: a size or a "
     "coefficient that no vehicle has",
-    "Error over refit: test RMSE divided by that of a refit that knows the cause, that is the kernel with the "
-    "simulator's true parameters, the change and the form of the efficiency, calibrated on the same training trips. "
-    "It is the median over logs with a slope, because the refit knows the slope. Covered: share of 90 % intervals "
+    "A fit that knows the cause: the kernel with the simulator's true parameters, the change and the form of the "
+    "efficiency, calibrated on the same training trips. The ratio of test RMSEs is the median over logs with a slope, "
+    "because that fit knows the slope. Covered: share of 90 % intervals "
     "that contain the true size. Coefficients covered: the same for rolling resistance and drag area, whatever was "
-    "changed. Segments of 100 m average over what happens within them, for the refit too",
-    "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim has no share of "
-    "friction braking, so regeneration that is lost is subtracted from the electric power",
+    "changed. Segments of 100 m average over what happens within them, for both fits",
+    "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
+    "split braking between motor and friction brakes, so regeneration that is lost is taken from the electric power",
     "Rivals get the declared model's residual and every effect's column. A name is right if it is the change, and "
     "false if it is neither the change nor the form of the efficiency. LightGBM names nothing",
 )
@@ -45,7 +46,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     changed = [(t, r) for t, r in results if t["plant"] != "nothing"]
     if changed:
         rows.append(change_row(config, ANY, changed))
-    drawn = f"seed {config.seed} on, --fdr {config.fdr}"
+    drawn = f"seeds from {config.seed}, FDR {100 * config.fdr:g} %"
     head = f"Vehicles of FASTSim and SUMO: one change in the simulator, none in the sheet; {drawn}"
     write_tables(run, "table", _shown(rows), head)
     by_line = [
@@ -58,7 +59,9 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     against = rival_rows(config, results)
     if against:
         write_tables(run, "table_rivals", against, "Rivals on the same logs")
-    write_tables(run, "table_said", said_rows(results), "What was said of each log: names with sizes, held-out error")
+    write_tables(
+        run, "table_said", said_rows(results), "The diagnosis of each log: names with sizes, held-out error [kW]"
+    )
     _figure(run, *confusion(results))
     missed = [f"{r['name']} ({r['short_of']})" for r in rows if r["name"] in ("nothing", ANY) and r["short_of"]]
     return {
@@ -73,8 +76,8 @@ def _findings(rows: Sequence[dict[str, Any]]) -> list[str]:
     """What leads the page: answers and false names, with one change and with none."""
     words = {ANY: "With one change", PLANTS["nothing"].words: "With none"}
     return [
-        f"{words[r['name']]}, the answer is right in {100 * r['right']:.0f} % of {r['n']} logs, and a false name is "
-        f"given in {100 * r['false_name']:.0f} %"
+        f"{words[r['name']]}, the answer is right in {100 * r['right']:.0f} % of {r['n']} logs; a false name is "
+        f"given in {100 * r['false_name']:.0f} %{', partly in the same logs' if r['name'] == ANY else ''}"
         for r in reversed(rows) if r["name"] in words
     ]  # fmt: skip
 
@@ -113,7 +116,12 @@ def change_row(config: Config, name: str, group: Group) -> dict[str, Any]:
         ("false name", false, *_at_most(false, config.wanted_false if nothing else config.wanted_beside)),
         ("instrument or payload falsely named", blamed, *_at_most(blamed, 0.0 if nothing else 1.0)),
         ("covered", covered, config.wanted_covered, covered is None or covered >= config.wanted_covered),
-        ("error over refit", error, config.wanted_error, error is None or error <= config.wanted_error),
+        (
+            "test RMSE over that of a fit that knows the cause",
+            error,
+            config.wanted_error,
+            error is None or error <= config.wanted_error,
+        ),
         ("impossible size", impossible, *_at_most(impossible, 0.0)),
     )
     return {

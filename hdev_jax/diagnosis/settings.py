@@ -47,8 +47,10 @@ class Settings:
         0.25, "smallest ratio of the GLS estimate, plus two standard errors, to the OLS estimate", "1",
         "chosen on seeds 1-99",
     )  # fmt: skip
-    placebo_level: float = _number(0.01, "share of sign placebos that may gain as much", "1", "permutation test, 1 %")
-    placebos: int = _number(199, "sign placebos", "draws", "least number for a test at 1 % with two to spare")
+    placebo_level: float = _number(
+        0.01, "share of placebos with flipped signs that may gain as much", "1", "permutation test, 1 %"
+    )
+    placebos: int = _number(199, "placebos with flipped signs", "draws", "1 of 199 may do as well: p of 2/200")
     shifts: int = _number(
         19, "placebos shifted in time, none of which may gain as much", "draws", "permutation test, 5 %"
     )
@@ -57,19 +59,19 @@ class Settings:
         "Meinshausen and Bühlmann, JRSS B 72 (2010), far below their 0.6: sets of 8 trips differ much",
     )  # fmt: skip
     switch_low: float = _number(
-        0.4, "smallest estimate of a switch, as a share of its full step; the largest is 1 over it", "1",
+        0.4, "smallest estimated step of a switch over its full step; the largest is the reciprocal", "1",
         "half, less two standard errors",
     )  # fmt: skip
 
     # a joint refit
     stands: float = _number(2.6, "least |t| of a size in the joint refit", "standard errors", "1 %, two-sided")
     agrees: float = _number(
-        0.9878, "probability below which least squares and generalised least squares agree on a size", "1",
-        "Hausman, Econometrica 46 (1978): 2.25 sd",
+        0.9878, "level of the test that ordinary and generalised least squares agree on a size", "1",
+        "Hausman, Econometrica 46 (1978): 2.25 sd, one-sided",
     )  # fmt: skip
     known: float = _number(
         2.0,
-        "times smaller standard error for which generalised least squares are tried first",
+        "factor by which the GLS standard error is smaller for GLS to be tried first",
         "1",
         "relative efficiency 4",
     )
@@ -80,43 +82,47 @@ class Settings:
 
     # is X still needed beside Y
     wald: float = _number(
-        0.05, "p-value up to which an effect is needed beside those added later, or another of its class", "1",
+        0.05, "largest p-value at which an effect is needed beside those added later, or another of its class", "1",
         "Wald test, 5 %",
     )  # fmt: skip
     class_share: float = _number(
         0.8, "least share of an effect's gain that another of its class reaches", "1", "chosen on seeds 1-99"
     )
     inexact: float = _number(
-        0.2, "share by which the forms of effects are inexact; effects that differ by less are one class", "1",
+        0.2, "relative error of an effect's equation; effects that differ by less are one class", "1",
         "efficiencies and drag by FASTSim's and SUMO's vehicles: 5 to 20 % off any closed form",
     )  # fmt: skip
 
     correlated: float = _number(
-        0.5, "least correlation of two estimates for which a class among found effects is looked for", "1",
-        "time: of those that share 80 % of their gain it is 0.9",
+        0.5, "smallest correlation of the estimates of two found effects for which they may be one class", "1",
+        "to save time: effects that share 80 % of their gain have 0.9",
     )  # fmt: skip
 
     # terms without a name
     unnamed_stricter: float = _number(
-        5.0, "factor by which the FDR level is lower for a term without a name", "1", "a description is not a cause"
+        5.0, "factor by which the FDR level is lower for a term without a name", "1", "it names no cause"
     )
     mean_over_swing: float = _number(
-        2.0, "largest mean of a load over the amplitude of its cycle", "1", "a square wave that is on for 78 % of it"
+        2.0, "largest ratio of a periodic load's mean to its amplitude", "1", "a square wave that is on for 78 % of it"
     )
 
     # loads that switch in a cycle, modes of some trips
-    alike_spread: float = _number(0.3, "largest sd of its size over trips, over the size", "1", "chosen on seeds 1-99")
-    other_waves: float = _number(0.1, "largest share of its gain that harmonics may add", "1", "chosen on seeds 1-99")
+    alike_spread: float = _number(
+        0.3, "periodic load: largest sd of its size between trips, over the size", "1", "chosen on seeds 1-99"
+    )
+    other_waves: float = _number(
+        0.1, "periodic load: largest share of its gain from harmonics", "1", "chosen on seeds 1-99"
+    )
     least_count: int = _number(
-        8, "least number of trips for a mode of some of them, and of switches of a load beyond once a trip", "1",
+        8, "fewest trips for a mode of some of them; fewest switchings of a load beyond one per trip", "1",
         "as for trips as clusters",
     )  # fmt: skip
-    mode_side: int = _number(2, "least trips of either mode", "trips", "one is an outlier")
+    mode_side: int = _number(2, "fewest trips in each mode", "trips", "one is an outlier")
     mode_enough: float = _number(0.01, "p-value above which two values are enough for all trips", "1", "a test at 1 %")
 
     # loads that switch
     load_alike: float = _number(
-        0.5, "largest sd of a load's power over trips, and difference between standstill and motion, over it", "1",
+        0.5, "largest relative sd of a load's power between trips, and difference of standstill and motion", "1",
         "measured loads of buses have stages: 0.15 to 0.35",
     )  # fmt: skip
     load_steady: float = _number(
@@ -124,7 +130,10 @@ class Settings:
         "two loads of a bus 0.01 and 0.08, planted ones at most 0.05, a saw-tooth 0.26 to 0.7",
     )  # fmt: skip
     load_s: float = _number(
-        60.0, "least time on, and off, in a trip, at standstill or in motion, for a power there", "s", "a minute"
+        60.0,
+        "shortest time on, and off, in a trip or at standstill, for an estimate of the power there",
+        "s",
+        "a minute",
     )
     load_sure: float = _number(
         0.8, "least probability of a decoded state, on and off alike", "1",
@@ -133,11 +142,14 @@ class Settings:
 
     # what remains
     drifts: float = _number(
-        0.2, "least correlation of the means of neighbouring minutes of a slow remainder", "1", "4 % of their variance"
+        0.2,
+        "least correlation of neighbouring one-minute means for a residual that drifts",
+        "1",
+        "4 % of their variance",
     )
     level: float = _number(
-        1e-3, "p-value below which structure is unexplained (a tenth of it for change points and intercepts), a size "
-        "joins a found effect, or a cycle differs between trips", "1", "a test at 0.1 %",
+        1e-3, "p-value below which remaining structure is reported (a tenth of it for change points and intercepts), a "
+        "parameter is added to a found effect, or a cycle differs between trips", "1", "a test at 0.1 %",
     )  # fmt: skip
     least_share: float = _number(
         0.02, "least share of the variance that a structure has to explain, or an effect where slope or speed have "
@@ -148,7 +160,7 @@ class Settings:
     )
 
     instrument_share: float = _number(
-        0.5, "share of the remaining test variance that is structure, above which no instrument is named", "1",
+        0.5, "structure's share of the remaining test variance, above which no instrument fault is named", "1",
         "more structure than noise: the model's form is wrong",
     )  # fmt: skip
 
@@ -162,7 +174,7 @@ class Settings:
     )
     half: float = _number(
         0.5,
-        "for undecided effects: share of the differences between trips to be ruled out, and largest adjusted p-value",
+        "undecided effects: largest adjusted p-value, and share of the differences between trips to be ruled out",
         "1",
         "half",
     )

@@ -38,29 +38,29 @@ def test_errors_on_measured_logs_are_those_of_the_page():
     assert f"RMSE {after} kW" in README
     assert f"{before} kW for the calibrated sheet" in README
     pooled = next(x for x in REAL.splitlines() if x.startswith("| pooled |")).split("|")
-    assert f"({pooled[4].strip()} kW if the on and off states of two loads are read" in README
-    assert f"energy of a mission off by {pooled[5].strip()} in the mean" in README
+    assert f"(RMSE {pooled[4].strip()} kW if the on and off states of two loads are decoded" in README
+    assert f"mean absolute error of a mission's energy {pooled[5].strip()} (" in README
     each = [row(REAL, str(trip)) for trip in (1, 2, 3, 4)]
     mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
     assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} parameters" in README
-    assert "paper's best network (NARXS), trained on trip 1 (its table VIII): 0.1604" in REAL
-    assert "0.1604 kW² for the best network of the paper (NARXS)" in README
+    assert "best network (NARXS, its table VIII), trained on trip 1: MSE 0.1604" in REAL
+    assert "0.1604 kW² for the best network of [paper 2](docs/paper2.md) (NARXS), trained on trip 1" in README
 
 
 def test_shares_of_synthetic_logs_are_those_of_the_page():
     alone = []
     for size, words in (
-        (0.5, "half as large as the noise (RMS of what it adds to a row), is identified in"),
+        (0.5, "half as large as the noise is identified in"),
         (0.25, "a quarter as large in"),
     ):
-        name = f"one effect, size {size}, 12 trips, ar1"
+        name = f"one effect, size {size}, 12 trips, AR(1)"
         assert f"{words} {percent(cell(PLANTED, name, 'right'))} % of {cell(PLANTED, name, 'n'):.0f}" in TEXT
         alone.append(percent(cell(PLANTED, name, "named alone")))
     assert f"named alone ({alone[0]} and {alone[1]} %)" in TEXT
     quiet = "nothing planted, all together"
     n = cell(PLANTED, quiet, "n")
     assert f"an effect is named in {(1 - cell(PLANTED, quiet, 'right')) * n:.0f} of {n:.0f} logs" in TEXT
-    outside = [f"a {what} outside the library, size 1, 24 trips, ar1" for what in ("cause", "cycle")]
+    outside = [f"a {what} outside the library, size 1, 24 trips, AR(1)" for what in ("cause", "cycle")]
     wrong = sum(cell(PLANTED, name, "false name") * cell(PLANTED, name, "n") for name in outside)
     assert f"a wrong one is named in {wrong:.0f} of {sum(cell(PLANTED, name, 'n') for name in outside):.0f}." in TEXT
 
@@ -70,9 +70,11 @@ def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
     n, false = cell(SIMULATORS, any_change, "n"), percent(cell(SIMULATORS, any_change, "false name"))
     blamed = percent(cell(SIMULATORS, any_change, "instrument or payload falsely named"))
     assert f"right in {percent(cell(SIMULATORS, any_change, 'right'))} % of {n:.0f} logs" in TEXT
-    assert f"{false} % of these logs get a false name, {blamed} % a false instrument fault or payload error" in TEXT
+    fault = f"(in {blamed} % a false instrument fault or payload error, part of the {false} %)"
+    assert f"a false name is given in {false} % of these logs {fault}" in TEXT
     winds = cell(SIMULATORS, wind, "n")
     assert f"a headwind is missed in {(1 - cell(SIMULATORS, wind, 'right')) * winds:.0f} of {winds:.0f}" in TEXT
     rivals = [percent(cell(SIMULATORS, name, "false name")) for name in ("LassoCV", "STLSQ (PySINDy)")]
-    assert f"give a false name in {rivals[0]} and {rivals[1]} % of all logs" in TEXT
+    assert f"On all {n + cell(SIMULATORS, 'nothing', 'n'):.0f} logs, LassoCV and STLSQ" in TEXT
+    assert f"give a false name in {rivals[0]} and {rivals[1]} %." in TEXT
     assert f"a false name is given in {false} % of the logs in which one thing was changed" in " ".join(WRONG.split())
