@@ -293,14 +293,14 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
             found.setdefault(tuple(task["weights"]), []).append(pooled([result["network"]["test"]])["rmse_wh"])
     if not found:
         raise InputError("every training of the grid diverged; lower the rate")
-    lines = [{"λ₁": w[0], "λ₂": w[1], "λ₃": w[2], "seeds": len(x), "RMSE [Wh]": float(np.median(x)), "least": min(x),
-              "most": max(x)} for w, x in sorted(found.items())]  # fmt: skip
+    lines = [{"λ₁": w[0], "λ₂": w[1], "λ₃": w[2], "seeds": len(x), "RMSE [Wh]": float(np.median(x)), "smallest": min(x),
+              "largest": max(x)} for w, x in sorted(found.items())]  # fmt: skip
     write_tables(run, "grid", lines, config.caption)
     weight_maps(run, {w: float(np.median(x)) for w, x in found.items()})
     best = min(lines, key=lambda x: x["RMSE [Wh]"])
     lost = sum("diverged" in r for _, r in results)
     where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"
-    medians, spread = [x["RMSE [Wh]"] for x in lines], max(x["most"] - x["least"] for x in lines)
+    medians, spread = [x["RMSE [Wh]"] for x in lines], max(x["largest"] - x["smallest"] for x in lines)
     note = (
         f"The lowest median RMSE is {best['RMSE [Wh]']:.2f} Wh, at λ = {where}; the {len(lines)} settings lie within "
         f"{max(medians) - min(medians):.1f} Wh, the seeds of one setting within up to {spread:.1f} Wh; {lost} of "
