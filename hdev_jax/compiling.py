@@ -14,7 +14,10 @@ from pathlib import Path
 
 __all__ = ["compile_quickly", "compiles_long", "crowded", "environment", "keep_compiled", "make_room", "of_threads"]
 
-FLAGS = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+# A program is compiled in one piece: the pieces that threads share take a half more in all, and few have cores for them.
+FLAGS = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
 PACKED = 5  # times smaller than that, where a file is compressed
 KEPT_BYTES = 40_000_000  # some 2,000 programs; JAX looks at each when it adds one; those not used for longest go first

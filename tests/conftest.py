@@ -17,6 +17,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from jax._src import lru_cache
+from jax._src.interpreters import mlir
 
 # One cache of compiled programs for all test processes and those that they start: the tests compile the same few
 # programs for log after log.
@@ -42,6 +43,22 @@ def _put(self: lru_cache.LRUCache, key: str, value: bytes) -> None:
 
 
 lru_cache.LRUCache.put = _put  # type: ignore[method-assign]
+
+_CONTEXTS: list[Any] = []
+_make_context = mlir.make_ir_context
+
+
+def _context() -> Any:
+    """One context for many programs: a new one, as JAX takes, costs as much as all else of lowering a small program.
+    What a context has interned stays, so now and then there is another."""
+    if not _CONTEXTS or len(_CONTEXTS) > 50:
+        _CONTEXTS[:] = [_make_context()]
+    else:
+        _CONTEXTS.append(_CONTEXTS[0])
+    return _CONTEXTS[0]
+
+
+mlir.make_ir_context = _context
 
 
 def _with_shapes() -> list[str]:

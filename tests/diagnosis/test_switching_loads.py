@@ -28,9 +28,9 @@ FEW = {k: LIBRARY[k] for k in ("auxiliary_power", "hvac_power", "switching_load"
 LOAD = Load(12e3, share=0.35, by_temp=0.01)
 
 
-def log_with(folder: Path, *loads: Load, seed: int = 3):
+def log_with(folder: Path, *loads: Load, seed: int = 3, trips: int = 9, rows: int = 900):
     """A log of samples with these loads, read as a user's would be, with its truth."""
-    synthetic = synthetic_log(seed=seed, trips=9, rows_per_trip=900, entry="shaft", mode="samples", effects={})
+    synthetic = synthetic_log(seed=seed, trips=trips, rows_per_trip=rows, entry="shaft", mode="samples", effects={})
     synthetic = with_loads(synthetic, loads, seed=seed) if loads else synthetic
     files = synthetic.write(folder, truth=False)
     log = read_log([files["log"]])
@@ -54,7 +54,7 @@ def found(tmp_path_factory):
 @pytest.fixture(scope="module")
 def some(tmp_path_factory):
     """Any training rows: the test of levels reads the settings and the kind of clusters of them."""
-    _, problem, _ = log_with(tmp_path_factory.mktemp("some"))
+    _, problem, _ = log_with(tmp_path_factory.mktemp("some"), trips=5, rows=200)
     return training(problem, ("auxiliary_power",))
 
 
@@ -277,7 +277,7 @@ def test_two_rows_at_standstill_have_no_load(short):
 
 
 def test_predicting_online_filters_along_the_log(tmp_path):
-    synthetic, *_ = log_with(tmp_path, LOAD)
+    synthetic, *_ = log_with(tmp_path, LOAD, trips=6, rows=500)
     files = {k: str(tmp_path / f"synthetic_truck.{k}") for k in ("csv", "toml")}
     found = hdev_jax.diagnose(files["csv"], files["toml"], only=[*FEW])
     assert found.predictive["states"]["ids"] == ["switching_load"]
