@@ -14,7 +14,7 @@ from pathlib import Path
 
 __all__ = ["compile_quickly", "compiles_long", "crowded", "environment", "keep_compiled", "make_room", "of_threads"]
 
-# A program is compiled in one piece: the pieces that threads share take a half more in all, and few have cores for them.
+# In one piece: the parts that threads share take a half more in all, and few machines have cores for them.
 FLAGS = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )

@@ -104,8 +104,9 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     lines, missed = [], []
     for task, r in results:
         error, name = np.abs(r["error"]), f"{task['variant']}, {task['log']}"
+        said = _said(name)
         if not len(error):
-            missed.append(f"{name}: no cell of {config.least_rows} rows")
+            missed.append(f"{said}: no cell of {config.least_rows} rows")
             continue
         ours = {
             "gears": r["gears"], "rows": r["all_rows"], "cells": len(error),
@@ -117,9 +118,9 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         }  # fmt: skip
         lines.append({"name": name, "paper": None, "ours": ours})
         if task["log"] in config.asked_of and ours["within"] < 1.0:
-            missed.append(f"{name}: worst cell {ours['worst_percent']:.2f} %, target {100 * config.within:g}")
+            missed.append(f"{said}: worst cell {ours['worst_percent']:.2f} %, target {100 * config.within:g}")
         if not r["converged"]:
-            missed.append(f"{name}: not converged")
+            missed.append(f"{said}: not converged")
     write_tables(run, "maps", [_shown(r) for r in lines], config.caption)
     _figure(run, results, config.within)
     return {
@@ -137,11 +138,15 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     }  # fmt: skip
 
 
+def _said(name: str) -> str:
+    return name.replace("_", " ").replace(WITHOUT, UNMODELLED)
+
+
 def _shown(row: dict[str, Any]) -> dict[str, Any]:
     """A line of the table: errors are in percentage points of efficiency."""
-    o, name = row["ours"], row["name"].replace("_", " ")
+    o = row["ours"]
     return {
-        "vehicle and log": name.replace(WITHOUT, UNMODELLED),
+        "vehicle and log": _said(row["name"]),
         "gears": o["gears"], "rows": o["rows"], "cells": o["cells"], "share of cells within 1 point": o["within"],
         "median error [points]": o["median_error_percent"], "largest error [points]": o["worst_percent"],
         "power there [kW]": o["worst_at_kw"], "share of nodes in 90 % intervals": o["nodes_in_90"],

@@ -132,7 +132,7 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     for way, whose in NAMEABLE.items():
         if way in square:
             share = 100 * (base - square[way]) / (base - learned)
-            removed = f"by {share:.0f} % of that amount" if share > 0 else "not at all"
+            removed = f"by {share:.0f} % of that amount" if share > 0 else "by nothing"
             out.append(f"{what}; {whose} reduces the squared error {removed}, without a network")
     return out
 

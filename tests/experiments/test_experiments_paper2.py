@@ -185,8 +185,8 @@ def test_what_the_tables_use_is_held_against_what_was_best(tmp_path):
 def test_the_edge_of_what_was_tried_is_told():
     tried = {"a": {"units": 5, "rate": 0.1}, "b": {"units": 10, "rate": 0.1}, "c": {"units": 20, "rate": 0.1}}
     assert paper2_choice._at_the_edge("b", tried) == []
-    assert paper2_choice._at_the_edge("c", tried) == ["units 20 is the largest"]
-    assert paper2_choice._at_the_edge("a", tried) == ["units 5 is the least"]
+    assert paper2_choice._at_the_edge("c", tried) == ["units 20 (largest)"]
+    assert paper2_choice._at_the_edge("a", tried) == ["units 5 (smallest)"]
 
 
 def test_a_window_without_rows_is_one_line(trips, tmp_path, monkeypatch):

@@ -119,7 +119,7 @@ def test_the_table_counts_rows_once_and_bounds_over_all_trainings(run, no_figure
     assert (paper["model"], paper["n"], paper["trips"]) == ("PINN", "6", "4")
     assert (unseen["model"], unseen["n"]) == ("PINN: unseen", "2")
     assert (tables["model"], tables["n"]) == ("physics, tables", "6")
-    assert lost["model"] == "network without physics: diverged, 1 of 1 trainings"
+    assert lost["model"] == "network, physics as input only: diverged, 1 of 1 trainings"
     rows = {r["name"]: r for r in out["rows"]}
     assert rows["PINN"]["ours"]["rmse"] == pytest.approx(np.sqrt((141 + 3 * 4 + 3 * 1) / 9))
     assert rows["PINN"]["ours"]["pe"] == pytest.approx(100 * (1 + 6 + 3) / 1050)
@@ -146,7 +146,7 @@ def test_missed_targets_are_listed(run, no_figures):
     assert pinn_pages.table(config(), results, run)["missed"] == [
         f"RMSE is not in the order of table 2: {0.01 * unit:.2f}, {0.2 * unit:.2f}, {0.1 * unit:.2f}",
         "ours: PE +2.00 %, target ±1",
-        "ours: RMSE 2.00 of the paper's, target 0.9",
+        "ours: RMSE 2 times the paper's, target 0.9",
         "ours: c_rr off by 15.0 % in the median of vehicles, target 5",
         "ours: c_rr off by 15.0 % in the worst vehicle, target 5",
         "ours: 33.3 % at a bound",
@@ -191,20 +191,21 @@ def test_ours_against_black_boxes_at_the_least_data_and_on_what_is_unseen(run, n
     ]  # fmt: skip
     out = pinn_pages.shares(config("studies/pinn_data"), results, run)
     assert out["missed"] == [
-        "10 % of the routes, test: RMSE 0.75 of that of network without physics, target 0.7",
-        "10 % of the routes, test, vehicles trained on: RMSE 0.75 of that of network without physics, target 0.7",
-        "10 % of the routes, unseen: RMSE 0.75 of that of network without physics, target 0.7",
-        "100 % of the routes, unseen: RMSE 1.00 of that of network without physics, target 0.7",
+        "10 % of the routes, test: RMSE 0.75 times that of network, physics as input only, target 0.7",
+        "10 % of the routes, test, vehicles trained on: RMSE 0.75 times that of network, physics as input only, "
+        "target 0.7",
+        "10 % of the routes, unseen: RMSE 0.75 times that of network, physics as input only, target 0.7",
+        "100 % of the routes, unseen: RMSE 1 times that of network, physics as input only, target 0.7",
     ]
     first = written(run, "shares")[0]
-    expected = {"seeds": 3, "RMSE [Wh]": 3, "least": 2, "most": 4, "training routes": 2, "training rows": 90}
+    expected = {"seeds": 3, "RMSE [Wh]": 3, "smallest": 2, "largest": 4, "training routes": 2, "training rows": 90}
     assert {k: float(first[k]) for k in expected} == expected
     assert (
         "validation error still falling at the last epoch, in some training: network without physics, ours"
         in out["notes"]
     )
     # where every route trains, every vehicle is trained on
-    assert [x["share"] for x in written(run, "shares") if x["rows of"] == TAUGHT] == ["0.1", "0.1", "1", "1"]
+    assert [x["share [%]"] for x in written(run, "shares") if x["evaluated on"] == TAUGHT] == ["10", "10", "100", "100"]
 
 
 def test_how_much_of_what_is_learned_has_a_name(run, no_figures):
@@ -219,16 +220,16 @@ def test_how_much_of_what_is_learned_has_a_name(run, no_figures):
         ),
     ]
     notes = pinn_pages.table(config(), results, run)["notes"]
-    said = [n for n in notes if "lowers the RMSE" in n]
+    said = [n for n in notes if "reduces the RMSE" in n]
     assert all("from 4 to 2 Wh" in n for n in said)
-    assert ["reach 81 % of that gain" in said[0], "reach 58 % of that gain" in said[1], len(said)] == [True, True, 2]
-    alone = [x for x in written(run, "table") if x["model"].endswith("closed form alone")]
+    assert ["by 81 % of that amount" in said[0], "by 58 % of that amount" in said[1], len(said)] == [True, True, 2]
+    alone = [x for x in written(run, "table") if x["model"].endswith("linear fit before training")]
     assert [(x["n"], float(x["RMSE [Wh]"])) for x in alone] == [("3", 3.0)], "no seed changes a closed form"
     other = [(results[0][0], {**vehicles, "kernel": scored(MEASURED + 5.0)}), results[1]]
-    (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if "lowers the RMSE" in n]
-    assert "reach nothing of that gain without any network" in none
+    (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if "reduces the RMSE" in n]
+    assert "reduces the squared error by nothing, without a network" in none
     worse = [results[0], (task("ours without effects"), {"network": scored(MEASURED + 3.95)})]
-    assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if "lowers the RMSE" in n]
+    assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if "reduces the RMSE" in n]
 
 
 def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures):
@@ -242,7 +243,10 @@ def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures)
         {"name": "1, 0.1, 0.01", "paper": None, "ours": {"rmse_wh": pytest.approx(3.0)}},
         {"name": "1, 0.1, 1", "paper": None, "ours": {"rmse_wh": pytest.approx(4.0)}},
     ]
-    assert out["findings"] == ["Best at λ = 1, 0.1, 0.01: 3.00 Wh; 1 of 5 trainings diverged"]
+    assert out["findings"] == [
+        "The lowest median RMSE is 3.00 Wh, at λ = 1, 0.1, 0.01; the 2 settings lie within 1.0 Wh, the seeds of one "
+        "setting within up to 4.0 Wh; 1 of 5 trainings diverged"
+    ]
     with pytest.raises(InputError, match="every training of the grid diverged"):
         pinn_pages.grid(config("studies/pinn_weights"), [lost], run)
 

@@ -138,7 +138,7 @@ def test_a_size_at_the_end_of_its_range_is_marked_and_agrees_with_nothing():
     runs = {k: result([effect("hvac_power", "heat_c", v, 1.0, "°C")]) for k, v in ends.items()}
     assert size_rows(runs)[0].at_bound == {"2"}
     assert "| 24.3 ± 1.0 | 26.0 ± 1.0, at its bound | 1.2 sd |" in size_table(runs, "fold")[-1]
-    assert "Of 0 sizes found more than once, none at a bound, 0 agree" in page._agreement(runs, "")[0]
+    assert "Of 0 sizes found in more than one training set, none at a bound, 0 agree" in page._agreement(runs, "")[0]
 
 
 def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
@@ -153,9 +153,12 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
         for factor, close in ((0.97, True), (1.03, False)):
             (row,) = size_rows(offsets(5.0, 5.0 + factor * bound, *[5.0 + 0.5 * bound] * (sets - 2)))
             assert row.agrees() == close
-    assert "Of 1 sizes found more than once, 1 agrees." in page._agreement(offsets(5.0, 5.5), "")[0]
     assert (
-        "0 agree. These differ by more: `torque_offset.offset_nm` (2.1 sd)."
+        "Of 1 sizes found in more than one training set, 1 agrees within chance."
+        in page._agreement(offsets(5.0, 5.5), "")[0]
+    )
+    assert (
+        "0 agree within chance. These do not: `torque_offset.offset_nm` (2.1 sd)."
         in page._agreement(offsets(5.0, 8.0), "")[0]
     )
 

@@ -156,7 +156,7 @@ def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
     quarter = [(t, result(test_rmse={"before": 1.03, "after": 1.03})) for t in every("single_quarter")]
     half = [(t, result(test_rmse={"before": 1.12, "after": 1.12})) for t in every("single")[:20]]
     rows = told(tmp_path, [*quarter, *half])
-    name = "test error within 5 % of the oracle's"
+    name = "test error within 5 % of that of a fit that knows the cause"
     assert rows[f"{name}, size 0.25"]["share"] == 1.0
     assert rows[f"{name}, size 0.25"]["met"] is None
     assert rows[f"{name}, size 0.5"]["share"] == 0.0
@@ -248,7 +248,7 @@ def test_a_page_explains_the_tables_that_it_has(tmp_path):
             return " ".join(collect(config(), logs, run)["notes"])
 
     single = notes([(t, result(["headwind"])) for t in every("single", effects=["headwind"])], "single")
-    assert "one before by 0.97" in single
+    assert "AR(1) with a coefficient of 0.97" in single
     assert "Top-ranked" in single
     twins = single[single.index("Twins:") :]
     assert all(k in twins for pair in scores.TWINS.items() for k in pair)
@@ -271,12 +271,14 @@ def test_a_page_says_how_many_answers_are_right_and_has_no_figure_of_zeros_or_of
     two = [({**t, "size": s}, r) for s in (0.25, 0.5) for t, r in single]
     found, figures = ran([*two, *nothing], "two")
     assert figures == {"confusion.png"}
-    assert f"one effect, size 0.25, 12 trips, {n} of {n}; one effect, size 0.5, 12 trips, {n} of {n}" in found[0]
-    assert f"nothing planted, {quiet} of {quiet}" in found[0]
+    assert (
+        f"{n} of {n} with one effect, size 0.25, 12 trips; {n} of {n} with one effect, size 0.5, 12 trips" in found[0]
+    )
+    assert f"{quiet} of {quiet} with nothing planted" in found[0]
     one_false = [*nothing[1:], (nothing[0][0], result(["headwind"]))]
     found, figures = ran([*two, *(({**t, "size": 1.0}, r) for t, r in single), *one_false], "three")
     assert figures == {"confusion.png", "false_discoveries.png", "power.png"}
-    assert f"nothing planted, {quiet - 1} of {quiet}" in found[0]
+    assert f"{quiet - 1} of {quiet} with nothing planted" in found[0]
 
 
 def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):

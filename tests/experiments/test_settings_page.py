@@ -53,7 +53,7 @@ def test_the_page_in_docs_is_as_the_settings_are():
     for s in described():
         name, default, half, double, unit, meaning, source = shown[s["name"]]
         assert name.endswith(f"`{s['name']}`")
-        assert (default, unit) == (f"{s['default']:g}", s["unit"])
+        assert (default, unit) == (f"{s['default']:g}", s["unit"].replace("1", "–"))
         assert meaning.replace("\\|", "|") == s["meaning"]
         assert source.removesuffix(" |") == s["source"]
         ways = changed(s["default"], s["unit"])
@@ -71,7 +71,7 @@ def test_results_of_the_study_fill_half_and_double(tmp_path, capsys):
     (tmp_path / "sweep.json").write_text(json.dumps([run({}, 4), run({"mode_side": 1}, 3)]))
     assert main(["--docs", str(tmp_path / "docs"), "--run", str(tmp_path)]) == 0
     text = (tmp_path / "docs" / "settings.md").read_text(encoding="utf-8")
-    assert "With the defaults: 4/4, 1 false." in text
+    assert "with the defaults, 4/4, 1 false." in text
     assert "| `mode_side` | 2 | 1: 3/4, 1 false | 4 |" in text
     assert "No results" in page(command="x")
     assert main(["--docs", str(tmp_path), "--run", str(tmp_path / "none")]) == 2

@@ -107,7 +107,6 @@ def test_fit_reaches_scipys_cost_from_the_same_start():
     fit = fit_prediction(model, trip, begin, max_steps=500, rtol=1e-10)
     x, y = model.regressors(trip)
     for k in range(3):
-
         said = jax.jit(lambda theta: output(s.shape, theta, jnp.asarray(x)))
 
         def residual(theta, said=said):
