@@ -36,7 +36,7 @@ DATA = Path(os.environ.get("HDEV_DATA", "../shared/data"))
 PARTS = ("niro", "road", "ztbus", "withheld", "load")
 TRIPS = ("1", "2", "3", "4")
 FOLDS = (1, 2, 3)
-# Which channel is withheld in which fold. The warmth of the passengers is small: the fold decides whether it is found.
+# Which channel is withheld in which fold. The heat from passengers is small: the fold decides whether it is found.
 HELD = (("temperature", 1), ("passengers", 1), ("passengers", 3), ("steering", 1))
 CODE = tuple(
     Path(hdev_jax.__file__).parent / p

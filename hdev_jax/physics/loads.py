@@ -101,7 +101,7 @@ class PassengerHeat(Effect):
     """
 
     id: ClassVar[str] = "passenger_heat"
-    label: ClassVar[str] = "warmth of the passengers"
+    label: ClassVar[str] = "heat from passengers"
     stage: ClassVar[Stage] = "battery"
     equation: ClassVar[str] = "h·N·([T > T₂] − [T < T₁])"
     source: ClassVar[str] = "Basma et al., Energy 207 (2020) (occupants in the cabin's heat balance)"
