@@ -13,6 +13,7 @@ from experiments.planted.scores import MOST, PLANTABLE, Group, names
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import wilson
 from hdev_jax.physics import LIBRARY
+from hdev_jax.report import names as named
 from hdev_jax.report.canvas import figure, tidy
 from hdev_jax.rundir import Run
 
@@ -142,6 +143,11 @@ def _answers(entry: Mapping[str, Any], right: str) -> bool:
     return right in entry["class"] and entry["class_size"] <= MOST
 
 
+def _in_words(name: str) -> str:
+    """Of an effect, or of a declared coefficient."""
+    return named.coefficient(name)[0] if "." in name else name.replace("_", " ")
+
+
 def share_figure(
     run: Run, name: str, rows: Sequence[str], columns: Sequence[str], share: np.ndarray, right: Sequence[Sequence[str]],
     *, ylabel: str, title: str,
@@ -153,7 +159,7 @@ def share_figure(
     fig = figure(max(0.32 * len(columns) + 2.5, 4.9), 0.3 * len(rows) + 1.8)  # the title's at least
     axes = fig.add_subplot()
     image = axes.imshow(share, cmap="Blues", vmin=0, vmax=100, aspect="auto")
-    axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90, fontsize=7.5)
+    axes.set_xticks(range(len(columns)), [_in_words(c) for c in columns], rotation=90, fontsize=7.5)
     axes.set_yticks(range(len(rows)), rows, fontsize=7.5)
     for i, k in zip(*np.nonzero(share >= 0.5), strict=True):
         axes.text(k, i, f"{share[i, k]:.0f}", ha="center", va="center", fontsize=6,

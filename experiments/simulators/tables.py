@@ -11,6 +11,7 @@ from experiments.runner.tables import wilson, write_tables
 from experiments.simulators import scores as scores
 from experiments.simulators.config import Config
 from experiments.simulators.plants import FORMS, PLANTS
+from hdev_jax.report import names
 from hdev_jax.rundir import Run
 
 __all__ = ["Group", "change_row", "collect", "confusion", "rival_rows"]
@@ -188,11 +189,12 @@ def said_rows(results: Group) -> list[dict[str, Any]]:
     """A row for each log."""
     rows = []
     for t, r in results:
-        names = [f"{' or '.join(e['class'])} ({_sizes(e)})" for e in r["named"]]
+        entries = [f"{' or '.join(e['class'])} ({_sizes(e)})" for e in r["named"]]
         moved = PLANTS[t["plant"]].coefficients[:1] if scores.moved(t, r) else ()
+        told = [f"{names.coefficient(k)[0]} moved from the sheet" for k in moved]
         rows.append({
             "log": f"{t['line']}, {t['vehicle']}, seed {t['seed']}", "changed": PLANTS[t["plant"]].words,
-            "said": "; ".join([*names, *(f"{k} moved" for k in moved)]) or "nothing", "right": scores.right(t, r),
+            "said": "; ".join([*entries, *told]) or "nothing", "right": scores.right(t, r),
             "unexplained": r["unexplained"],
             "before": r["test_rmse"]["before"], "after": r["test_rmse"]["after"], "refit": r["refit_rmse"],
         })  # fmt: skip
