@@ -125,11 +125,16 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
         apart.write(a, rows.segments)
         shared.write(b, rows.segments)
         by_way = {replace(c, columns=()): b[:, c.columns] for c in shared.candidates}
+        # the column of a switch is the difference of two predictions, each of them rounded
+        rounding = (
+            4.0 * np.finfo(float).eps * np.max(np.abs(np.asarray(vehicle.predict(rows.segments, problem.target))))
+        )
         assert len(by_way) == len(apart.candidates) == len(shared.candidates)
         for c in apart.candidates:
             expected = a[: rows.rows, c.columns]
             scale = np.max(np.abs(expected)) + 1e-300
-            np.testing.assert_allclose(by_way[replace(c, columns=())][: rows.rows], expected, atol=1e-9 * scale)
+            same = by_way[replace(c, columns=())][: rows.rows]
+            np.testing.assert_allclose(same, expected, atol=1e-9 * scale + rounding)
         kernels = [r.program.parts[1] for r in shared.recipes]
         programs.append({(p.structure, jax.tree.structure(p.car)) for p in kernels})
     assert programs[0] == programs[1] == programs[2]
