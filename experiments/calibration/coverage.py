@@ -177,7 +177,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         line = {"setting": name, "new trips": len(inside), "coverage of totals by 90 % interval [%]": levels.pop(0.9),
                 "its 95 % interval": [100.0 * v for v in wilson(int(inside.sum()), len(inside))],
                 "coverage of rows [%]": ours["rows_inside_90"],
-                "of totals, rows taken as independent [%]": 100.0 * float(np.mean(np.array(r["naive"]) <= 1.0)),
+                "coverage of totals if rows are taken as independent [%]":
+                    100.0 * float(np.mean(np.array(r["naive"]) <= 1.0)),
                 "half width [% of the total]": 100.0 * float(np.median(r["width"]))}  # fmt: skip
         lines.append(line | {f"coverage of totals by {100 * v:g} % interval [%]": share for v, share in levels.items()})
         if not low <= share <= high:

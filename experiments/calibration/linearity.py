@@ -126,8 +126,8 @@ def _findings(rows: list[dict[str, Any]]) -> list[str]:
     for what in ("known", "free"):
         once, often = ([r["ours"][k] for r in rows if what in r["name"]] for k in ("rmse_once", "rmse_often"))
         said.append(f"With a {what} efficiency, one linearisation at the table values has an "
-                    f"RMSE of {min(once):.2f} to {max(once):.2f} Wh a row, iterating {min(often):.2f} to "
-                    f"{max(often):.2f} Wh (medians of logs)")  # fmt: skip
+                    f"RMSE of {min(once):.3f} to {max(once):.3f} Wh a row, iterating {min(often):.3f} to "
+                    f"{max(often):.3f} Wh (medians of logs)")  # fmt: skip
     return said
 
 

@@ -248,8 +248,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         ],
         "notes": [
             f"{DRAWS} draws for each data set, {APART} apart in a chain: ranks run from 0 to {DRAWS}",
-            "Here the prior of the noise, and the energy with which the noise grows, are fixed in advance; in use, "
-            "hdev estimates both from the same rows",
+            "Here the prior of the noise, and each row's energy to which the growing part of the noise is "
+            "proportional, are fixed in advance; in use, hdev estimates both from the same rows",
         ],
     }  # fmt: skip
 

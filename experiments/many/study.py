@@ -154,8 +154,8 @@ def _findings(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
             yield (f"Of {o['planted']} changed vehicles among {o['vehicles']}, {o['found']} are found, "
                    f"{o['in_a_week']} with the date within a week, and {o['others']} others are named")  # fmt: skip
         elif row["name"] == "small":
-            alone = f"named by {o['named_alone']} of {o['vehicles']} vehicles alone"
-            yield (f"An effect of a tenth of the noise in all vehicles is found in {o['effect_shown']} of {n} fleets, "
-                   f"and {alone}; {false}")  # fmt: skip
+            alone = f"of their {o['vehicles']} vehicles, each diagnosed alone, {o['named_alone']} name it"
+            yield (f"An effect of a tenth of the noise in all vehicles is found in {o['effect_shown']} of {n} fleets; "
+                   f"{alone}; {false}")  # fmt: skip
         else:
             yield f"With nothing planted, {false}"

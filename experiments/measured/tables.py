@@ -210,7 +210,8 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
         )  # fmt: skip
     return table(
         [head, "verdict", f"test RMSE after [{unit}]", f"noise floor [{unit}]",
-         "share of it that LightGBM predicts", "depends on", "what is left", "best rejected candidate"],
+         "share of the remaining test variance that LightGBM predicts", "depends on", "what is left",
+         "best rejected candidate"],
         rows,
     )  # fmt: skip
 

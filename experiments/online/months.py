@@ -90,7 +90,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     missed = [said] if total["with_alarm"] > config.at_most * total["vehicle_months"] else []  # a noise has too few
     many = total["vehicle_months"] // total["drives"]
     shared = f"as if they were independent: {many} vehicles share each of {total['drives']} drives and differ in noise"
-    had = f"{total['with_alarm']} of {total['vehicle_months']} vehicle-months"
+    had = f"False alarms: {total['with_alarm']} in {total['vehicle_months']} vehicle-months"
     findings = [f"{had} of {total['km_a_month']:.0f} km have a false alarm (95 % interval "
                 f"{total['interval_95']}, {shared})"]  # fmt: skip
     rows = [{"name": x["name"], "paper": None, "ours": x} for x in (*lines, total)]

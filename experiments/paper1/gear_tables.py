@@ -97,7 +97,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             f"{config.search_rows} rows; score: mean of accuracy and balanced accuracy",
             "balanced: each probability is divided by the gear's share of the training rows before the likeliest gear "
             "is taken; shares below a limit chosen in the search are raised to that limit. Gears with fewer than "
-            f"{LEAST_ROWS} scored rows are left out, of the reference too, which takes the shares of the scored rows",
+            f"{LEAST_ROWS} scored rows are left out, of the reference too; the reference divides by the shares of "
+            "the scored rows, which no classifier knows",
         ],
     }  # fmt: skip
 

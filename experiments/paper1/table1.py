@@ -218,7 +218,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "notes": [
             "Models A-D are synthetic: laps of one track each, the first half calibrates, the second half tests; "
             "medians over tracks",
-            "Buses and car are measured: traction force, sums weighted by distance",
+            "For the buses and the car the traction force is measured: the RMSE is that of the force by row, in N; "
+            "the PE is that of its sum over distance, the energy",
             *(f"{n}: {c} {'total is' if c == 1 else 'totals are'} near 0 and without a PE" for n, c in without.items()),
         ],
     }  # fmt: skip

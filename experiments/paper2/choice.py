@@ -88,7 +88,10 @@ def _recurrent_notes(config: Any) -> list[str]:
     own = [g.model for g in config.picked.values() if config.models[g.model].kind == "recurrent"]
     if not own:
         return []
-    steps = " and ".join(f"{config.models[n].steps} steps ({n})" for n in own)
+    by_model = {n: config.models[n].steps for n in own}
+    steps = " and ".join(f"{count} steps ({n})" for n, count in by_model.items())
+    if len(set(by_model.values())) == 1:
+        steps = f"{config.models[own[0]].steps} steps"
     return [
         f"{' and '.join(own)} are validated on blocks of time only, with {config.recurrent_starts} starts of "
         f"{config.recurrent_steps} steps; for the tables they are trained for {steps}"

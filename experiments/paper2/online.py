@@ -166,8 +166,9 @@ def collect(config: Config, results: Any, run: Run) -> dict[str, Any]:
                 f"memory: {memory:g} min, the best of {', '.join(f'{m:g}' for m in config.memories_min)} when the "
                 "model starts from the first half of trip 1 and is updated through the "
                 f"second{', at the edge of the grid' if edge else ''}",
-                "fixed: coefficients of trip 1; updated: each row is predicted from the rows before it; at the start "
-                "and at the end: the whole trip with the coefficients known at its first row and at its last",
+                "fixed: coefficients of trip 1; updated: each row is predicted with the coefficients estimated from "
+                "the rows before it; at the start, at the end: the whole trip is predicted with the coefficients "
+                "estimated up to its first row, or up to its last",
                 "With a short memory the coefficients follow the driving, not only the car's age",
             ]),
         ],

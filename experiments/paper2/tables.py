@@ -121,7 +121,7 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     several = [n for n in found if len(found[n]["losses"]) > 1]
     starts = {n: f"{n} ({len(found[n]['losses'])} starts)" for n in several}
     rules = {
-        "least": "ours is the random start with the lowest loss on trip 1",
+        "least": "ours is the random start with the lowest training loss on trip 1, which is not always the lowest MSE",
         "ensemble": "ours is the mean of all starts' predictions",
     }  # fmt: skip
     said = [

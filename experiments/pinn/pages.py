@@ -126,14 +126,14 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     if base is None or learned is None or base - learned < LEAST_LEARNED * base:
         return []
     what = (
-        f"'{LEARNED}' reduces the RMSE of the calibrated declared physics from {base**0.5:.4g} to {learned**0.5:.4g} Wh"
+        f"'{LEARNED}' lowers the RMSE of the calibrated declared physics from {base**0.5:.4g} to {learned**0.5:.4g} Wh"
     )
     out = []
     for way, whose in NAMEABLE.items():
         if way in square:
-            share = 100 * (base - square[way]) / (base - learned)
-            removed = f"by {share:.0f} % of that amount" if share > 0 else "by nothing"
-            out.append(f"{what}; {whose} reduces the squared error {removed}, without a network")
+            share = (base - square[way]) / (base - learned)
+            removed = f"lowers the squared error {share:.2f} times as much" if share > 0 else "does not lower the error"
+            out.append(f"{what}; {whose} {removed}, without a network")
     return out
 
 
@@ -149,13 +149,18 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
             q, t = found[m][name], found[m][f"{name}_true"]
             lines.append({"vehicle": m, "method": in_words(way),
                           **{f"{k} %": x for k, x in zip(QUANTILES, q, strict=True)},
-                          "error of the median [%]": 100 * found[m][f"{name}_error"]})  # fmt: skip
+                          "coefficient error [%]": 100 * found[m][f"{name}_error"]})  # fmt: skip
             rows.append({"name": f"{m}, {way}", "paper": None, "ours": {"median": q[2], "true_median": t[2]}})
     write_tables(run, "coefficients", lines, config.caption)
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": rows,
         "better_than_paper": 0, "of": 0, "missed": [],
-        "notes": ["the paper prints no numbers for its boxes, and its true values are unknown", *diverged(results)],
+        "notes": [
+            "the paper prints no numbers for its boxes, and its true values are unknown",
+            "coefficient error: size of the median over rows of predicted over true value, minus one; it is not the "
+            "error of the column 50 %",
+            *diverged(results),
+        ],
     }  # fmt: skip
 
 
@@ -302,8 +307,8 @@ def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
     where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"
     medians, spread = [x["RMSE [Wh]"] for x in lines], max(x["largest"] - x["smallest"] for x in lines)
     note = (
-        f"The lowest median RMSE is {best['RMSE [Wh]']:.2f} Wh, at λ = {where}; the {len(lines)} settings lie within "
-        f"{max(medians) - min(medians):.1f} Wh, the seeds of one setting within up to {spread:.1f} Wh; {lost} of "
+        f"The lowest median RMSE is {best['RMSE [Wh]']:.2f} Wh, at λ = {where}; the {len(lines)} medians differ by at "
+        f"most {max(medians) - min(medians):.1f} Wh, the seeds of one setting by at most {spread:.1f} Wh; {lost} of "
         f"{len(results)} trainings diverged"
     )
     return {

@@ -113,8 +113,8 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         f"The mean bias of the calibrated c_rr is {total['c_rr_bias_percent']:+.1f} % ({min(bias):+.1f} to "
         f"{max(bias):+.1f} % by kind of log)",
         f"A payload error of {100 * config.payload:g} % is found, alone or in its class, in "
-        f"{total['found_percent']:.0f} % of {total['payload_logs']} logs; 90 % intervals cover it in "
-        f"{total['inside_90']:.0f} %",
+        f"{total['found_percent']:.0f} % of {total['payload_logs']} logs; where it has a size, 90 % intervals cover it "
+        f"in {total['inside_90']:.0f} %",
     ]
     rows = [{"name": x["name"], "paper": None, "ours": x} for x in (*lines, total)]
     return {"artefact": config.artefact, "data": "synthetic logs", "synthetic": True, "rows": rows,

@@ -14,6 +14,7 @@ from experiments.planted.scores import Group
 from experiments.planted.sizes import CAPTION as SIZED
 from experiments.planted.sizes import NEAR_ORACLE, sized_rows
 from experiments.runner.tables import wilson, write_tables
+from hdev_jax.report.names import verbose_join
 from hdev_jax.rundir import Run
 
 __all__ = ["collect"]
@@ -46,7 +47,7 @@ WANTED = {  # what may be wanted of a setting: column with the share, in words, 
     "called_unexplained": ("called unexplained", "unexplained_wanted"),
 }
 MOST_SAID = 6  # counts that a page begins with
-BY_TWIN = "Planted effects: one that the log can tell apart has to be named alone, one with a twin in a class with it"
+BY_TWIN = "Planted effects: one without a twin has to be named alone, one with a twin in a class with it"
 LEGEND = {  # of each table that is there; the first of every page
     "": (
         "Size: RMS of what the effect adds to a row and the declared coefficients cannot absorb, divided by the RMS "
@@ -67,8 +68,8 @@ LEGEND = {  # of each table that is there; the first of every page
     "planted_errors": (
         "Within 5 % of a fit that knows the cause: share of logs whose test RMSE is at most 5 % above that of such "
         "a fit on the same training trips. Test RMSE over noise: test RMSE divided by the RMS of the noise, median. "
-        "Sizes: of effects named by their own name. Seconds: of one diagnosis, median, with others running on the "
-        "same machine; the first logs of each kind include compiling",
+        "Sizes: of planted effects that are the name, or the first name, of an entry. Seconds: of one diagnosis, "
+        "median, with others running on the same machine; the first logs of each kind include compiling",
     ),
     "planted_names": (
         "Top-ranked: share of logs in which the planted effect is the first of each class. Named alone: share "
@@ -144,8 +145,8 @@ def _findings(config: Config, done: Group) -> list[str]:
         if case.asked == "named" and (not planted or (len(planted) == 1 and scores.nameable(planted))):
             name = f"{case.name}{_sized(task)}" + (f", {task['trips']} trips" if planted else "")
             groups.setdefault(name, []).append(_right(case.asked, task, result))
-    said = [f"{sum(hits)} of {len(hits)} with {name}" for name, hits in groups.items()]
-    return [f"Right answers, of logs: {'; '.join(said)}"] if 0 < len(said) <= MOST_SAID else []
+    said = [f"{sum(hits)} of {len(hits)} logs with {name}" for name, hits in groups.items()]
+    return [f"The answer is right in {verbose_join(said)}"] if 0 < len(said) <= MOST_SAID else []
 
 
 def _unexplained_wanted(config: Config, done: Group) -> str:

@@ -92,7 +92,8 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
         said.append(f"{n} {kind} {'log' if n == 1 else 'logs'}.")
 
     if metrics["tasks_left_out"]:
-        said.append(f"Not run: {metrics['tasks_left_out']} more tasks of the config.")
+        n = metrics["tasks_left_out"]
+        said.append(f"Not run: {n} more {'task' if n == 1 else 'tasks'} of the config.")
     if metrics.get("skipped"):
         n = len(metrics["skipped"])
         said.append(f"{n} {'log' if n == 1 else 'logs'} could not be simulated as configured.")

@@ -78,7 +78,8 @@ def _findings(rows: Sequence[dict[str, Any]]) -> list[str]:
     words = {ANY: "With one change", PLANTS["nothing"].words: "With none"}
     return [
         f"{words[r['name']]}, the answer is right in {100 * r['right']:.0f} % of {r['n']} logs; a false name is "
-        f"given in {100 * r['false_name']:.0f} %{', partly in the same logs' if r['name'] == ANY else ''}"
+        f"given in {100 * r['false_name']:.0f} "
+        f"%{', also in some logs whose answer is right' if r['name'] == ANY else ''}"
         for r in reversed(rows) if r["name"] in words
     ]  # fmt: skip
 

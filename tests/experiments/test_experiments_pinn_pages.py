@@ -220,16 +220,16 @@ def test_how_much_of_what_is_learned_has_a_name(run, no_figures):
         ),
     ]
     notes = pinn_pages.table(config(), results, run)["notes"]
-    said = [n for n in notes if "reduces the RMSE" in n]
+    said = [n for n in notes if "lowers the RMSE" in n]
     assert all("from 4 to 2 Wh" in n for n in said)
-    assert ["by 81 % of that amount" in said[0], "by 58 % of that amount" in said[1], len(said)] == [True, True, 2]
+    assert ["0.81 times as much" in said[0], "0.58 times as much" in said[1], len(said)] == [True, True, 2]
     alone = [x for x in written(run, "table") if x["model"].endswith("linear fit before training")]
     assert [(x["n"], float(x["RMSE [Wh]"])) for x in alone] == [("3", 3.0)], "no seed changes a closed form"
     other = [(results[0][0], {**vehicles, "kernel": scored(MEASURED + 5.0)}), results[1]]
-    (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if "reduces the RMSE" in n]
-    assert "reduces the squared error by nothing, without a network" in none
+    (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if "lowers the RMSE" in n]
+    assert "does not lower the error, without a network" in none
     worse = [results[0], (task("ours without effects"), {"network": scored(MEASURED + 3.95)})]
-    assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if "reduces the RMSE" in n]
+    assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if "lowers the RMSE" in n]
 
 
 def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures):
@@ -244,8 +244,8 @@ def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures)
         {"name": "1, 0.1, 1", "paper": None, "ours": {"rmse_wh": pytest.approx(4.0)}},
     ]
     assert out["findings"] == [
-        "The lowest median RMSE is 3.00 Wh, at λ = 1, 0.1, 0.01; the 2 settings lie within 1.0 Wh, the seeds of one "
-        "setting within up to 4.0 Wh; 1 of 5 trainings diverged"
+        "The lowest median RMSE is 3.00 Wh, at λ = 1, 0.1, 0.01; the 2 medians differ by at most 1.0 Wh, the seeds of "
+        "one setting by at most 4.0 Wh; 1 of 5 trainings diverged"
     ]
     with pytest.raises(InputError, match="every training of the grid diverged"):
         pinn_pages.grid(config("studies/pinn_weights"), [lost], run)

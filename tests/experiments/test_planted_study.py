@@ -271,14 +271,13 @@ def test_a_page_says_how_many_answers_are_right_and_has_no_figure_of_zeros_or_of
     two = [({**t, "size": s}, r) for s in (0.25, 0.5) for t, r in single]
     found, figures = ran([*two, *nothing], "two")
     assert figures == {"confusion.png"}
-    assert (
-        f"{n} of {n} with one effect, size 0.25, 12 trips; {n} of {n} with one effect, size 0.5, 12 trips" in found[0]
-    )
-    assert f"{quiet} of {quiet} with nothing planted" in found[0]
+    for size in (0.25, 0.5):
+        assert f"{n} of {n} logs with one effect, size {size:g}, 12 trips" in found[0]
+    assert f"{quiet} of {quiet} logs with nothing planted" in found[0]
     one_false = [*nothing[1:], (nothing[0][0], result(["headwind"]))]
     found, figures = ran([*two, *(({**t, "size": 1.0}, r) for t, r in single), *one_false], "three")
     assert figures == {"confusion.png", "false_discoveries.png", "power.png"}
-    assert f"{quiet - 1} of {quiet} with nothing planted" in found[0]
+    assert f"{quiet - 1} of {quiet} logs with nothing planted" in found[0]
 
 
 def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):

@@ -71,7 +71,10 @@ def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
     blamed = percent(cell(SIMULATORS, any_change, "instrument or payload falsely named"))
     assert f"right in {percent(cell(SIMULATORS, any_change, 'right'))} % of {n:.0f} logs" in TEXT
     fault = f"(in {blamed} % it is a false instrument fault or payload error)"
-    assert f"A false name is given in {false} % of these logs, partly in logs whose answer is right as well {fault}" in TEXT
+    assert (
+        f"A false name is given in {false} % of these logs, partly in logs whose answer is right as well {fault}"
+        in TEXT
+    )
     winds = cell(SIMULATORS, wind, "n")
     assert f"a headwind is missed in {(1 - cell(SIMULATORS, wind, 'right')) * winds:.0f} of {winds:.0f}" in TEXT
     rivals = [percent(cell(SIMULATORS, name, "false name")) for name in ("LassoCV", "STLSQ (PySINDy)")]
