@@ -170,7 +170,7 @@ def test_coefficients_are_those_of_the_first_seed(run, no_figures):
         "A, tables": {"median": pytest.approx(0.008), "true_median": pytest.approx(0.0055)},
         "A, paper": {"median": pytest.approx(0.0063), "true_median": pytest.approx(0.0055)},
     }
-    assert [float(x["error of the median [%]"]) for x in written(run, "coefficients")] == pytest.approx(
+    assert [float(x["coefficient error [%]"]) for x in written(run, "coefficients")] == pytest.approx(
         [100 * (np.median([0.008 / 0.006, 0.008 / 0.005]) - 1), 15.0], rel=0.01
     )
     with pytest.raises(InputError, match="every training of the networks diverged"):
