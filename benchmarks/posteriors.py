@@ -35,7 +35,7 @@ TABLE = (("road.c_rr", "1", 0.006, 0.0008), ("road.cda_m2", "m²", 5.6, 0.5))
 
 
 class Clock:
-    """Wall and by CPU time of a call."""
+    """Wall and CPU seconds of a call."""
 
     def __init__(self, call: Callable[[], Any]):
         wall, cpu = time.perf_counter(), time.process_time()
@@ -250,12 +250,12 @@ def main(argv: list[str] | None = None) -> int:
     sections = _kept()
     print("\n".join(HEAD), flush=True)
     for name in options.what or WHAT:
-        table = [*HEAD]
+        table, load = [*HEAD], os.getloadavg()[0]
         for row in calls[name]():
             table.append(f"| {' | '.join(row)} |")
             print(table[-1], flush=True)
         made = [f"Made by `python benchmarks/posteriors.py {shlex.join(sys.argv[1:])}`: {cores} cores, float64;",
-                f"load average before the run {os.getloadavg()[0]:.1f}."]  # fmt: skip
+                f"load average before the run {load:.1f}."]  # fmt: skip
         sections[name] = [f"## {name}", "", *made, "", *table, ""]
     if options.write:
         lines = ["# Posteriors: speed", "", INTRO, "", *(line for name in WHAT for line in sections.get(name, []))]

@@ -166,7 +166,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     for task, result in results:
         for k, values in result.items():
             found.setdefault(_setting(task), {}).setdefault(k, []).extend(values)
-    rows, lines, missed, every = [], [], [], []
+    rows, lines, missed = [], [], []
     low, high = config.range_percent
     for name, r in found.items():
         inside = np.array(r["off_0.9"]) <= 1.0
@@ -183,17 +183,15 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         lines.append(line | {f"coverage of totals by {100 * v:g} % interval [%]": share for v, share in levels.items()})
         if not low <= share <= high:
             missed.append(f"{worded(name)}: {share:.1f} % covered, target {low:g} to {high:g}")
-        if not name.startswith("fleet"):
-            every += inside.tolist()
     write_tables(run, "coverage", lines, config.caption)
-    _figure(run, found)
+    _figure(run, found, config)
     shares = {r["name"]: r["ours"]["inside_90"] for r in rows if not r["name"].startswith("fleet")}
     as_long, others = ([v for k, v in shares.items() if ("times as long" in k) == far] for far in (False, True))
     together = ""
     if as_long and others:
         together = (
             f"90 % intervals cover {min(as_long):.1f} to {max(as_long):.1f} % of the totals of new trips as long as "
-            f"the training trips, and {min(others):.0f} to {max(others):.0f} % of much longer or shorter ones"
+            f"the training trips, and {min(others):.0f} to {max(others):.0f} % of longer or shorter ones"
         )
     return {
         "artefact": config.artefact, "data": "synthetic", "synthetic": True, "rows": rows, "better_than_paper": 0,
@@ -203,7 +201,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
 
 
 @styled
-def _figure(run: Run, found: dict[str, dict[str, list[float]]]) -> None:
+def _figure(run: Run, found: dict[str, dict[str, list[float]]], config: Config) -> None:
     """Shares of totals inside 90 % intervals, with what chance allows, beside those of independent rows."""
     fig = figure(7.0, 0.26 * len(found) + 1.2)
     ax = fig.add_subplot(1, 1, 1)
@@ -214,7 +212,7 @@ def _figure(run: Run, found: dict[str, dict[str, list[float]]]) -> None:
             share = float(np.mean(inside))
             ax.errorbar(100 * share, -k, xerr=[[100 * (share - low)], [100 * (high - share)]], fmt="o", color=colour,
                         markersize=4, label=label if k == 0 else None)  # fmt: skip
-    ax.axvspan(87, 93, color=GREY, alpha=0.2, label="target")
+    ax.axvspan(*config.range_percent, color=GREY, alpha=0.2, label="target")
     ax.set_yticks(-np.arange(len(found)), [worded(name) for name in found])
     ax.set_xlabel("totals of new trips inside the 90 % interval [%], with its 95 % interval")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=3, title="Synthetic logs and fleet")

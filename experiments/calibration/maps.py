@@ -128,11 +128,11 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
         "better_than_paper": 0, "of": 0,
         "notes": [
             f"Targets: every fit converges; every cell is within {100 * config.within:g} percentage point on logs with "
-            f"{' and with '.join(config.asked_of)}",
+            f"{' and with '.join(map(_said, config.asked_of))}",
             f"A cell of the map's grid (gear, speed, torque) counts from {config.least_rows} rows; its error is the "
             "mean over its rows of learned minus true efficiency, in percentage points",
-            "The fit knows the mass of each trip, the map's grid and all of the vehicle but its map; on logs of the "
-            "third kind the model also lacks the effects that the fleet hides, and the map absorbs them",
+            "The fit knows the mass of each trip, the map's grid and all of the vehicle but its map; where it "
+            "says so, the model also lacks the effects that the fleet hides, and the map absorbs them",
         ],
         "findings": _findings(config, lines),
     }  # fmt: skip
@@ -147,7 +147,7 @@ def _shown(row: dict[str, Any]) -> dict[str, Any]:
     o = row["ours"]
     return {
         "vehicle and log": _said(row["name"]),
-        "gears": o["gears"], "rows": o["rows"], "cells": o["cells"], "share of cells within 1 point": o["within"],
+        "gears": o["gears"], "rows": o["rows"], "cells": o["cells"], "share of cells within the target": o["within"],
         "median error [points]": o["median_error_percent"], "largest error [points]": o["worst_percent"],
         "power there [kW]": o["worst_at_kw"], "share of nodes in 90 % intervals": o["nodes_in_90"],
         "noise [Wh]": o["noise_wh"], "noise of the slope [mrad]": o["slope_noise_mrad"],

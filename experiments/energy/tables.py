@@ -51,7 +51,7 @@ def tabulate(results: Results, run: Run, config: Any) -> tuple[list[str], list[s
                           f"target {config.service_percent:g}")  # fmt: skip
     found = [
         f"In {len(ledger)} logs the energies by cause and the unexplained rest add up to the measured energy of the "
-        "log and of each trip, to rounding",
+        f"log and of each trip{', to rounding' if off < 1e-6 else f' within {off:.1g} %'}",
         f"90 % intervals cover {whole['inside_90']:.0f} % of the true energies by cause and, in coast-downs, "
         f"{np.mean([x['inside_90'] for x in coasted]):.0f} % of the true forces",
     ]
@@ -158,7 +158,7 @@ def _saved(saved: Results) -> Iterator[Line]:
             between = wilson(sum(inside), len(inside))
             half = [100.0 * (high - low) / 2.0 for _, (_, low, high) in mine]
             yield {
-                "name": f"saving, {planted}, {trips} trips", "n": len(mine), "logs with a saving detected": shown,
+                "name": f"saving, {planted}, {trips} trips", "n": len(mine), DETECTED: shown,
                 "median_half_interval_percent": float(np.median(half)),
                 "inside_90": 100.0 * float(np.mean(inside)), "interval_95": [100.0 * x for x in between],
                 "planted": what == "planted", "trips": trips,

@@ -89,10 +89,10 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     said = f"{total['with_alarm']} of {total['vehicle_months']} have an alarm, target {config.at_most:.0%}"
     missed = [said] if total["with_alarm"] > config.at_most * total["vehicle_months"] else []  # a noise has too few
     many = total["vehicle_months"] // total["drives"]
-    shared = f"as if they were independent: {many} vehicles share each of {total['drives']} drives and differ in noise"
+    shared = f"but {many} vehicles share each of {total['drives']} drives and differ only in noise"
     had = f"False alarms: {total['with_alarm']} in {total['vehicle_months']} vehicle-months"
-    findings = [f"{had} of {total['km_a_month']:.0f} km have a false alarm (95 % interval "
-                f"{total['interval_95']}, {shared})"]  # fmt: skip
+    how_sure = f"95 % interval {total['interval_95']} if they were independent; {shared}"
+    findings = [f"{had} of {total['km_a_month']:.0f} km ({how_sure})"]
     rows = [{"name": x["name"], "paper": None, "ours": x} for x in (*lines, total)]
     return {"artefact": config.artefact, "data": "synthetic logs", "synthetic": True, "rows": rows,
             "better_than_paper": 0, "of": 0, "missed": missed, "findings": findings}  # fmt: skip

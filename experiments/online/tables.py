@@ -8,6 +8,7 @@ from scipy import stats
 
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import wilson, worded, write_tables
+from hdev_jax.errors import InputError
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, figure, tidy
 from hdev_jax.rundir import Run
 
@@ -42,13 +43,17 @@ def tabulate(
     _figure(run, [*laps, *forecasts], shares, alarms)
     low, high = held
     missed = []
+    if unknown := within_percent.keys() - {line["name"] for line in (*rests, *estimates)}:
+        raise InputError(f"config, key within_percent: {', '.join(sorted(unknown))} is no line of the tables")
     for line in (*rests, *estimates):
         if not low <= line["inside_90"] <= high:
             missed.append(f"{worded(line['name'])}: 90 % intervals cover {line['inside_90']:.0f} %, target {low:g} to "
                           f"{high:g}")  # fmt: skip
         most = within_percent.get(line["name"])
         if most is not None and (line["median_error_percent"] or 0.0) > most:
-            missed.append(f"{line['name']}: {line['median_error_percent']:.2g} % in the median, target {most:g}")
+            missed.append(
+                f"{worded(line['name'])}: {line['median_error_percent']:.2g} % in the median, target {most:g}"
+            )
     for line in alarms:
         late = line["batch_logs"] - line["within_twice"]
         if late:

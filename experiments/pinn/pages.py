@@ -39,7 +39,7 @@ HELD = ("the inputs include the energy of the calibrated kernel and the efficien
         "models with 'log columns only' are without physics")  # fmt: skip
 GIVEN = "'ours' and the linear fits know which effects the fleet hides"
 DIAGNOSED = "models 'as diagnosed' have the effects that the diagnosis of training routes names"
-RATIO = "coefficient error: median ratio of predicted to true value, minus one; drag by spray counts as air drag"
+RATIO = "coefficient error: size of the median ratio of predicted to true value, minus one; spray counts as air drag"
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
 NAMEABLE = {
@@ -234,10 +234,11 @@ def _quantiles(results: Results) -> dict[str, dict[str, Any]]:
 
 def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
     """Error by the amount of training data: a learning curve of each model, with the spread over seeds."""
-    lines, curves = [], {}
+    lines, curves, routes = [], {}, {}
     for share in sorted({t["data"]["share"] for t, _ in results}):
         part = [(t, r) for t, r in results if t["data"]["share"] == share]
         counts = next((r["counts"] for _, r in part if "counts" in r), None)
+        routes |= {share: counts["routes"]} if counts and counts["routes"] else {}
         gathered = gathered_scores(part)
         if any(use == TAUGHT for _, use in curves) and not any(use == TAUGHT for _, use in gathered):
             # by now every vehicle has training routes
@@ -251,7 +252,6 @@ def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
                           "training rows": counts and counts["training"],
                           "n": found[0]["rows"], "seeds": len(seeds)})  # fmt: skip
     write_tables(run, "shares", lines, config.caption)
-    routes = {x["share [%]"] / 100.0: x["training routes"] for x in lines if x["training routes"]}
     learning_curves(run, curves, routes)
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "better_than_paper": 0, "of": 0,

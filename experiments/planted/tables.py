@@ -13,7 +13,7 @@ from experiments.planted.rivals_table import rival_rows
 from experiments.planted.scores import Group
 from experiments.planted.sizes import CAPTION as SIZED
 from experiments.planted.sizes import NEAR_ORACLE, sized_rows
-from experiments.runner.tables import wilson, write_tables
+from experiments.runner.tables import wilson, worded, write_tables
 from hdev_jax.report.names import verbose_join
 from hdev_jax.rundir import Run
 
@@ -125,7 +125,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     power_figure(run, on_road, config.rivals)
     false_figure(run, [(t, r) for t, r in able if not t["effects"]], config.rivals)
     confusion_figure(run, [(t, r) for t, r in able if t["effects"]])
-    missed = [f"{r['name']} ({_short_of(r)})" for r in (*rows, *apart, *sized) if r["met"] is False]
+    missed = [f"{worded(r['name'])} ({_short_of(r)})" for r in (*rows, *apart, *sized) if r["met"] is False]
     return {
         "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "logs": len(done),
         "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k not in ("name", "paper")}}

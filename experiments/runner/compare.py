@@ -98,7 +98,11 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
         n = len(metrics["skipped"])
         said.append(f"{n} {'log' if n == 1 else 'logs'} could not be simulated as configured.")
     if metrics["of"] == 1:
-        said.append("As good as the paper, or better." if metrics["better_than_paper"] else "Not as good as the paper.")
+        said.append(
+            "Ours is at least as good as the paper."
+            if metrics["better_than_paper"]
+            else "Ours is not as good as the paper."
+        )
     elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += _sentences(metrics.get("findings", []))

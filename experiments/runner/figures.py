@@ -32,7 +32,7 @@ def save_figure(run: Run, fig: Any, name: str) -> None:
 def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
     """The deciding error of each model over the paper's, as PNG; None where fewer than `LEAST_COMPARED` have both.
 
-    **Arguments:** `rows`: `of, name, quantity, paper, ours` (`compare.headlines`) and, over all random starts of a
+    **Arguments:** `rows`: `part, name, quantity, paper, ours` (`compare.headlines`) and, over all random starts of a
     fit, `range over starts`. Accuracies, of which more is better, are left out.
     """
     models: dict[tuple[Any, ...], list[str]] = {}
@@ -40,7 +40,7 @@ def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
     for x in rows:
         if x["paper"] and x["ours"] and "accuracy" not in x["quantity"]:
             key = (x["name"], x["quantity"], x["paper"], x["ours"])
-            models.setdefault(key, []).append(x["of"])
+            models.setdefault(key, []).append(x["part"])
             spread[key] = x.get("range over starts")
     if len(models) < LEAST_COMPARED:
         return None

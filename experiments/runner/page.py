@@ -148,11 +148,11 @@ def write_list_docs(
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
         lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
-        first = [{"of": _heading(stem), **x} for stem, m in every for x in headlines(m)]
+        first = [{"part": _heading(stem), **x} for stem, m in every for x in headlines(m)]
         with_paper = [x for x in first if x["paper"] is not None]
         alone = [x for x in first if x["paper"] is None]
         measured = {_heading(stem) for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
-        lines += _against([x for x in with_paper if x["of"] in measured], docs, home.name)
+        lines += _against([x for x in with_paper if x["part"] in measured], docs, home.name)
         if with_paper:
             lines += [*_open(_decides(with_paper)), ""]
         if alone:
@@ -163,7 +163,7 @@ def write_list_docs(
             for k, folder in enumerate(folders):
                 before = f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"
                 lines += [*_lines(folder, path, docs, home.name, before, most_rows=MOST_ROWS), ""]
-        if against := [{"of": _heading(stem), **x} for stem, m in every for x in comparison(m)]:
+        if against := [{"part": _heading(stem), **x} for stem, m in every for x in comparison(m)]:
             every_number = markdown(cells(against, 4), "Every number of the paper").rstrip()
             lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number), ""]
         lines += [_by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs")]

@@ -98,7 +98,7 @@ def _blame(came: Outcomes, path: Path, error: Exception, log: Log) -> None:
 def against(came: Outcomes) -> list[dict[str, Any]]:
     """A line for each number of the papers: config, name, quantity, paper, ours, ratio, why there is none."""
     pairs = [(path, run) for path, every in came.made.items() for run in every]
-    return [{"of": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
+    return [{"part": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
 
 
 def _title(path: Path, run: Mapping[str, Any]) -> str:
@@ -129,7 +129,7 @@ def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
         for path, runs in came.made.items() for run in runs
     ]  # fmt: skip
     lines, every = against(came), [(path, run) for path, runs in came.made.items() for run in runs]
-    first = [{"of": _title(path, run), **line} for path, run in every for line in headlines(run)]
+    first = [{"part": _title(path, run), **line} for path, run in every for line in headlines(run)]
     tables = [("Runs", cells(rows))] if rows else []
     tables += [(decides(first), cells(first, 4))] if first else []
     tables += [("Paper against ours", cells(lines, 4))] if lines else []

@@ -16,6 +16,8 @@ _TEX = {
     "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--", "−": "$-$", "±": r"$\pm$", "µ": r"$\mu$",
     "²": "$^2$", "³": "$^3$", "·": r"$\cdot$", "×": r"$\times$", "°": r"$^\circ$", "η": r"$\eta$", "λ": r"$\lambda$",
+    "χ": r"$\chi$",
+    "₁": "$_1$", "₂": "$_2$", "₃": "$_3$",
 }  # fmt: skip
 
 
@@ -47,7 +49,7 @@ _WORDS = {
     "step_worst_energy_percent": "energy error one step ahead, worst trip [%]",
     "network without physics": "network, physics as input only", "LightGBM, no kernel": "LightGBM, log columns only",
     "network, no kernel": "network, log columns only",
-    "duration_min": "duration [min]", "of": "table or figure", "why_not": "why no value",
+    "duration_min": "duration [min]", "part": "part of the paper or study", "why_not": "why no value",
 }  # fmt: skip
 NOISES = {  # of the generator, in words
     "white": "white", "ar1": "AR(1)", "ar1_white": "AR(1) + white", "trip_levels": "random intercepts of trips",
@@ -140,6 +142,5 @@ def _cell(x: Any, digits: int) -> str:
 
 def _plain(x: float, digits: int) -> str:
     """Without an exponent up to a billion."""
-    if 10.0**digits <= abs(x) < 1e9:
-        return f"{float(f'{x:.{digits}g}'):,.0f}"
-    return f"{x:.{digits}g}"
+    rounded = float(f"{x:.{digits}g}")
+    return f"{rounded:,.0f}" if 10.0**digits <= abs(rounded) < 1e9 else f"{x:.{digits}g}"

@@ -131,7 +131,7 @@ class Settings:
     )  # fmt: skip
     load_s: float = _number(
         60.0,
-        "shortest time on, and off, in a trip or at standstill, for an estimate of the power there",
+        "shortest time on, and off, in a trip, at standstill or in motion, for its power there",
         "s",
         "a minute",
     )

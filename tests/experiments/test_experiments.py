@@ -272,7 +272,7 @@ def test_many_tasks_on_two_workers_are_all_kept(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch, library):
-    for effect in library.keys() - {*FEW}:
+    for effect in library.keys() - {*FEW}:  # the whole library is tried by tests of the diagnosis
         del library[effect]
 
     def once(out: str) -> dict:

@@ -53,7 +53,7 @@ def test_the_page_in_docs_is_as_the_settings_are():
     for s in described():
         name, default, half, double, unit, meaning, source = shown[s["name"]]
         assert name.endswith(f"`{s['name']}`")
-        assert (default, unit) == (f"{s['default']:g}", s["unit"].replace("1", "–"))
+        assert (default, unit) == (f"{s['default']:g}", "–" if s["unit"] == "1" else s["unit"])
         assert meaning.replace("\\|", "|") == s["meaning"]
         assert source.removesuffix(" |") == s["source"]
         ways = changed(s["default"], s["unit"])

@@ -123,7 +123,7 @@ def test_a_run_that_was_killed_goes_on_and_gives_the_same(logs, whole, monkeypat
 
     def stops(work, tasks, where):
         for i, record in computed(work, tasks, where):
-            if len(seen) == 1:
+            if "V0" in seen:
                 raise KeyboardInterrupt
             seen.append(tasks[i]["name"])
             yield i, record
