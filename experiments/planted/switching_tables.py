@@ -261,7 +261,7 @@ def _beside_sentence(rows: Sequence[dict[str, Any]]) -> list[str]:
         return []
     a, b = (round(sum(r["n"] * r[k] for r in rows)) for k in ("effect named, with the load", "effect named, without"))
     n = sum(r["n"] for r in rows)
-    return [f"With a load added, that effect is named in {a} of {n} logs, without the load in {b} of them"]
+    return [f"That other effect is named in {b} of {n} logs without a load, and in {a} of {n} once a load is added"]
 
 
 @styled
