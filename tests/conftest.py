@@ -1,7 +1,9 @@
 """Every test runs with float64, without silent rank promotion, and with the shapes in annotations checked."""
 
+import functools
 import gc
 import io
+import itertools
 import os
 import tempfile
 from functools import cache
@@ -44,21 +46,18 @@ def _put(self: lru_cache.LRUCache, key: str, value: bytes) -> None:
 
 lru_cache.LRUCache.put = _put  # type: ignore[method-assign]
 
-_CONTEXTS: list[Any] = []
+_programs = itertools.count()
 _make_context = mlir.make_ir_context
 
 
-def _context() -> Any:
-    """One context for many programs: a new one, as JAX takes, costs as much as all else of lowering a small program.
-    What a context has interned stays, so now and then there is another."""
-    if not _CONTEXTS or len(_CONTEXTS) > 50:
-        _CONTEXTS[:] = [_make_context()]
-    else:
-        _CONTEXTS.append(_CONTEXTS[0])
-    return _CONTEXTS[0]
+@functools.lru_cache(maxsize=1)
+def _context(_block: int) -> Any:
+    """One context for fifty programs: a new one, as JAX takes, costs as much as all else of lowering a small program.
+    What a context has interned stays, so it is not kept for all."""
+    return _make_context()
 
 
-mlir.make_ir_context = _context
+mlir.make_ir_context = lambda: _context(next(_programs) // 50)
 
 
 def _with_shapes() -> list[str]:

@@ -1,5 +1,6 @@
 """Figures of the planted study: power against size, false discoveries against noise, confusion between causes."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import Any
@@ -11,7 +12,7 @@ from experiments.planted.rivals import comparable
 from experiments.planted.rivals_table import LABELS, outcome
 from experiments.planted.scores import MOST, PLANTABLE, Group, names
 from experiments.runner.figures import save_figure, styled
-from experiments.runner.tables import wilson
+from experiments.runner.tables import wilson, worded
 from hdev_jax.physics import LIBRARY
 from hdev_jax.report import names as named
 from hdev_jax.report.canvas import figure, tidy
@@ -26,8 +27,6 @@ COLOURS = {
     "lasso_cv": "#3d8a5f",
     "forward_bic": "#8a3d6f",
 }
-NOISES = {"white": "white", "ar1": "AR(1)", "ar1_white": "AR(1)\n+ white", "trip_levels": "random\nintercepts",
-          "student_t": "Student's t", "trip_variance": "variance\nby trip"}  # fmt: skip
 LEAST_SIZES = 3  # of a curve
 LEVEL = 5.0  # per cent of logs with nothing planted that may be given a name
 
@@ -105,7 +104,7 @@ def false_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
             axes.vlines(x, 100 * low, 100 * high, color="#333", lw=1)
             highest = max(highest, 102 * high)
     axes.axhline(LEVEL, color="#333", lw=0.8, ls=":", label=f"target: at most {LEVEL:g} %")
-    axes.set_xticks(range(len(noises)), [NOISES[n] for n in noises], fontsize=8)
+    axes.set_xticks(range(len(noises)), [textwrap.fill(worded(n), 12) for n in noises], fontsize=8)
     axes.set(ylabel="something named [%]", ylim=(0, highest), title="Synthetic logs with nothing missing")
     tidy(axes)
     fig.legend(fontsize=7, loc="outside right center")

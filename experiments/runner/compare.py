@@ -90,7 +90,6 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if "logs" in metrics:
         n, kind = metrics["logs"], "synthetic" if metrics["synthetic"] else "measured"
         said.append(f"{n} {kind} {'log' if n == 1 else 'logs'}.")
-
     if metrics["tasks_left_out"]:
         n = metrics["tasks_left_out"]
         said.append(f"Not run: {n} more {'task' if n == 1 else 'tasks'} of the config.")
@@ -98,11 +97,7 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
         n = len(metrics["skipped"])
         said.append(f"{n} {'log' if n == 1 else 'logs'} could not be simulated as configured.")
     if metrics["of"] == 1:
-        said.append(
-            "Ours is at least as good as the paper."
-            if metrics["better_than_paper"]
-            else "Ours is not as good as the paper."
-        )
+        said.append(f"Ours is {'at least' if metrics['better_than_paper'] else 'not'} as good as the paper.")
     elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += _sentences(metrics.get("findings", []))
