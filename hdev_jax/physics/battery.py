@@ -226,7 +226,7 @@ class StepChange(Effect):
     equation: ClassVar[str] = "[trip ≥ k]·(ΔP + Δc·m·g·v + Δg·|P|)"
     source: ClassVar[str] = "ageing, a service event, a fault"
     parameters: ClassVar[Parameters] = (
-        Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
+        Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=100.0),
         Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
         Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
         Choice("at_trip", "1", 0.0, 1.0, grid=()),  # every trip with three of the same vehicle on either side
@@ -260,7 +260,7 @@ class ModeChange(Effect):
     equation: ClassVar[str] = "z·(ΔP + Δc·m·g·v + Δg·|P| + Δr·max(−P, 0)), z of each trip 0 or 1"
     source: ClassVar[str] = "limp mode, weak regeneration, a second driver's setting"
     parameters: ClassVar[Parameters] = (
-        Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=10.0),
+        Size("power_w", "W", 0.0, 1000.0, -6e4, 6e4, least=100.0),
         Size("c_rr", "1", 0.0, 1e-3, -0.02, 0.02, least=2e-5),
         Size("loss", "1", 0.0, 0.05, -0.5, 0.5, least=0.002),
         Size("regeneration", "1", 0.0, 0.1, -0.9, 0.9, least=0.005),

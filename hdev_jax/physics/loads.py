@@ -48,7 +48,7 @@ class AuxiliaryPower(Effect):
     equation: ClassVar[str] = "P₀"
     source: ClassVar[str] = "paper 2, section III-A (loads left out there)"
     # electric heaters of articulated buses have 40 to 60 kW
-    parameters: ClassVar[Parameters] = (Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=5.0, constant=True),)
+    parameters: ClassVar[Parameters] = (Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=50.0, constant=True),)
     mistaken_for: ClassVar[Names] = ("power_gain", "inverter_loss")
     separated_by: ClassVar[str] = "standing still with the vehicle on, and with it off"
     power_w: Any
@@ -135,7 +135,7 @@ class CabinWarmup(Effect):
     equation: ClassVar[str] = "P·exp(−t/t₀)"
     source: ClassVar[str] = "Basma et al., Energy 207 (2020) (cabin transient)"
     parameters: ClassVar[Parameters] = (
-        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=100.0),
         Shape("tau_s", "s", 900.0, 600.0, 60.0, 7200.0, grid=(300.0, 900.0, 2400.0), label="time constant"),
     )
     mistaken_for: ClassVar[Names] = ("tyre_warmup",)
@@ -161,7 +161,7 @@ class PeriodicLoad(Effect):
     equation: ClassVar[str] = "P·[cos 2π(t/T + φ) > cos πD], φ by trip"
     source: ClassVar[str] = "thermostat with hysteresis"
     parameters: ClassVar[Parameters] = (
-        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=10.0),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=100.0),
         Shape("period_s", "s", 900.0, 300.0, 20.0, 7200.0, grid=(600.0, 1200.0, 1500.0)),
         Shape("duty", "1", 0.5, 0.2, 0.05, 0.95, grid=(0.3, 0.5, 0.7)),
         Choice("phase", "1", float("nan"), 0.25, -1.0, 1.0),
@@ -202,7 +202,7 @@ class StandstillLoad(Effect):
     equation: ClassVar[str] = "P·[v < 0.1 m/s]·(1 − d + d·door)"
     source: ClassVar[str] = "PTO, doors and kneeling of city buses"
     parameters: ClassVar[Parameters] = (
-        Size("power_w", "W", 0.0, 1000.0, 0.0, 1e5, least=10.0),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 1e5, least=100.0),
         Choice("by_door", "1", 0.0, 1.0, 0.0, 1.0, grid=(0.0, 1.0)),
     )
     mistaken_for: ClassVar[Names] = ("auxiliary_power", "periodic_load")

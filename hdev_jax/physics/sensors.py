@@ -34,7 +34,7 @@ class MassScale(Effect):
     equation: ClassVar[str] = "m → m·(1 + s)"
     source: ClassVar[str] = "paper 1, section 5 (mass as future work)"
     entries: ClassVar[Names] = ("road",)
-    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.002),)
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.1, -0.6, 1.5, least=0.005),)
     mistaken_for: ClassVar[Names] = ("rotating_mass",)
     separated_by: ClassVar[str] = "the same road empty and loaded"
     scale: Any
@@ -75,7 +75,7 @@ class GradeScale(Effect):
     needs: ClassVar[Names] = ("grade_rad",)
     entries: ClassVar[Names] = ("road",)
     # a slope whose noise counts as slope is attenuated to half; a percentage taken for degrees is another matter
-    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.1, -0.6, 1.0, least=0.002),)
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.1, -0.6, 1.0, least=0.01),)
     mistaken_for: ClassVar[Names] = ("mass_scale", "grade_lag", "grade_noise")
     separated_by: ClassVar[str] = "accelerating on the flat, and the same hills again"
     order: ClassVar[int] = -1  # before an offset
@@ -144,7 +144,7 @@ class SpeedScale(Effect):
     equation: ClassVar[str] = "v → v·(1 + s), d → d·(1 + s)"
     source: ClassVar[str] = "wear and pressure of tyres"
     entries: ClassVar[Names] = ("road",)
-    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.003),)
     mistaken_for: ClassVar[Names] = ("mass_scale", "rotating_mass")
     separated_by: ClassVar[str] = "a position by satellite"
     scale: Any
@@ -191,8 +191,8 @@ class TorqueOffset(Effect):
     needs: ClassVar[Names] = ("motor_torque_nm",)
     entries: ClassVar[Names] = ("shaft",)
     parameters: ClassVar[Parameters] = (
-        Size("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.02),
-        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
+        Size("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.5),
+        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.005),
     )
     variants: ClassVar[tuple[Names, ...]] = (("offset_nm",), ("gain",), ("offset_nm", "gain"))
     mistaken_for: ClassVar[Names] = ("iron_loss", "driveline_drag")
@@ -205,7 +205,10 @@ class TorqueOffset(Effect):
 
 
 class PowerGain(Effect):
-    """The power sensor has a gain and an offset: P·(1 + g) + P₀."""
+    """The power sensor has a gain and an offset: P·(1 + g) + P₀.
+
+    A diagnosis calls an offset above 0 a constant load, `auxiliary_power`: rows of power cannot tell the two apart.
+    """
 
     id: ClassVar[str] = "power_gain"
     label: ClassVar[str] = "offset or gain of the power signal"
@@ -215,8 +218,8 @@ class PowerGain(Effect):
     source: ClassVar[str] = "current sensor"
     of_battery: ClassVar[bool] = True
     parameters: ClassVar[Parameters] = (
-        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),
-        Size("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=5.0, constant=True),
+        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.005),
+        Size("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=50.0, constant=True),
     )
     # an offset alone is auxiliary_power by another name
     variants: ClassVar[tuple[Names, ...]] = (("gain",), ("gain", "offset_w"))

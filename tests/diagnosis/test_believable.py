@@ -15,7 +15,7 @@ from planted import SHORT, declared, diagnosed, found_in_turn, named, opened, tr
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.compete import no_instrument_named
-from hdev_jax.diagnosis.competition.needed import without_idle_switches
+from hdev_jax.diagnosis.competition.needed import backward, without_idle_switches
 from hdev_jax.diagnosis.competition.state import Found
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.gates.rejection import Kind
@@ -79,6 +79,39 @@ def test_payload_is_named_before_a_gain_where_regeneration_would_beat_driving():
     result = diagnosed(changed(problem, MassScale(0.1)), split, only(*DRIVE))
     (e,) = result.summary["effects"]
     assert e["id"] == "mass_scale"
+
+
+def test_a_constant_load_beside_a_gain_is_a_load_and_an_offset_below_zero_is_the_instruments():
+    problem, split = nothing()
+    reads = LIBRARY["power_gain"]
+    gain = {k: v for k, v in only(*DRIVE).items() if k != "regen_efficiency"}
+    result = diagnosed(changed(problem, reads(-0.06, 4000.0)), split, gain)
+    effects = {e["id"]: e["parameters"] for e in result.summary["effects"]}
+    assert effects["auxiliary_power"]["power_w"]["value"] == pytest.approx(4000.0, abs=400.0)
+    assert all("offset_w" not in parameters for parameters in effects.values())
+    result = diagnosed(changed(problem, reads(-0.06, -4000.0)), split, gain)
+    effects = {e["id"]: e["parameters"] for e in result.summary["effects"]}
+    assert effects["power_gain"]["offset_w"]["value"] == pytest.approx(-4000.0, abs=400.0)
+
+
+@pytest.mark.parametrize(("watts", "names"), [(60.0, []), (140.0, ["standstill_load"])])
+def test_what_is_too_small_to_matter_is_not_named_however_significant(watts, names):
+    problem, split = nothing()
+    problem = changed(without_noise(without_noise(problem)), LIBRARY["standstill_load"](watts, 0.0))
+    assert named(diagnosed(problem, split, only("standstill_load"))) == names
+
+
+def test_what_has_become_too_small_beside_others_goes():
+    problem, _ = nothing()
+    start = without_noise(without_noise(problem))
+    state = found_in_turn(training(changed(start, MassScale(0.02)), ["mass_scale"]), start, ["mass_scale"])
+    assert state.ids == ("mass_scale",)
+    assert backward(training(changed(start, MassScale(0.02)), ["mass_scale"]), state, newest=True).ids == ("mass_scale",)
+    smaller = training(changed(start, MassScale(0.003)), ["mass_scale"])
+    now = replace(state, fit=smaller.calibrate(state.fit.vehicle, state.fit.table))
+    kept = backward(smaller, now, newest=True)
+    assert kept.ids == ()
+    assert kept.removed["mass_scale"].kind is Kind.SUPERFLUOUS
 
 
 def test_an_efficiency_by_load_and_direction_blames_no_instrument():

@@ -156,16 +156,23 @@ def without_far(training: Training, state: State, declared: Calibration) -> Stat
 
 
 def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
-    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is not confirmed by
-    cross-validation there, or is one of a class with one of them. The newest (not `old`) has been tested already but
-    for the last."""
+    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is too small to be worth
+    naming, is not confirmed by cross-validation there, or is one of a class with one of them. The newest (not `old`)
+    has been tested already but for the last."""
     if any(_doubles(evidence, state, f, g, settings) for g in state.found if g is not f):
         return 1.0
     if not old:
         return 0.0
     own = needed(evidence, state.fit, f)
-    stands = own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate)
+    stands = own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate) and _worth_naming(state.fit, f)
     return own.p if stands else 1.0
+
+
+def _worth_naming(fit: Calibration, f: Found) -> bool:
+    """Whether a size of a found effect is still as large as the smallest that is worth naming."""
+    c, at = f.score.candidate, _places(fit, f)
+    each = [(c.parameter(fit.table.free[k].path.rpartition(".")[2]), float(fit.values[k])) for k in at]
+    return any(abs(v - p.null) >= p.least for p, v in each)
 
 
 def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Settings) -> bool:

@@ -309,6 +309,8 @@ def in_range(fit: Calibration, candidate: Candidate, slack: float = 0.0) -> bool
     for c, v, sd in zip(fit.table.free, fit.values, fit.errors, strict=True):
         if c.path.startswith(prefix):
             p = candidate.parameter(c.path.removeprefix(prefix))
+            if candidate.is_load({p.name: v - slack * sd}):
+                return False
             if p.has_column and not p.lower - slack * sd <= v <= p.upper + slack * sd:
                 return False
             width, edges = p.upper - p.lower, [e for e in (p.lower, p.upper) if e != p.null]

@@ -51,7 +51,7 @@ SENTENCES = {
     Kind.NO_EFFECT: "no effect on this log",
     Kind.ABSORBED: "absorbed: this log cannot distinguish it from {by}",
     Kind.TOO_FEW_CLUSTERS: "not decidable: at least {least} {unit} are needed for training, there are {there}",
-    Kind.IMPLAUSIBLE: "its best estimate has the wrong sign or is out of range",
+    Kind.IMPLAUSIBLE: "its best estimate has the wrong sign, is out of range or is too small to matter",
     Kind.NOT_CONFIRMED: "not confirmed by cross-validation: does not lower the error on {unit} left out of the fit",
     Kind.NOT_SIGNIFICANT: "not significant over the whole library (FDR-adjusted p = {q:.2g})",
     Kind.CONTRADICTED: (

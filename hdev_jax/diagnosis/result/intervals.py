@@ -145,7 +145,7 @@ def _other_open(training: Training, state: State, s: Score, other: str, reported
 
     def possible(x: float) -> bool:
         values = {other: x, **dict(zip(c.sizes, found + per_unit * x, strict=True))}
-        return plausible(replace(s, candidate=both, beta=np.array([values[n] for n in both.sizes])), training.settings)
+        return not c.effect.implausible({n: c.parameter(n).null + v for n, v in values.items()})
 
     low, high = np.clip(beta + error * np.array([-REACH, REACH]), p.lower - p.null, p.upper - p.null)
     at = np.array([x for x in np.linspace(low, high, POINTS) if possible(float(x))])

@@ -38,7 +38,8 @@ LEADING = 6  # ways to have an effect that are tested in full
 
 
 def plausible(s: Score, settings: Settings) -> bool:
-    """Signs, ranges, least sizes, limits in order; a switch has to make about the whole of its difference."""
+    """Signs, ranges, least sizes, limits in order; a switch has to make about the whole of its difference, and an
+    instrument's offset is not a load."""
     c = s.candidate
     shapes = dict(c.shapes)
     if c.kind == "limit":
@@ -48,6 +49,8 @@ def plausible(s: Score, settings: Settings) -> bool:
         return bool(least <= s.beta[0] <= 1.0 / settings.switch_low and size >= first.least)
     each = [(c.parameter(n), b) for n, b in zip(c.sizes, s.beta, strict=True)]
     enough = any if None not in c.groups else all  # a gear may have nothing; a gain of 0 beside an offset is a load
+    if c.is_load(dict(zip(c.sizes, s.beta, strict=True))):
+        return False
     return all(p.lower <= p.null + b <= p.upper for p, b in each) and enough(abs(b) >= p.least for p, b in each)
 
 
