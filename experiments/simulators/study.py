@@ -23,7 +23,7 @@ from experiments.simulators.tables import collect
 from experiments.simulators.truth import make
 from experiments.simulators.vehicles import Vehicle
 from hdev_jax.diagnosis.diagnose import Outcome, diagnose
-from hdev_jax.diagnosis.settings import Settings
+from hdev_jax.diagnosis.settings import SETTINGS, Settings
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import by_distance, read_log
 from hdev_jax.physics import LIBRARY
@@ -78,6 +78,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         "signature": summary["unexplained"]["signature"],
         "missing": _missing(summary),
         "coefficients": _coefficients(outcome),
+        "reasons": _reasons(summary),
         "two_efficiencies": task["measured"] != "none",
         **_truths(task, made, true, outcome),
         "test_rmse": {k: summary[k]["test"]["rmse"] for k in ("before", "after")},
@@ -102,6 +103,12 @@ def _read(rows: str, frame: pd.DataFrame, sheet: str) -> tuple[Problem, Split]:
 def _missing(summary: Mapping[str, Any]) -> list[str]:
     """Channels that the diagnosis says the log lacks."""
     return [str(k) for k in summary.get("missing_channels", ())]
+
+
+def _reasons(summary: Mapping[str, Any]) -> list[str]:
+    """Effects that the report gives as reasons of declared coefficients that are far from the sheet's values."""
+    moved = summary["baseline"]["parameters"].values()
+    return sorted({k for p in moved if abs(p.get("prior_z", 0.0)) > SETTINGS.far for k in p["absorbs"]})
 
 
 def _coefficients(outcome: Outcome) -> dict[str, dict[str, float]]:

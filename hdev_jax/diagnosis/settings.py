@@ -81,10 +81,12 @@ class Settings:
     )
 
     # is X still needed beside Y
+    stays: float = _number(
+        0.01, "largest p-value at which an effect stays beside those added later", "1", "Wald test, 1 %"
+    )
     wald: float = _number(
-        0.05, "largest p-value at which an effect is needed beside those added later, or another of its class", "1",
-        "Wald test, 5 %",
-    )  # fmt: skip
+        0.05, "largest p-value at which an effect is needed beside another of its class", "1", "Wald test, 5 %"
+    )
     class_share: float = _number(
         0.8, "least share of an effect's gain that another of its class reaches", "1", "chosen on seeds 1-99"
     )

@@ -118,7 +118,9 @@ class RegenEfficiency(Effect):
     equation: ClassVar[str] = "s·max(−P, 0)"
     source: ClassVar[str] = "paper 2, eq. 7-9 (η_rg)"
     parameters: ClassVar[Parameters] = (Size("share", "1", 0.0, 0.1, -0.05, 1.0, least=0.005),)
-    mistaken_for: ClassVar[Names] = ("friction_blending", "mass_scale", "power_gain", "mode_change")
+    mistaken_for: ClassVar[Names] = (
+        "friction_blending", "mass_scale", "power_gain", "speed_scale", "regen_limit", "mode_change"
+    )  # fmt: skip
     separated_by: ClassVar[str] = "coasting and braking on the flat, and the balance of charge"
     order: ClassVar[int] = 25
     share: Any

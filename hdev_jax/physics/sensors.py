@@ -144,7 +144,8 @@ class SpeedScale(Effect):
     equation: ClassVar[str] = "v → v·(1 + s), d → d·(1 + s)"
     source: ClassVar[str] = "wear and pressure of tyres"
     entries: ClassVar[Names] = ("road",)
-    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.003),)
+    # a speedometer may show 10 % too much (UN Regulation 39); pressure and load change a tyre's radius by 0.3 %
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.1, 0.1, least=0.003),)
     mistaken_for: ClassVar[Names] = ("mass_scale", "rotating_mass")
     separated_by: ClassVar[str] = "a position by satellite"
     scale: Any
@@ -218,7 +219,8 @@ class PowerGain(Effect):
     source: ClassVar[str] = "current sensor"
     of_battery: ClassVar[bool] = True
     parameters: ClassVar[Parameters] = (
-        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.005),
+        # electric meters are within 2 % (EN 50470, classes A and B), a current sensor in a vehicle within 5 %
+        Size("gain", "1", 0.0, 0.03, -0.1, 0.1, least=0.005),
         Size("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=50.0, constant=True),
     )
     # an offset alone is auxiliary_power by another name

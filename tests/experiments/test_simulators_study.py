@@ -15,7 +15,7 @@ from experiments.simulators.logs import simulated_log
 from experiments.simulators.plants import PLANTS
 from experiments.simulators.refit import known_sheet
 from experiments.simulators.study import tasks
-from experiments.simulators.tables import change_row, confusion, rival_rows
+from experiments.simulators.tables import change_row, confusion, headwind_note, rival_rows
 from experiments.simulators.truth import SIMULATORS, make
 from experiments.simulators.vehicles import GRAVITY_MPS2, Simulated, Vehicle, drawn, slope_with_force
 from hdev_jax.inference.sheet import read_sheet
@@ -36,7 +36,7 @@ def entry(*names: str, size: int = 0, **parameters: tuple[float, float]) -> dict
 def result(*named: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A log's result that says no more than it is given."""
     return {
-        "named": list(named), "unexplained": False, "missing": [], "two_efficiencies": False, "coefficients": {},
+        "named": list(named), "unexplained": False, "missing": [], "two_efficiencies": False, "coefficients": {}, "reasons": [],
         "truth": {"road.c_rr": 0.012}, "recovered": 0.4, "recovers": 0.8, "rivals": {},
         "test_rmse": {"before": 2.0, "after": 1.0}, "refit_rmse": 1.0, "seconds": 1.0, **more,
     }  # fmt: skip
@@ -142,6 +142,14 @@ def test_the_confusion_shows_what_was_named_instead():
     shown = {(r, c): share[i, k] for i, r in enumerate(rows) for k, c in enumerate(columns)}
     assert shown["nothing (2)", "nothing"] == shown["nothing (2)", "power_gain"] == 50.0
     assert shown["mass +10 % (2)", "mass_scale"] == shown["c_rr +20 % (1)", "road.c_rr"] == 100.0
+
+
+def test_a_headwind_as_the_reason_of_a_coefficient_is_said_and_does_not_count():
+    moved = result(reasons=["constant_headwind", "rolling_linear"])
+    (note,) = headwind_note([(task("headwind"), moved), (task("headwind"), result()), (task("payload"), moved)])
+    assert "In 1 of 2 logs" in note
+    assert not scores.right(task("headwind"), moved)
+    assert headwind_note([(task("payload"), moved)]) == []
 
 
 def test_rivals_are_scored_by_the_same_rule():

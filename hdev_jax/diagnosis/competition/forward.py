@@ -78,8 +78,8 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
 def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:
     """The leader, or the simplest of those that these rows cannot distinguish from it; and the ids of the class.
 
-    Where one efficiency is declared for all of it, and the leader is a gain or a mass that a wrong efficiency looks
-    like, the efficiency that does about as well takes its place; or the mass that of a gain.
+    Where one efficiency is declared for all of it, and the leader is a gain, a mass or a limit that a wrong efficiency
+    looks like, the efficiency that does about as well takes its place; or the mass that of a gain.
     """
 
     def asks(s: Score) -> tuple[int, int]:
@@ -93,12 +93,13 @@ def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:
     first = min((s for s in able if s.candidate.id in same), key=asks)
     library = round_.training.library.values()
     looks_like = {id_ for c in library if c.of_efficiency for id_ in c.mistaken_for}
-    if not round_.state.fit.vehicle.one_efficiency or first.candidate.id not in looks_like or not asks(first)[0]:
+    if not round_.state.fit.vehicle.one_efficiency or first.candidate.id not in looks_like:
         return first, same
     members = {*of_class(round_.asked(first))}
     instead = [
         s for s in able if s.candidate.id in members
         and (s.candidate.effect.of_efficiency or (s.candidate.id in looks_like and asks(s)[0]))
+        and (asks(first)[0] or s.candidate.freedoms <= first.candidate.freedoms)
     ]  # fmt: skip
     return min((first, *instead), key=prior), same | members
 

@@ -96,7 +96,7 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
         for f in asked:
             p = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
             strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
-            allowed = settings.fdr / _tried(training, state) if strictly else settings.wald
+            allowed = settings.fdr / _tried(training, state) if strictly else settings.stays
             rank = (p / allowed, f.score.candidate.effect.stage == "sensors")
             if p > allowed and (worst is None or rank >= worst[0]):
                 worst = (rank, f)

@@ -197,6 +197,9 @@ def stability(a: Asked) -> float:
         and plausible(s, settings) and _beyond_readings(replace(a, score=s)) is None
     ]  # fmt: skip
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
+    # a form with more numbers (a limit of nothing, with a share) that holds the chosen one is no rival of it
+    wider = [s for s in rivals if s.candidate.freedoms > chosen.candidate.freedoms]
+    names |= {s.candidate.id for s in wider if chosen.candidate.id in of_class(replace(a, score=s))}
     small = [scores.evidence(s).only(s.candidate) for s in rivals]
     hits = 0
     for _ in range(RESAMPLES):
