@@ -150,7 +150,7 @@ def test_what_held_out_trips_contradict_is_not_named():
 
 def test_no_instrument_is_named_while_most_of_what_is_left_is_structure():
     problem, _ = nothing()
-    rows = training(changed(problem, LIBRARY["power_gain"](0.1, 0.0)), ["power_gain"])
+    rows = training(changed(problem, LIBRARY["power_gain"](0.08, 0.0)), ["power_gain"])
     state = found_in_turn(rows, problem, ["power_gain"])
     less = no_instrument_named(rows, state, 0.7)
     assert less.ids == ()

@@ -421,10 +421,11 @@ def test_only_a_group_beyond_a_null_that_bounds_it_goes(problem):
 
 
 @pytest.mark.parametrize(
-    ("sizes", "is_plausible"), [((0.05, 800.0), True), ((0.05, 1e-3), False), ((1e-9, 800.0), False)]
+    ("sizes", "is_plausible"),
+    [((0.05, -800.0), True), ((0.05, -1e-3), False), ((1e-9, -800.0), False), ((0.05, 800.0), False)],
 )
 def test_of_two_sizes_of_one_effect_neither_may_be_nothing(sizes, is_plausible):
-    """A gain of 0 beside an offset is a constant load by another name."""
+    """A gain of 0 beside an offset is an offset alone, and one above 0 is a constant load by another name."""
     c = Candidate(LIBRARY["power_gain"], ("gain", "offset_w"), (None, None), (), "size", (0, 1))
     s = Score(c, np.array(sizes), 50.0, 1e-9, 1e-9, 9.0, 0.5)
     assert plausible(s, SETTINGS) is is_plausible
