@@ -106,9 +106,9 @@ def _missing(summary: Mapping[str, Any]) -> list[str]:
 
 
 def _reasons(summary: Mapping[str, Any]) -> list[str]:
-    """Effects that the report gives as reasons of declared coefficients that are far from the sheet's values."""
+    """Effects that the report gives as reasons of declared coefficients that are far above the sheet's values."""
     moved = summary["baseline"]["parameters"].values()
-    return sorted({k for p in moved if abs(p.get("prior_z", 0.0)) > SETTINGS.far for k in p["absorbs"]})
+    return sorted({k for p in moved if p.get("prior_z", 0.0) > SETTINGS.far for k in p["absorbs"]})
 
 
 def _coefficients(outcome: Outcome) -> dict[str, dict[str, float]]:

@@ -76,14 +76,18 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
 
 def headwind_note(results: Group) -> list[str]:
     """A change that no log can tell from a declared coefficient: how often the report says so."""
-    wind = [r for t, r in results if t["plant"] == "headwind"]
+    names = PLANTS["headwind"].names
+    wind, still = (
+        [bool(names & {*r["reasons"]}) for t, r in results if (t["plant"] == "headwind") is there]
+        for there in (True, False)
+    )
     if not wind:
         return []
-    said = sum(bool(PLANTS["headwind"].names & {*r["reasons"]}) for r in wind)
     return [
         "Wind from the front at all times looks like more drag area. "
-        f"In {said} of {len(wind)} logs with a headwind the report says that a coefficient is far from the sheet's "
-        "value, and that a headwind may be the reason. That is not counted as right"
+        f"In {sum(wind)} of {len(wind)} logs with a headwind the report says that a coefficient is far above the "
+        f"sheet's value and that a headwind may be the reason, as it does in {sum(still)} of the {len(still)} others. "
+        "That is not counted as right"
     ]
 
 

@@ -55,7 +55,7 @@ class Settings:
         19, "placebos shifted in time, none of which may gain as much", "draws", "permutation test, 5 %"
     )
     stable: float = _number(
-        0.25, "share of resampled sets of clusters in which the effect, or its class, ranks first again", "1",
+        0.25, "share of resampled sets of clusters in which the effect, its class or a wider form ranks first", "1",
         "Meinshausen and Bühlmann, JRSS B 72 (2010), far below their 0.6: sets of 8 trips differ much",
     )  # fmt: skip
     switch_low: float = _number(
@@ -82,8 +82,9 @@ class Settings:
 
     # is X still needed beside Y
     stays: float = _number(
-        0.01, "largest p-value at which an effect stays beside those added later", "1", "Wald test, 1 %"
-    )
+        0.01, "largest p-value at which an effect stays beside those added later", "1",
+        "Wald test, 1 %: it entered at some 0.1 %, the FDR over the library",
+    )  # fmt: skip
     wald: float = _number(
         0.05, "largest p-value at which an effect is needed beside another of its class", "1", "Wald test, 5 %"
     )

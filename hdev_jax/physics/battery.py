@@ -94,7 +94,7 @@ class EfficiencyScale(Effect):
     stage: ClassVar[Stage] = "battery"
     equation: ClassVar[str] = "s·|P|"
     source: ClassVar[str] = "paper 1, eq. 5 (η); paper 2, eq. 6, 10 and 11"
-    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.001),)
+    parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.3, 0.3, least=0.005),)
     mistaken_for: ClassVar[Names] = ("gear_efficiency", "copper_loss", "inverter_loss")
     separated_by: ClassVar[str] = "driving and braking at the same power, at several torques"
     order: ClassVar[int] = -10  # before the loads: at the entry to the battery

@@ -135,7 +135,7 @@ class GradeNoise(Effect):
 
 
 class SpeedScale(Effect):
-    """Speed and distance are wrong by a factor, for instance by a wrong wheel radius: v·(1 + s)."""
+    """Speed and distance are wrong by a factor, by worn tyres or another size of them: v·(1 + s)."""
 
     id: ClassVar[str] = "speed_scale"
     label: ClassVar[str] = "scale of the speed signal"
@@ -144,7 +144,7 @@ class SpeedScale(Effect):
     equation: ClassVar[str] = "v → v·(1 + s), d → d·(1 + s)"
     source: ClassVar[str] = "wear and pressure of tyres"
     entries: ClassVar[Names] = ("road",)
-    # a speedometer may show 10 % too much (UN Regulation 39); pressure and load change a tyre's radius by 0.3 %
+    # a speedometer may show 10 % and 4 km/h too much (UN Regulation 39); load changes a tyre's radius by 0.3 %
     parameters: ClassVar[Parameters] = (Size("scale", "1", 0.0, 0.03, -0.1, 0.1, least=0.003),)
     mistaken_for: ClassVar[Names] = ("mass_scale", "rotating_mass")
     separated_by: ClassVar[str] = "a position by satellite"
@@ -193,7 +193,8 @@ class TorqueOffset(Effect):
     entries: ClassVar[Names] = ("shaft",)
     parameters: ClassVar[Parameters] = (
         Size("offset_nm", "Nm", 0.0, 1.0, -200.0, 200.0, least=0.5),
-        Size("gain", "1", 0.0, 0.03, -0.3, 0.3, least=0.005),
+        # what an inverter estimates from currents is within 5 %
+        Size("gain", "1", 0.0, 0.03, -0.1, 0.1, least=0.005),
     )
     variants: ClassVar[tuple[Names, ...]] = (("offset_nm",), ("gain",), ("offset_nm", "gain"))
     mistaken_for: ClassVar[Names] = ("iron_loss", "driveline_drag")
@@ -206,10 +207,7 @@ class TorqueOffset(Effect):
 
 
 class PowerGain(Effect):
-    """The power sensor has a gain and an offset: P·(1 + g) + P₀.
-
-    A diagnosis calls an offset above 0 a constant load, `auxiliary_power`: rows of power cannot tell the two apart.
-    """
+    """The power sensor has a gain and an offset: P·(1 + g) + P₀. An offset above 0 is a constant load first."""
 
     id: ClassVar[str] = "power_gain"
     label: ClassVar[str] = "offset or gain of the power signal"
@@ -219,11 +217,11 @@ class PowerGain(Effect):
     source: ClassVar[str] = "current sensor"
     of_battery: ClassVar[bool] = True
     parameters: ClassVar[Parameters] = (
-        # electric meters are within 2 % (EN 50470, classes A and B), a current sensor in a vehicle within 5 %
+        # twice the 5 % of a current sensor in a vehicle; electric meters are within 2 % (EN 50470, classes A and B)
         Size("gain", "1", 0.0, 0.03, -0.1, 0.1, least=0.005),
         Size("offset_w", "W", 0.0, 500.0, -2e4, 2e4, least=50.0, constant=True),
     )
-    # an offset alone is auxiliary_power by another name
+    # an offset alone is auxiliary_power by another name, and so is one above 0 beside a gain (`is_constant_load`)
     variants: ClassVar[tuple[Names, ...]] = (("gain",), ("gain", "offset_w"))
     mistaken_for: ClassVar[Names] = ("auxiliary_power",)
     separated_by: ClassVar[str] = "the balance of charge over a trip"

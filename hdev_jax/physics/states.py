@@ -89,7 +89,7 @@ class SwitchingLoad(Effect):
     source: ClassVar[str] = "two-state Markov chain in continuous time, decoded as in Rabiner, Proc. IEEE 77 (1989)"
     parameters: ClassVar[Parameters] = (
         # electric heaters of articulated buses have 40 to 60 kW
-        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=50.0),
+        Size("power_w", "W", 0.0, 1000.0, 0.0, 6e4, least=100.0),
         Choice("share_0c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 0 °C"),
         Choice("share_10c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 10 °C"),
         Choice("share_20c", "1", 0.5, 0.2, 0.0, 1.0, label="share of time on at 20 °C"),

@@ -101,17 +101,34 @@ def test_what_is_too_small_to_matter_is_not_named_however_significant(watts, nam
     assert named(diagnosed(problem, split, only("standstill_load"))) == names
 
 
-def test_what_has_become_too_small_beside_others_goes():
+def test_what_has_become_too_small_goes_and_the_reason_says_so():
     problem, _ = nothing()
     start = without_noise(without_noise(problem))
-    state = found_in_turn(training(changed(start, MassScale(0.02)), ["mass_scale"]), start, ["mass_scale"])
-    assert state.ids == ("mass_scale",)
-    assert backward(training(changed(start, MassScale(0.02)), ["mass_scale"]), state, newest=True).ids == ("mass_scale",)
+    rows = training(changed(start, MassScale(0.02)), ["mass_scale"])
+    state = found_in_turn(rows, start, ["mass_scale"])
+    assert backward(rows, state, newest=True).ids == ("mass_scale",)
     smaller = training(changed(start, MassScale(0.003)), ["mass_scale"])
-    now = replace(state, fit=smaller.calibrate(state.fit.vehicle, state.fit.table))
-    kept = backward(smaller, now, newest=True)
+    kept = backward(smaller, replace(state, fit=smaller.calibrate(state.fit.vehicle, state.fit.table)))
     assert kept.ids == ()
-    assert kept.removed["mass_scale"].kind is Kind.SUPERFLUOUS
+    assert "too small to matter" in str(kept.removed["mass_scale"])
+    assert kept.barred == frozenset(), "it competes again"
+
+
+def test_one_efficiency_does_not_compete_before_another_loss_in_the_vehicle():
+    """`part_load` is mistaken for it, and here explains nearly as much."""
+    problem, split = nothing()
+    problem = changed(problem, LIBRARY["battery_resistance"](0.15))
+    assert named(diagnosed(problem, split, only("regen_efficiency", "part_load", "battery_resistance"))) == [
+        "battery_resistance"
+    ]
+
+
+def test_an_offset_is_a_load_only_above_nothing_and_only_of_power():
+    gain = Candidate(LIBRARY["power_gain"], ("gain", "offset_w"), (None, None), (), "size", (0, 1))
+    assert gain.is_constant_load({"gain": -0.02, "offset_w": 500.0})
+    assert not gain.is_constant_load({"gain": 0.02, "offset_w": -500.0})
+    load = Candidate(LIBRARY["auxiliary_power"], ("power_w",), (None,), (), "size", (0,))
+    assert not load.is_constant_load({"power_w": 500.0})
 
 
 def test_an_efficiency_by_load_and_direction_blames_no_instrument():

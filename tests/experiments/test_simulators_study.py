@@ -36,7 +36,8 @@ def entry(*names: str, size: int = 0, **parameters: tuple[float, float]) -> dict
 def result(*named: dict[str, Any], **more: Any) -> dict[str, Any]:
     """A log's result that says no more than it is given."""
     return {
-        "named": list(named), "unexplained": False, "missing": [], "two_efficiencies": False, "coefficients": {}, "reasons": [],
+        "named": list(named), "unexplained": False, "missing": [], "two_efficiencies": False, "coefficients": {},
+        "reasons": [],
         "truth": {"road.c_rr": 0.012}, "recovered": 0.4, "recovers": 0.8, "rivals": {},
         "test_rmse": {"before": 2.0, "after": 1.0}, "refit_rmse": 1.0, "seconds": 1.0, **more,
     }  # fmt: skip
@@ -148,6 +149,7 @@ def test_a_headwind_as_the_reason_of_a_coefficient_is_said_and_does_not_count():
     moved = result(reasons=["constant_headwind", "rolling_linear"])
     (note,) = headwind_note([(task("headwind"), moved), (task("headwind"), result()), (task("payload"), moved)])
     assert "In 1 of 2 logs" in note
+    assert "in 1 of the 1 others" in note
     assert not scores.right(task("headwind"), moved)
     assert headwind_note([(task("payload"), moved)]) == []
 

@@ -86,10 +86,11 @@ class Candidate:
         """The effect's parameter of that name."""
         return next(p for p in self.effect.parameters if p.name == name)
 
-    def is_load(self, sizes: Mapping[str, float]) -> bool:
-        """Whether these sizes, by name, make it an instrument that reads a constant power too much: that is a constant
-        load of the vehicle first, under another name."""
-        return self.effect.instrument and any(self.parameter(n).constant and b > 0 for n, b in sizes.items())
+    def is_constant_load(self, sizes: Mapping[str, float]) -> bool:
+        """Whether these sizes, by name and against their null, make it an instrument that reads a constant power too
+        much: that is a constant load of the vehicle first, under another name."""
+        draws = any(self.parameter(n).constant and b > 0 for n, b in sizes.items())
+        return self.effect.instrument and self.effect.of_battery and draws
 
 
 def _matters(shape: Parameter, sizes: Sequence[str]) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
-from hdev_jax.diagnosis.competition.refit import gained, in_range, without
+from hdev_jax.diagnosis.competition.refit import gained, in_range, large_enough, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import alike
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
@@ -82,33 +82,42 @@ def can_be_asked(f: Found) -> bool:
 
 
 def backward(training: Training, state: State, *, newest: bool = False) -> State:
-    """The state without effects that are no longer needed beside the others, the weakest removed first.
+    """The state without effects that have become too small to name, or are no longer needed beside the others, the
+    weakest removed first.
 
     The newest has just passed every gate beside the others: unless `newest` (the others have changed) it is only asked
     whether it is one of a class with one of them.
     Beside a term without a name an effect has to be as significant as when it entered, unless it reads the same channel
     (the two may be parts of one cause) or is a constant load. The same holds for a constant load beside a cycle.
     """
-    settings = training.settings
     while asked := [f for f in state.found if _has_columns(f)]:
-        evidence = evidence_of(training.baseline(state.fit))
-        worst: tuple[tuple[float, bool], Found] | None = None
-        for f in asked:
-            p = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
-            strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
-            allowed = settings.fdr / _tried(training, state) if strictly else settings.stays
-            rank = (p / allowed, f.score.candidate.effect.stage == "sensors")
-            if p > allowed and (worst is None or rank >= worst[0]):
-                worst = (rank, f)
-        if worst is None:
+        small = [f for f in asked if not large_enough(state.fit, f.score.candidate)]
+        drop = small[0] if small else _weakest(training, state, asked, newest=newest)
+        if drop is None:
             break
-        drop = worst[1].id
-        beside = "a term without a name" if _beside_unnamed(state, worst[1]) else "effects added later"
-        state = without(training, state, drop)
-        times = state.removed[drop].numbers["times"] + 1 if drop in state.removed else 1
+        beside = "a term without a name" if _beside_unnamed(state, drop) else "effects added later"
+        state = without(training, state, drop.id)
+        times = state.removed[drop.id].numbers["times"] + 1 if drop.id in state.removed else 1
         why = Rejection(Kind.SUPERFLUOUS, {"beside": beside, "times": times})
-        state = replace(state, removed={**state.removed, drop: why})
+        if small:
+            why = Rejection(Kind.IMPLAUSIBLE, {"times": times})
+        state = replace(state, removed={**state.removed, drop.id: why})
     return state
+
+
+def _weakest(training: Training, state: State, asked: Sequence[Found], *, newest: bool) -> Found | None:
+    """The effect that is least needed beside all others, None where each is needed."""
+    settings = training.settings
+    evidence = evidence_of(training.baseline(state.fit))
+    worst: tuple[tuple[float, bool], Found] | None = None
+    for f in asked:
+        p = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
+        strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
+        allowed = settings.fdr / _tried(training, state) if strictly else settings.stays
+        rank = (p / allowed, f.score.candidate.effect.stage == "sensors")
+        if p > allowed and (worst is None or rank >= worst[0]):
+            worst = (rank, f)
+    return worst[1] if worst else None
 
 
 def without_idle_switches(training: Training, state: State, scores: Scores) -> State:
@@ -156,23 +165,16 @@ def without_far(training: Training, state: State, declared: Calibration) -> Stat
 
 
 def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
-    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is too small to be worth
-    naming, is not confirmed by cross-validation there, or is one of a class with one of them. The newest (not `old`)
-    has been tested already but for the last."""
+    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is not confirmed by
+    cross-validation there, or is one of a class with one of them. The newest (not `old`) has been tested already but
+    for the last."""
     if any(_doubles(evidence, state, f, g, settings) for g in state.found if g is not f):
         return 1.0
     if not old:
         return 0.0
     own = needed(evidence, state.fit, f)
-    stands = own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate) and _worth_naming(state.fit, f)
+    stands = own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate)
     return own.p if stands else 1.0
-
-
-def _worth_naming(fit: Calibration, f: Found) -> bool:
-    """Whether a size of a found effect is still as large as the smallest that is worth naming."""
-    c, at = f.score.candidate, _places(fit, f)
-    each = [(c.parameter(fit.table.free[k].path.rpartition(".")[2]), float(fit.values[k])) for k in at]
-    return any(abs(v - p.null) >= p.least for p, v in each)
 
 
 def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Settings) -> bool:

@@ -21,7 +21,9 @@ from hdev_jax.inference import Calibration, ParameterTable, effect_coefficients
 from hdev_jax.inference.parameters import Coefficient
 from hdev_jax.physics import Choice, Effect, Switch, Vehicle
 
-__all__ = ["Refit", "as_reported", "fitted", "gained", "in_range", "joined", "refit", "widened", "without"]
+__all__ = [
+    "Refit", "as_reported", "fitted", "gained", "in_range", "joined", "large_enough", "refit", "widened", "without",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
         if fit is not None and fewer is None and c.kind == "size":
             beta = _sizes(fit, c)
             inner = [
-                bool(p.lower <= p.null + b <= p.upper) for p, b in zip(map(c.parameter, c.sizes), beta, strict=True)
+                bool(p.lower <= p.null + b <= p.upper) and not c.is_constant_load({p.name: b})
+                for p, b in zip(map(c.parameter, c.sizes), beta, strict=True)
             ]
             fewer = without_idle(c, beta) or c.narrower(inner)
     return replace(failed, fewer=fewer)
@@ -264,11 +267,13 @@ def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) 
 
 
 def _stands(fit: Calibration, candidate: Candidate, settings: Settings) -> bool:
-    """Whether it is in range, and a size is significant with clustered errors."""
+    """Whether it is in range, and a size is significant with clustered errors and large enough to name."""
     if not in_range(fit, candidate):
         return False
     if candidate.kind == "limit":
         return True
+    if not large_enough(fit, candidate):
+        return False
     at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes
           and c.path.startswith(f"effects.{candidate.id}.")]  # fmt: skip
     return bool(np.any(np.abs(fit.values[at]) > settings.stands * fit.errors[at]))
@@ -300,6 +305,16 @@ def _idle_shape(candidate: Candidate, name: str) -> bool:
     return name not in candidate.sizes and all(name != n for n, _ in candidate.shapes)
 
 
+def large_enough(fit: Calibration, candidate: Candidate) -> bool:
+    """Whether one of its sizes is at least the smallest that is worth naming. (An effect one of whose sizes is nothing
+    competes without it.)"""
+    prefix = f"effects.{candidate.id}."
+    each = ((c.path.removeprefix(prefix), v) for c, v in zip(fit.table.free, fit.values, strict=True)
+            if c.path.startswith(prefix))  # fmt: skip
+    sizes = [(candidate.parameter(n), float(v)) for n, v in each if n in candidate.sizes]
+    return any(abs(v - p.null) >= p.least for p, v in sizes)
+
+
 def in_range(fit: Calibration, candidate: Candidate, slack: float = 0.0) -> bool:
     """Whether sizes and limits are plausible, and no limit ends up at an edge of its range; `slack` in standard errors.
 
@@ -309,7 +324,7 @@ def in_range(fit: Calibration, candidate: Candidate, slack: float = 0.0) -> bool
     for c, v, sd in zip(fit.table.free, fit.values, fit.errors, strict=True):
         if c.path.startswith(prefix):
             p = candidate.parameter(c.path.removeprefix(prefix))
-            if candidate.is_load({p.name: v - slack * sd}):
+            if candidate.is_constant_load({p.name: v - p.null - slack * sd}):
                 return False
             if p.has_column and not p.lower - slack * sd <= v <= p.upper + slack * sd:
                 return False

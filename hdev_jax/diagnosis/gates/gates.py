@@ -183,7 +183,8 @@ def alike(
 
 
 def stability(a: Asked) -> float:
-    """Share of resampled sets of clusters in which the same effect (or its class) comes first of its kind.
+    """Share of resampled sets of clusters in which the same effect, one of its class, or one of more numbers in whose
+    class it is, comes first of its kind.
 
     Its rivals are the candidates with p at most 0.01 before any correction that no joint refit or placebo has turned
     down.
@@ -197,9 +198,15 @@ def stability(a: Asked) -> float:
         and plausible(s, settings) and _beyond_readings(replace(a, score=s)) is None
     ]  # fmt: skip
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
-    # a form with more numbers (a limit of nothing, with a share) that holds the chosen one is no rival of it
-    wider = [s for s in rivals if s.candidate.freedoms > chosen.candidate.freedoms]
-    names |= {s.candidate.id for s in wider if chosen.candidate.id in of_class(replace(a, score=s))}
+    # one with more numbers that the chosen one does as well as (a limit at 0 W, with a share) is no rival of it
+    names |= {
+        s.candidate.id for s in rivals
+        if s.candidate.freedoms > chosen.candidate.freedoms
+        and alike(
+            scores.evidence(s), s.candidate, [chosen.candidate], s.gain, settings, plain=s.plain,
+            inexact=settings.inexact,
+        )
+    }  # fmt: skip
     small = [scores.evidence(s).only(s.candidate) for s in rivals]
     hits = 0
     for _ in range(RESAMPLES):

@@ -6,6 +6,7 @@ that may have two sizes it may show one alone, a loss that grows with the speed 
 there: the one then holds some of the other.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,6 @@ from hdev_jax.diagnosis.candidates.plan import Plan
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import both_looks
-from hdev_jax.diagnosis.scores.scores import plausible
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
 from hdev_jax.physics import RegenEfficiency, Shape
@@ -98,11 +98,8 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
         stands = all(x == here[n] for n, x in zip(names, shapes, strict=True))
         if stands:
             found, inside = beta, evidence.estimate(k)[1]
-        if (
-            np.isfinite(gain)
-            and np.all(np.isfinite(beta))
-            and plausible(replace(s, candidate=k, beta=beta), training.settings)
-        ):
+        # what is too small to name is possible all the same
+        if np.isfinite(gain) and np.all(np.isfinite(beta)) and not c.effect.implausible(_with_sizes(k, beta)):
             usual = [(x - c.parameter(n).null) / c.parameter(n).scale for n, x in zip(names, shapes, strict=True)]
             cell = [np.log(cells[n][x]) for n, x in zip(names, shapes, strict=True)]
             points.append((gain - 0.5 * float(np.sum(np.square(usual))) + float(np.sum(cell)), beta, shapes))
@@ -115,6 +112,11 @@ def left_open(training: Training, state: State, s: Score, reported: Calibration)
     away = np.array([[*(p[1] - found), *(p[2] - [here[n] for n in names])] for p in points])[kept]
     inside = [*inside, *(0.0 for _ in names)]
     return {n: Open(away[:, k], share, float(inside[k])) for k, n in enumerate((*c.sizes, *names))}
+
+
+def _with_sizes(c: Candidate, beta: Sequence[float] | np.ndarray) -> dict[str, float]:
+    """Values of a candidate's parameters, where its sizes differ from their nulls by `beta`."""
+    return dict(c.shapes) | {n: c.parameter(n).null + float(b) for n, b in zip(c.sizes, beta, strict=True)}
 
 
 def _apart(training: Training, state: State, c: Candidate, grids: Grids) -> tuple[Plan, Evidence, Evidence]:
@@ -145,7 +147,7 @@ def _other_open(training: Training, state: State, s: Score, other: str, reported
 
     def possible(x: float) -> bool:
         values = {other: x, **dict(zip(c.sizes, found + per_unit * x, strict=True))}
-        return not c.effect.implausible({n: c.parameter(n).null + v for n, v in values.items()})
+        return not c.effect.implausible(_with_sizes(both, [values[n] for n in both.sizes]))
 
     low, high = np.clip(beta + error * np.array([-REACH, REACH]), p.lower - p.null, p.upper - p.null)
     at = np.array([x for x in np.linspace(low, high, POINTS) if possible(float(x))])

@@ -49,7 +49,7 @@ def plausible(s: Score, settings: Settings) -> bool:
         return bool(least <= s.beta[0] <= 1.0 / settings.switch_low and size >= first.least)
     each = [(c.parameter(n), b) for n, b in zip(c.sizes, s.beta, strict=True)]
     enough = any if None not in c.groups else all  # a gear may have nothing; a gain of 0 beside an offset is a load
-    if c.is_load(dict(zip(c.sizes, s.beta, strict=True))):
+    if c.is_constant_load(dict(zip(c.sizes, s.beta, strict=True))):
         return False
     return all(p.lower <= p.null + b <= p.upper for p, b in each) and enough(abs(b) >= p.least for p, b in each)
 
