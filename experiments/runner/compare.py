@@ -27,8 +27,8 @@ def check(metrics: Mapping[str, Any]) -> None:
 def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A line for each number that the paper has: `name, quantity, paper, ours, ratio, why_not`.
 
-    `ratio` is ours over the paper's, None where either is none or the paper's is 0; `why_not`, the reason where we have
-    no number.
+    `ratio` is ours over the paper's, of errors with a sign their sizes, None where either is none or the paper's is 0;
+    `why_not`, the reason where we have no number.
     """
     lines = []
     for row in metrics["rows"]:
@@ -36,7 +36,7 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         for quantity, paper in (row["paper"] or {}).items():
             if _number(paper) is not None:
                 own = _number(ours.get(quantity))
-                ratio = own / paper if own is not None and paper else None
+                ratio = abs(own / paper) if own is not None and paper else None
                 reason = None if own is not None else row.get("reason", "not computed")
                 lines.append(
                     {
@@ -65,7 +65,7 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         lines.append(
             {
                 "name": readable(row["name"]), "quantity": readable(quantity), "paper": paper, "ours": own,
-                "ratio": own / paper if own is not None and paper else None,
+                "ratio": abs(own / paper) if own is not None and paper else None,
                 "median": spread.get("median"),
                 "range over starts": [spread["least"], spread["most"]] if spread else None,
                 "why_not": row.get("reason"),

@@ -1,10 +1,8 @@
-"""Pages: a run's tables and figures, or those of many runs, in one file that opens offline."""
+"""Pages of the site: a run's tables and figures, or those of many runs, in Markdown."""
 
-import base64
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,100 +10,13 @@ from experiments.runner.compare import comparison, decides, findings, headlines,
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
 from experiments.runner.store import HERE
-from experiments.runner.tables import cells, markdown, read_markdown
-from hdev_jax.rundir import Run, atomic_file
+from experiments.runner.tables import cells, markdown
 
-__all__ = ["Section", "folded", "of_run", "part", "write_docs", "write_html", "write_list_docs", "write_page"]
+__all__ = ["about", "folded", "heading", "kind_of", "part", "title_of", "write_docs", "write_list_docs"]
 
 MOST_COLUMNS = 8  # of the table that a page shows
 MOST_ROWS = 20  # of a table that a page of many runs shows; a longer one is folded
 MOST_MISSED = 4  # targets that a page shows; more are folded
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{{ title }}</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #1b1f24; max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
-table { border-collapse: collapse; font-size: 13px; margin-bottom: 1.2rem; }
-td, th { padding: .3rem .6rem; border-bottom: 1px solid #d9dee3; text-align: right; vertical-align: bottom; }
-td:first-child, th:first-child { text-align: left; } caption { text-align: left; font-weight: 600; padding: .3rem 0; }
-.scroll { overflow-x: auto; } img { max-width: 100%; margin: 1rem 0; } .tag { background: #fff3cd; padding: 0 .4rem; }
-h2 { margin-top: 3rem; border-top: 1px solid #d9dee3; padding-top: 1rem; } .made { color: #57606a; }
-</style></head><body>
-<h1>{{ title }}</h1>
-{% for s in sections %}
-{% if sections | length > 1 and s.title %}<h2 id="{{ s.anchor }}">{{ s.title }}</h2>{% endif %}
-{% if s.synthetic %}<p><span class="tag">synthetic</span></p>{% endif %}
-{% for line in s.made %}<p class="made">{{ line }}</p>{% endfor %}
-{% if s.said %}<ul>{% for line in s.said %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
-{% if s.links %}<p>{% for name, to in s.links %}<a href="{{ to }}">{{ name }}</a> {% endfor %}</p>{% endif %}
-{% for caption, lines in s.tables %}<div class="scroll"><table><caption>{{ caption }}</caption><thead><tr>
-{% for h in lines[0] %}<th>{{ h }}</th>{% endfor %}</tr></thead><tbody>
-{% for line in lines[1:] %}<tr>{% for c in line %}<td>{{ c }}</td>{% endfor %}</tr>
-{% endfor %}</tbody></table></div>{% endfor %}
-{% for name, data in s.figures %}<img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
-{% endfor %}
-{% endfor %}
-</body></html>
-"""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of a page: how it was `made`, what is `said` of it, tables (caption, lines), figures (name, PNG)."""
-
-    title: str
-    synthetic: bool = False
-    made: Sequence[str] = ()
-    said: Sequence[str] = ()
-    links: Sequence[tuple[str, str]] = ()
-    tables: Sequence[tuple[str, list[list[str]]]] = field(default_factory=list)
-    figures: Sequence[tuple[str, str]] = field(default_factory=list)
-
-    @property
-    def anchor(self) -> str:
-        """Where links within the page lead."""
-        return re.sub(r"[^\w.]+", "-", self.title).strip("-")
-
-
-def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = (), home: Path | None = None) -> Section:
-    """The part of a page for the run in `folder`: paper against ours, its own tables, its figures.
-
-    **Arguments:** `made`, lines on what made it; `home`, the folder of the page, for links to the run's files.
-    """
-    against = comparison(metrics)
-    tables = [("Paper against ours", cells(against, 4))] if against else []
-    tables += [read_markdown(path) for path in sorted((folder / "tables").glob("*.md"))]
-    images = sorted((folder / "figures").glob("*.png"))
-    names = ("report.html", "config.toml", "metrics.json", "log.txt")
-    links = [(n, (folder / n).relative_to(home).as_posix()) for n in names] if home is not None else []
-    return Section(
-        title=metrics["artefact"],
-        synthetic=metrics["synthetic"],
-        made=made,
-        said=[
-            *findings(metrics),
-            *(f"Missed: {line}" for line in missed(metrics)),
-            *notes(metrics),
-            f"{metrics['seconds']} s.",
-        ],
-        links=links,
-        tables=tables,
-        figures=[(p.stem.replace("_", " "), base64.b64encode(p.read_bytes()).decode("ascii")) for p in images],
-    )
-
-
-def write_html(path: Path, title: str, sections: Sequence[Section]) -> None:
-    """A page of these parts. **Raises:** `InputError` where the file cannot be written."""
-    from jinja2 import Environment, StrictUndefined
-
-    page = Environment(autoescape=True, undefined=StrictUndefined).from_string(_PAGE)
-    with atomic_file(path) as temporary:
-        temporary.write_text(page.render(title=title, sections=sections), encoding="utf-8")
-
-
-def write_page(run: Run, metrics: dict[str, Any]) -> None:
-    """`report.html` of a run, from its metrics, Markdown tables and PNG figures."""
-    write_html(run.path("report.html"), metrics["artefact"], [of_run(run.work, metrics)])
 
 
 def write_docs(
@@ -143,15 +54,15 @@ def write_list_docs(
     for home in dict.fromkeys(path.parent for path in made):
         runs = {path: folders for path, folders in made.items() if path.parent == home}
         every = [(p.stem, json.loads((f / "metrics.json").read_text())) for p, folders in runs.items() for f in folders]
-        kind = _kind(next(iter(runs)))
-        lines = [f"# {kind if kind != 'Study' else _titled(home)}", "", *_about(Path(configs)), ""]
+        kind = kind_of(next(iter(runs)))
+        lines = [f"# {kind if kind != 'Study' else _titled(home)}", "", *about(Path(configs)), ""]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
         compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
         lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
-        first = [{"part": _heading(stem), **x} for stem, m in every for x in headlines(m)]
+        first = [{"part": heading(stem), **x} for stem, m in every for x in headlines(m)]
         with_paper = [x for x in first if x["paper"] is not None]
         alone = [x for x in first if x["paper"] is None]
-        measured = {_heading(stem) for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
+        measured = {heading(stem) for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
         lines += _against([x for x in with_paper if x["part"] in measured], docs, home.name)
         if with_paper:
             lines += [*_open(_decides(with_paper)), ""]
@@ -159,11 +70,11 @@ def write_list_docs(
             title = "Models that the paper does not have" if with_paper else "Every model"
             lines += [*folded(title, _decides(alone)), ""]
         for path, folders in runs.items():
-            lines += [f"## {_heading(path.stem)}", ""]
+            lines += [f"## {heading(path.stem)}", ""]
             for k, folder in enumerate(folders):
                 before = f"{path.stem}_{f'{k}_' if len(folders) > 1 else ''}"
                 lines += [*_lines(folder, path, docs, home.name, before, most_rows=MOST_ROWS), ""]
-        if against := [{"part": _heading(stem), **x} for stem, m in every for x in comparison(m)]:
+        if against := [{"part": heading(stem), **x} for stem, m in every for x in comparison(m)]:
             every_number = markdown(cells(against, 4), "Every number of the paper").rstrip()
             lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number), ""]
         lines += [_by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs")]
@@ -172,7 +83,7 @@ def write_list_docs(
     return pages
 
 
-def _heading(stem: str) -> str:
+def heading(stem: str) -> str:
     """What a page calls a config: `table2` is Table 2, `pinn_data` is Data."""
     if m := re.fullmatch(r"(table|fig)(\d+)", stem):
         return f"{'Table' if m[1] == 'table' else 'Figure'} {m[2]}"
@@ -212,7 +123,7 @@ def _lines(
         figures.append(f"![{figure.stem.replace('_', ' ')}](figures/{name}/{to.name})")
     files = sorted((folder / "tables").glob("*.md"), key=lambda path: (path.stem != "table", path.stem))
     tables = [path.read_text(encoding="utf-8") for path in files]
-    said = [*_about(config), *findings(metrics)]
+    said = [*about(config), *findings(metrics)]
     return part(said, figures, tables, notes(metrics), missed(metrics), most_rows=most_rows)
 
 
@@ -248,7 +159,7 @@ def _open(table: str, most_rows: int | None = MOST_ROWS) -> list[str]:
     return [table] if most_rows is None or rows <= most_rows else folded(f"Table of {rows} rows", table)
 
 
-def _about(config: Path) -> list[str]:
+def about(config: Path) -> list[str]:
     """The first sentence of the comment that heads a config: what it is; none where it has no comment."""
     comment = re.match(r"(?:#.*\n)+", config.read_text(encoding="utf-8"))
     text = " ".join(line.lstrip("# ") for line in comment.group().splitlines()) if comment else ""
@@ -280,7 +191,13 @@ def _titled(config: Path) -> str:
     return config.stem.replace("_", " ").capitalize()
 
 
-def _kind(config: Path) -> str:
+def title_of(config: Path) -> str:
+    """What a page of several kinds calls a config: `Paper 2, table 5`, or a study by its title."""
+    kind, name = kind_of(config), heading(config.stem)
+    return f"{kind}, {name[0].lower()}{name[1:]}" if kind.startswith("Paper") else _titled(config)
+
+
+def kind_of(config: Path) -> str:
     """What a page of a config in this folder is of: a study, paper 2, …"""
     folder = config.resolve().parent.name
     if folder.startswith("paper"):

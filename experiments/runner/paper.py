@@ -1,5 +1,6 @@
 """Every table and figure there is: a list of configs, each run in its place, paper against ours, one page of all."""
 
+import base64
 import contextlib
 import dataclasses
 import traceback
@@ -11,8 +12,10 @@ from experiments.runner.compare import comparison, decides, headlines
 from experiments.runner.compute import Where, compute
 from experiments.runner.config import artefact, changes, shown, shown_point
 from experiments.runner.engine import Plan, claim_folder, plan, refuse_hurry, run_config, unfinished
+from experiments.runner.figures import against_paper
+from experiments.runner.html import Folded, Section, Table, of_run, write_html
 from experiments.runner.log import Log
-from experiments.runner.page import Section, of_run, write_html
+from experiments.runner.page import about, heading, kind_of, title_of
 from experiments.runner.tables import cells
 from experiments.runner.workers import ClusterError
 from hdev_jax.errors import InputError
@@ -98,44 +101,72 @@ def _blame(came: Outcomes, path: Path, error: Exception, log: Log) -> None:
 def against(came: Outcomes) -> list[dict[str, Any]]:
     """A line for each number of the papers: config, name, quantity, paper, ours, ratio, why there is none."""
     pairs = [(path, run) for path, every in came.made.items() for run in every]
-    return [{"part": _title(path, run), **line} for path, run in pairs for line in comparison(run)]
+    return [{"part": _at(artefact(path), run), **line} for path, run in pairs for line in comparison(run)]
 
 
 def _title(path: Path, run: Mapping[str, Any]) -> str:
-    """What the config is called, and of a sweep the point of the grid."""
+    """What a page calls the config, and of a sweep the point of the grid."""
+    return _at(title_of(path), run)
+
+
+def _at(name: str, run: Mapping[str, Any]) -> str:
     point = shown_point(run["sweep"])
-    return f"{artefact(path)} ({point})" if point else artefact(path)
+    return f"{name} ({point})" if point else name
 
 
 def _write_index(home: Path, came: Outcomes) -> None:
     parts: list[Section] = []
+    links: dict[str, list[tuple[str, str]]] = {}
     for path, runs in came.made.items():
         if runs[0]["sweep"]:
-            page = f"{artefact(path)}/report.html"
-            parts.append(Section(artefact(path), links=[("the sweep as a table over its runs", page)]))
+            to = [("the sweep as a table over its runs", f"{artefact(path)}/report.html")]
+            parts.append(Section(title_of(path), contents=[("", to)]))
         for run in runs:
             part = of_run(Path(run["folder"]), run, made=_made(path, run["sweep"]), home=home)
-            parts.append(dataclasses.replace(part, title=_title(path, run)))
-    write_html(home / "index.html", "Every table and figure", [_summary(came, parts), *parts])
+            part = dataclasses.replace(part, title=_title(path, run), said=[*about(path), *part.said])
+            parts.append(part)
+            kind = kind_of(path)
+            name = heading(path.stem) if kind.startswith("Paper") else part.title
+            links.setdefault(kind if kind != "Study" else "Studies", []).append((name, f"#{part.anchor}"))
+    write_html(home / "index.html", "Every table and figure", [_summary(came, links), *parts])
 
 
-def _summary(came: Outcomes, parts: Sequence[Section]) -> Section:
+def _summary(came: Outcomes, links: Mapping[str, Sequence[tuple[str, str]]]) -> Section:
+    """How we compare, the deciding errors, what there is; times and every number of the papers folded."""
+    every = [(path, run) for path, runs in came.made.items() for run in runs]
     rows = [
         {
             "config": _title(path, run), "data": run["data"],
             "at least as good": f"{run['better_than_paper']} of {run['of']}" if run["of"] else None,
             "seconds": run["seconds"],
         }
-        for path, runs in came.made.items() for run in runs
+        for path, run in every
     ]  # fmt: skip
-    lines, every = against(came), [(path, run) for path, runs in came.made.items() for run in runs]
+    lines = [{"part": _title(path, run), **line} for path, run in every for line in comparison(run)]
     first = [{"part": _title(path, run), **line} for path, run in every for line in headlines(run)]
-    tables = [("Runs", cells(rows))] if rows else []
-    tables += [(decides(first), cells(first, 4))] if first else []
-    tables += [("Paper against ours", cells(lines, 4))] if lines else []
+    measured = {_title(path, run) for path, run in every if not run["synthetic"]}  # synthetic data is not the paper's
+    theirs = [x for x in first if x["paper"] is not None and x["part"] in measured]
+    alone = [x for x in first if x not in theirs]
     said = [] if came.made else ["No config of the list has been run."]
+    if compared := sum(run["of"] for _, run in every):
+        better = sum(run["better_than_paper"] for _, run in every)
+        said.append(f"At least as good as the paper in {better} of {compared} comparisons.")
     said += [f"Not made: {why}." for why in came.reasons()]
-    return Section("", said=said, links=[(p.title, f"#{p.anchor}") for p in parts], tables=tables)
+    folded = [
+        Folded("On synthetic data, and models that the papers do not have", tables=_table(decides(alone), alone)),
+        Folded("Every number of the papers, and ours", tables=_table("Paper against ours", lines)),
+        Folded("Data and time of each", tables=_table("Runs", rows)),
+    ]
+    image = against_paper(theirs)
+    return Section(
+        "", said=said, tables=_table(decides(theirs), theirs), folded=[f for f in folded if f.tables],
+        figures=[("Our error over the paper's", base64.b64encode(image).decode("ascii"))] if image else [],
+        contents=list(links.items()),
+    )  # fmt: skip
+
+
+def _table(caption: str, rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+    return [(caption, cells(rows, 4))] if rows else []
 
 
 def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments.runner.compare import numbers
 from experiments.runner.config import shown, shown_point
-from experiments.runner.page import Section, write_html
+from experiments.runner.html import Section, write_html
 from experiments.runner.tables import cells, markdown, tex
 from hdev_jax.rundir import atomic_file
 
@@ -38,7 +38,11 @@ def write_sweep(out: Path, config: str | Path, found: Sequence[Mapping[str, Any]
             temporary.write_text(text, encoding="utf-8")
     links = [(shown_point(r["sweep"]), f"{Path(r['folder']).name}/report.html") for r in found]
     synthetic = all(r["synthetic"] for r in found)
-    write_html(out / "report.html", f"Sweep of {shown(config)}", [Section("", synthetic, links=links, tables=tables)])
+    write_html(
+        out / "report.html",
+        f"Sweep of {shown(config)}",
+        [Section("", synthetic, tables=tables, contents=[("Runs", links)])],
+    )
 
 
 def sweep_rows(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
