@@ -36,6 +36,7 @@ NOTES = (
     "changed. Segments of 100 m average over what happens within them, for both fits",
     "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
     "split braking between motor and friction brakes, so regeneration that is lost is taken from the electric power",
+    "Some of these logs were looked at while the method was changed",
     "Rivals get the declared model's residual and every effect's column. A name is right if it is the change, and "
     "false if it is neither the change nor the form of the efficiency. LightGBM names nothing",
 )
