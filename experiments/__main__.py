@@ -87,7 +87,7 @@ def _parser() -> argparse.ArgumentParser:
 def _run_one(options: argparse.Namespace) -> int:
     from experiments.runner.config import shown_point
     from experiments.runner.engine import run_config
-    from experiments.runner.page import write_docs
+    from experiments.runner.pages.site import write_docs
 
     runs = run_config(
         options.config, options.set, out=options.out, workers=_workers(options), scheduler=options.scheduler,
@@ -105,7 +105,7 @@ def _run_one(options: argparse.Namespace) -> int:
 
 def _run_list(options: argparse.Namespace, configs: list[Path]) -> int:
     from experiments.runner.compute import Where
-    from experiments.runner.page import write_list_docs
+    from experiments.runner.pages.site import write_list_docs
     from experiments.runner.paper import against, run_list
     from experiments.runner.tables import cells
 

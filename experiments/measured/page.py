@@ -29,7 +29,7 @@ from experiments.measured.tables import (
     table,
 )
 from experiments.measured.withheld import WITHHELD
-from experiments.runner.page import folded
+from experiments.runner.pages.site import folded
 from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.report import names
 

@@ -33,8 +33,8 @@ from experiments.runner import store
 from experiments.runner.compare import check
 from experiments.runner.compute import Asked, Where, compute
 from experiments.runner.config import artefact, expanded, resolve, shown_point, typed
-from experiments.runner.html import write_page
 from experiments.runner.log import Log
+from experiments.runner.pages.html import write_page
 from experiments.runner.sweep import write_sweep
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run, config_digest, is_complete, open_run

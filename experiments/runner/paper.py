@@ -13,9 +13,9 @@ from experiments.runner.compute import Where, compute
 from experiments.runner.config import artefact, changes, shown, shown_point
 from experiments.runner.engine import Plan, claim_folder, plan, refuse_hurry, run_config, unfinished
 from experiments.runner.figures import against_paper
-from experiments.runner.html import Folded, Section, Table, of_run, write_html
 from experiments.runner.log import Log
-from experiments.runner.page import about, heading, kind_of, title_of
+from experiments.runner.pages.html import Folded, Section, Table, of_run, write_html
+from experiments.runner.pages.site import about, heading, kind_of, title_of
 from experiments.runner.tables import cells
 from experiments.runner.workers import ClusterError
 from hdev_jax.errors import InputError

@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments.runner.compare import numbers
 from experiments.runner.config import shown, shown_point
-from experiments.runner.html import Section, write_html
+from experiments.runner.pages.html import Section, write_html
 from experiments.runner.tables import cells, markdown, tex
 from hdev_jax.rundir import atomic_file
 

@@ -15,7 +15,7 @@ from experiments.runner.config import CONFIGS, artefact, changes, every_config, 
 from experiments.runner.data import MissingDataError
 from experiments.runner.engine import plan, run_config
 from experiments.runner.log import Log
-from experiments.runner.page import MOST_ROWS, part, write_docs
+from experiments.runner.pages.site import MOST_ROWS, part, write_docs
 from experiments.runner.tables import wilson
 from hdev_jax.errors import InputError
 from hdev_jax.physics import LIBRARY

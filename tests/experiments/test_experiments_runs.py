@@ -359,7 +359,7 @@ def test_what_a_task_depends_on_is_what_its_modules_load(name, modules_loaded):
     rest = {p for p in beside if p.parent.name != "runner" and p.stem not in {"__init__", *PAGES}}
     assert {store._name(p) for p in rest} <= OWN_FINGERPRINT
     tasks_need = {store._name(p) for p in store.reached(starts, experiments=False)}
-    assert not tasks_need & {"hdev_jax/cli.py", "hdev_jax/verbs/demo.py", "experiments/runner/page.py"}
+    assert not tasks_need & {"hdev_jax/cli.py", "hdev_jax/verbs/demo.py", "experiments/runner/pages/site.py"}
 
 
 def test_a_module_of_your_own_is_named_by_its_dotted_name_and_ours_goes_first(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.runner.html import MOST_ROWS, of_run, write_html
+from experiments.runner.pages.html import MOST_ROWS, of_run, write_html
 from experiments.runner.tables import markdown
 
 METRICS = {
