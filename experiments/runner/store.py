@@ -18,7 +18,7 @@ from hdev_jax.rundir import atomic_file
 __all__ = ["experiment", "experiments_here", "keep", "place", "read", "sources", "sources_of"]
 
 HERE = Path(__file__).parents[1]
-PAGE = Path(__file__).with_name("page.py")
+PAGE = Path(__file__).parent / "pages" / "html.py"
 PARTS = ("SOURCES", "Config", "tasks", "run", "collect")  # what an experiment is made of
 PACKAGES = {"hdev_jax": Path(hdev_jax.__file__).parent, "experiments": HERE}
 
