@@ -11,7 +11,7 @@ from experiments.runner.compare import comparison, findings, missed, notes
 from experiments.runner.tables import cells, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
-__all__ = ["Folded", "Section", "Table", "of_run", "write_html", "write_page"]
+__all__ = ["MOST_ROWS", "Folded", "Section", "Table", "of_run", "write_html", "write_page"]
 
 Table = tuple[str, list[list[str]]]  # its caption; its lines, the head first
 

@@ -9,13 +9,13 @@ from typing import Any
 from experiments.runner.compare import comparison, decides, findings, headlines, missed, notes
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
+from experiments.runner.pages.html import MOST_ROWS
 from experiments.runner.store import HERE
 from experiments.runner.tables import cells, markdown
 
 __all__ = ["about", "folded", "heading", "kind_of", "part", "title_of", "write_docs", "write_list_docs"]
 
 MOST_COLUMNS = 8  # of the table that a page shows
-MOST_ROWS = 20  # of a table that a page of many runs shows; a longer one is folded
 MOST_MISSED = 4  # targets that a page shows; more are folded
 
 

@@ -93,8 +93,8 @@ def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:
     first = min((s for s in able if s.candidate.id in same), key=asks)
     library = round_.training.library.values()
     looks_like = {id_ for c in library if c.of_efficiency for id_ in c.mistaken_for}
-    able_to_be = asks(first)[0] or first.candidate.kind == "limit"
-    if not (round_.state.fit.vehicle.one_efficiency and first.candidate.id in looks_like and able_to_be):
+    gives_way = asks(first)[0] or first.candidate.kind == "limit"
+    if not (round_.state.fit.vehicle.one_efficiency and first.candidate.id in looks_like and gives_way):
         return first, same
     members = {*of_class(round_.asked(first))}
     instead = [
