@@ -23,14 +23,14 @@ _OF_TRIPS = ("at_trip", "in_mode")  # parameters that say something of the trips
 
 
 @cache
-def found_effects(data: Data, vehicles: tuple[str, ...], routes: int) -> dict[str, dict[str, float]]:
-    """Effects that the diagnoses of these vehicles find on so many of their training routes, in the order of how often,
-    with the median of each shape; sizes and thresholds are left open.
+def found_effects(data: Data, vehicles: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Effects that the diagnoses of these vehicles find on their training routes, in the order of how often, with the
+    median of each shape; sizes and thresholds are left open.
 
     What began at some trip, or holds in some, is of one vehicle's log and no part of it.
     """
     chosen = [m for m in data.vehicles if (m.id in vehicles or vehicles == ("all",)) and len(m.where(0))]
-    return united([diagnosed(m, routes, seed=0)[1] for m in chosen])
+    return united([diagnosed(m, seed=0)[1] for m in chosen])
 
 
 def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
@@ -46,12 +46,12 @@ def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
     return out
 
 
-def diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
-    """The vehicle with the effects that the diagnosis finds on its first training routes, what these are, and what the
+def diagnosed(m: Member, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
+    """The vehicle with the effects that the diagnosis finds on its training routes, what these are, and what the
     declared coefficients became. The whole loop, as `hdev diagnose` runs it on so short a log: in a process that
     compiles quickly, which one where networks are trained does not."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _quickly) as pool:
-        return pool.submit(_diagnosed, m, routes, seed).result()
+        return pool.submit(_diagnosed, m, seed).result()
 
 
 def _quickly() -> None:
@@ -59,7 +59,7 @@ def _quickly() -> None:
     jax.config.update("jax_enable_x64", True)
 
 
-def _diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
+def _diagnosed(m: Member, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
     from hdev_jax import progress
     from hdev_jax.diagnosis.diagnose import diagnose
     from hdev_jax.fleet import FleetConfig
@@ -67,11 +67,11 @@ def _diagnosed(m: Member, routes: int, seed: int) -> tuple[Vehicle, dict[str, di
     from hdev_jax.inference.sheet import read_sheet
     from hdev_jax.problem import prepare, split_trips
 
-    known = np.unique(m.routes[m.where(0)])[: routes + 1]
+    known = np.unique(m.routes[m.where(0)])
     with tempfile.TemporaryDirectory() as folder:
         write_sheet(m.variant, FleetConfig(), Path(folder))
         problem = prepare(_log_of(m, known), read_sheet(Path(folder) / f"{m.id}.toml"))
-        # one route more than is learnt from: a diagnosis needs a test trip, and what it says of that is not used
+        # the last is not learnt from: a diagnosis needs a test trip, and what it says of that is not used
         split = split_trips(problem.log, None, [problem.log.trip_names[-1]])
         done = diagnose(problem, split, LIBRARY, seed=seed, tell=progress.step)
     found = {e["id"]: {k: p["value"] for k, p in e["parameters"].items()} for e in done.summary["effects"]}

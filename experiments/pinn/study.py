@@ -77,7 +77,6 @@ class Config(Strict):
     seeds: list[int] = Field(default_factory=lambda: [0])
     effects: dict[str, dict[str, float]] = Field(default_factory=dict)
     diagnosed: list[str] = Field(default_factory=list)  # vehicles that the whole diagnosis is made of, or "all"
-    diagnosed_routes: int = 12  # training routes that it sees of each
     epochs: int = 100
     patience: int = 5
     stop_after: int = 15
@@ -183,12 +182,12 @@ def _of_model(config: Config, data: dict[str, Any], name: str, model: Model) -> 
         for vehicle in _vehicles(config):
             known = config.diagnosed == ["all"] or (config.data == "fleet" and _id(config, vehicle) in config.diagnosed)
             yield {**task, "vehicle": vehicle, "effects": config.effects if model.effects is True else {},
-                   "diagnosed_routes": config.diagnosed_routes if known else 0}  # fmt: skip
+                   "diagnose": known}  # fmt: skip
         return
     plan = {"epochs": config.epochs, "patience": config.patience, "stop_after": config.stop_after}
     task |= {**plan, "effects": config.effects if model.effects is True else {}}
     if model.effects == "diagnosed":
-        task |= {"diagnosed": config.diagnosed, "diagnosed_routes": config.diagnosed_routes}
+        task["diagnosed"] = config.diagnosed
     # LightGBM draws nothing here: its seeds would be alike
     for seed in config.seeds[: None if model.kind == "network" else 1]:
         for weights in _weights(config, model) if model.kind == "network" else [[]]:
@@ -230,7 +229,7 @@ def run_together(tasks: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 tuple(d["variants"]))  # fmt: skip
     effects = data.shown(task.get("effects", {}))
     if "diagnosed" in task:
-        effects = found_effects(data, tuple(task["diagnosed"]), task["diagnosed_routes"])
+        effects = found_effects(data, tuple(task["diagnosed"]))
     tasks = [{**t, "effects": effects} for t in tasks]
     task = tasks[0]
     if task["model"]["kind"] == "vehicles":
@@ -266,8 +265,8 @@ def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
     out["bayesian"] = scored(bayesian(m)[0])
     if task["effects"]:
         out["kernel"] = scores(data, m.use, said(kernel(m, task["effects"]).vehicle, m), only=k)
-    if task["diagnosed_routes"]:
-        car, out["found"], out["coefficients"] = diagnosed(m, task["diagnosed_routes"], seed=0)
+    if task["diagnose"]:
+        car, out["found"], out["coefficients"] = diagnosed(m, seed=0)
         out["diagnosed"] = scores(data, m.use, said(car, m), only=k)
     return out
 
