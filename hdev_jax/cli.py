@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 import shtab
 
 from hdev_jax import __version__
-from hdev_jax.compiling import compile_quickly, compiles_long, keep_compiled
+from hdev_jax.compiling import compile_quickly, keep_compiled, level_of
 from hdev_jax.errors import InputError
 from hdev_jax.options.common import (
     count,
@@ -250,8 +250,10 @@ class _Help(argparse.HelpFormatter):
 
 
 def _run(verb: str, arguments: dict[str, Any]) -> Any:
-    if verb == "demo" or ("logs" in arguments and compiles_long(_files_of(verb, arguments["logs"]))):
-        compile_quickly()
+    if verb == "demo" or "logs" in arguments:
+        level = level_of(_by_vehicle(verb, arguments.get("logs", ())))
+        if level is not None:
+            compile_quickly(level)
     import jax
 
     from hdev_jax import progress
@@ -262,11 +264,11 @@ def _run(verb: str, arguments: dict[str, Any]) -> Any:
         return getattr(import_module(f"hdev_jax.verbs.{FOLDERS.get(verb, '')}{verb}"), verb)(**arguments)
 
 
-def _files_of(verb: str, logs: Sequence[Path]) -> list[Path]:
-    """The logs whose size decides how programs are compiled: those given, and what is in a fleet's folders."""
+def _by_vehicle(verb: str, logs: Sequence[Path]) -> list[list[Path]]:
+    """The files whose size decides how programs are compiled: those given; in a fleet each as if it were a vehicle."""
     if verb != "fleet":
-        return list(logs)
-    return [f for p in logs for f in ([p] if p.is_file() else p.rglob("*")) if f.is_file()]
+        return [list(logs)]
+    return [[f] for p in logs for f in ([p] if p.is_file() else p.rglob("*")) if f.is_file()]
 
 
 def _print(result: Any) -> None:

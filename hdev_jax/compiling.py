@@ -1,24 +1,23 @@
-"""How XLA compiles: quickly where a log is small, and once: compiled programs are kept between commands.
+"""How XLA compiles: quickly, and once: compiled programs are kept between commands.
 
-A search compiles the vehicle again for every effect that it adds. With an efficiency map and a log of 2,000 rows that
-is three quarters of the time, and programs that are not optimised bring the answer 2.6 times sooner; of a log of 40,000
-rows both take as long. Results differ in the last bits of a double.
+Of a diagnosis of 2,000 rows with an efficiency map, compiling is three quarters of the time: programs that are not
+optimised (level 0) bring the answer 2.6 times sooner. Of 20,000 rows it is half of the time: level 1 compiles in 60 %
+of what XLA takes by default, and its programs run a tenth longer. Results differ in the last bits of a double.
 """
 
 import contextlib
 import itertools
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-__all__ = ["compile_quickly", "compiles_long", "crowded", "environment", "keep_compiled", "make_room", "of_threads"]
+__all__ = ["compile_quickly", "crowded", "environment", "keep_compiled", "level_of", "make_room", "of_threads"]
 
 # In one piece: the parts that threads share take a half more in all, and few machines have cores for them.
-FLAGS = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-)
+FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 SMALL_BYTES = 3_000_000  # some 20,000 rows of a CSV file
+LARGE_BYTES = 50_000_000  # of larger logs level 1 costs more than it saves: with 87 MB a diagnosis took 14 % longer
 PACKED = 5  # times smaller than that, where a file is compressed
 KEPT_BYTES = 40_000_000  # some 2,000 programs; JAX looks at each when it adds one; those not used for longest go first
 # Memory maps of a process: Linux gives it 65,530. So many are 1 GB of compiled programs, those of three searches on
@@ -29,17 +28,29 @@ _calls = itertools.count(1)
 _COMPRESSED = {".gz", ".parquet", ".mat", ".zip", ".xz", ".bz2"}
 
 
-def compile_quickly() -> None:
-    """For this process, if nothing has been compiled in it yet. What `XLA_FLAGS` holds already has the last word."""
+def compile_quickly(level: int = 0) -> None:
+    """For this process, if nothing has been compiled in it yet. What `XLA_FLAGS` holds already has the last word.
+
+    **Arguments:** `level`, XLA's level of optimisation (`level_of`).
+    """
     asked = os.environ.get("XLA_FLAGS", "")
     if FLAGS not in asked:
-        os.environ["XLA_FLAGS"] = f"{FLAGS} {asked}".strip()
+        os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level={level} {FLAGS} {asked}".strip()
 
 
-def compiles_long(logs: Iterable[str | Path]) -> bool:
-    """Whether compiling is most of what these logs take; what is no file counts as nothing."""
-    paths = [p for p in map(Path, logs) if p.is_file()]
-    return sum(p.stat().st_size * (PACKED if p.suffix in _COMPRESSED else 1) for p in paths) < SMALL_BYTES
+def level_of(vehicles: Sequence[Sequence[Path]]) -> int | None:
+    """The level that suits the logs of these vehicles, each a list of files; None: as XLA does by default.
+
+    What is no file counts as nothing.
+    """
+
+    def size(files: Sequence[Path]) -> int:
+        return sum(p.stat().st_size * (PACKED if p.suffix in _COMPRESSED else 1) for p in files if p.is_file())
+
+    each = [size(files) for files in vehicles]
+    if sum(each) < SMALL_BYTES:
+        return 0
+    return 1 if max(each) < LARGE_BYTES else None
 
 
 def of_threads(count: int) -> dict[str, str]:

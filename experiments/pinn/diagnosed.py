@@ -24,8 +24,8 @@ _OF_TRIPS = ("at_trip", "in_mode")  # parameters that say something of the trips
 
 @cache
 def found_effects(data: Data, vehicles: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Effects that the diagnoses of these vehicles find on their training routes, in the order of how often, with the
-    median of each shape; sizes and thresholds are left open.
+    """Effects that the diagnoses of these vehicles find on their training routes but the last, in the order of how
+    often, with the median of each shape; sizes and thresholds are left open.
 
     What began at some trip, or holds in some, is of one vehicle's log and no part of it.
     """
@@ -47,9 +47,9 @@ def united(found: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict
 
 
 def diagnosed(m: Member, seed: int) -> tuple[Vehicle, dict[str, dict[str, float]], dict[str, Any]]:
-    """The vehicle with the effects that the diagnosis finds on its training routes, what these are, and what the
-    declared coefficients became. The whole loop, as `hdev diagnose` runs it on so short a log: in a process that
-    compiles quickly, which one where networks are trained does not."""
+    """The vehicle with the effects that the diagnosis finds on its training routes but the last, what these are, and
+    what the declared coefficients became. The whole loop, as `hdev diagnose` runs it on so short a log: in a process
+    that compiles quickly, which one where networks are trained does not."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _quickly) as pool:
         return pool.submit(_diagnosed, m, seed).result()
 

@@ -163,7 +163,7 @@ def _handed_out(
         if not held_out_gain(problem, split, predicted[0], predicted[-1], levels=levels) > -settings.ahead:
             tell("contradicted by the held-out trips: nothing is named")
             named, steps, predicted, state = none_named(named, steps[0]), steps[:1], predicted[:1], None
-    given = given_states(problem, split, named, steps[-1], seed)
+    given = given_states(problem, split, named, steps[-1], seed, kernel=training.kernel)
     explained = predicted[-1] if given is None else given.predicted
     described = _formula(problem, training, state, explained, given) if state is not None else None
     plain = keep(
@@ -180,7 +180,7 @@ def _handed_out(
         steps, predicted = [*steps[:-1], known], [*predicted[:-1], last]
         test = problem.rows(split.test)
         left = replace(left, noise_floor_rmse=float(np.sqrt(np.mean((problem.measured - predicted[-1])[test] ** 2))))
-        given = given_states(problem, split, named, known, seed)
+        given = given_states(problem, split, named, known, seed, kernel=training.kernel)
     return _Model(named, steps, predicted, given, left)
 
 

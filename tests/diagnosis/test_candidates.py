@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -171,6 +172,55 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows)
         instruments |= {(x.structure, jax.tree.structure(x.car)) for x in after}
     assert len(programs) == 1
     assert len(instruments) == 2
+
+
+def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows):
+    """A load that switches, by its decoded state, a cycle with a phase and a mode in each trip, the last of them
+    unknown: one program whatever their sizes and phases, another one where a trip more has a phase."""
+    facts = facts_of(rows.segments, rows.rows)
+    segments = rows.segments.with_channels(**{"derived:switching_load": np.arange(len(rows.measured)) // 7 % 2.0})
+    trips = int(np.max(np.asarray(segments.trip)))
+    effects = ("switching_load", "periodic_load", "mode_change", "auxiliary_power", "headwind")
+    kernel, programs = SharedKernel({k: LIBRARY[k] for k in effects}, facts, rows.segments), []
+
+    def by_trip(cls: type[Effect], name: str, known: np.ndarray, **values: float) -> Effect:
+        effect = with_values(cls, facts.gears, **values)
+        return eqx.tree_at(lambda e: getattr(e, name), effect, Grouped(jnp.asarray([*known, np.nan]), "trip"))
+
+    for k, more in ((1.0, 0), (1.7, 0), (1.7, 1)):
+        phases = np.linspace(-0.5, 0.5, trips + more) * k
+        has = [
+            with_values(LIBRARY["switching_load"], facts.gears, power_w=2000.0 * k),
+            by_trip(LIBRARY["periodic_load"], "phase", phases, power_w=800.0 * k, period_s=300.0 * k, duty=0.4),
+            by_trip(LIBRARY["mode_change"], "in_mode", (phases > 0) * 1.0, loss=0.05 * k, share=0.5),
+            *([with_values(LIBRARY["auxiliary_power"], facts.gears, power_w=900.0)] if k > 1.0 else []),
+        ]
+        vehicle, sizes = problem.vehicle.plus(*has), ["power_w", "loss"]
+        table = ParameterTable((*problem.table.rows, *(c for e in has for c in effect_coefficients(e, sizes))))
+        expected = linearised(vehicle, table, segments, problem.target)
+        assert kernel._of_library(vehicle, problem.target)
+        got = kernel.linearised(vehicle, table, segments, problem.target)
+        for a, b in zip(got, expected, strict=True):
+            assert np.all(np.abs(a - b) <= 1e-9 * np.max(np.abs(b), axis=0))
+        np.testing.assert_allclose(kernel.predict(vehicle, segments, problem.target), expected[0], rtol=1e-9)
+        programs.append(kernel._of_table(vehicle, table)[0])
+    assert programs[0] is programs[1]
+    assert programs[1] is not programs[2]
+
+
+def test_a_change_of_mode_has_the_same_columns_by_shared_programs(problem, rows):
+    facts, mode = facts_of(rows.segments, rows.rows), LIBRARY["mode_change"]
+    effects = [LIBRARY[k] for k in ("auxiliary_power", "headwind")]
+    kernel = SharedKernel({c.id: c for c in (*effects, mode)}, facts, rows.segments)
+    vehicle = problem.vehicle.plus(with_values(effects[0], facts.gears, power_w=900.0))
+    on = {"in_mode": (1.0,), "share": (0.5,)}
+    plans = [plan_of(vehicle, [mode], facts, problem.target, on, searched=True, kernel=k) for k in (kernel, None)]
+    assert plans[0].candidates == plans[1].candidates
+    a, b = (np.zeros((len(rows.segments), p.width)) for p in plans)
+    for out, plan in zip((a, b), plans, strict=True):
+        plan.write(out, rows.segments)
+    assert np.all(np.std(b, axis=0) > 0)
+    np.testing.assert_allclose(a, b, atol=1e-9 * np.max(np.abs(b)))
 
 
 class Amplified(Effect):

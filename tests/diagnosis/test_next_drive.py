@@ -35,10 +35,11 @@ def test_what_is_advised_is_enough_and_less_is_not(known):
     assert given
     assert [a.hours for a in given] == sorted(a.hours for a in given)
     at = np.array([k for k, c in enumerate(state.fit.table.free) if c.path == "effects.auxiliary_power.power_w"])
-    logged = _information(problem, state, rows, LIBRARY["cabin_warmup"])
+    logged = _information(problem, state, rows, [LIBRARY["cabin_warmup"]])["cabin_warmup"]
     for a in (a for a in given if a.drive):
         drive = simulate(DRIVES[a.drive], problem)
-        extra = _information(problem, state, padded(drive, np.zeros(len(drive))), LIBRARY["cabin_warmup"])
+        there = padded(drive, np.zeros(len(drive)))
+        extra = _information(problem, state, there, [LIBRARY["cabin_warmup"]])["cabin_warmup"]
         times = a.hours / (float(np.sum(drive.duration_s)) / 3600)
         assert times == pytest.approx(round(times))
         size = np.asarray(state.fit.values)[at]
@@ -47,6 +48,16 @@ def test_what_is_advised_is_enough_and_less_is_not(known):
         assert _relative_sd(base + times * extra[worst], size, at) <= 1 / SEPARATED
         if times > 1:
             assert _relative_sd(base + (times - 1) * extra[worst], size, at) > 1 / SEPARATED
+
+
+def test_each_pair_has_the_advice_that_it_has_alone(known):
+    problem, state, rows = known
+    pairs = [("auxiliary_power", LIBRARY[k]) for k in ("cabin_warmup", "standstill_load")]
+    together = advise(problem, state, rows, pairs)
+    alone = [a for pair in pairs for a in advise(problem, state, rows, [pair])]
+    assert [(a.rival, a.drive, a.hours) for a in together] == [(a.rival, a.drive, a.hours) for a in alone]
+    assert {a.rival for a in together} == {"cabin_warmup", "standstill_load"}
+    np.testing.assert_allclose([a.sd_after for a in together], [a.sd_after for a in alone], rtol=1e-6)
 
 
 def test_what_no_drive_tells_is_said_to_be(tmp_path):

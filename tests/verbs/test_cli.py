@@ -246,17 +246,26 @@ def test_progress_is_silent_in_the_library_and_a_line_a_step_in_a_command(capsys
     assert [line.split("s  ")[1] for line in captured.err.splitlines()] == ["reading [a.csv]", "resampling"]
 
 
-def test_a_small_log_is_compiled_for_quickly_and_the_users_flags_have_the_last_word(api, monkeypatch, tmp_path):
+def test_the_size_of_a_log_decides_how_it_is_compiled_and_the_users_flags_have_the_last_word(
+    api, monkeypatch, tmp_path
+):
     small, large = tmp_path / "small.csv", tmp_path / "large.csv"
     small.write_text("a,b\n")
     large.write_bytes(b"0" * 4_000_000)
     packed = tmp_path / "packed.csv.gz"
     packed.write_bytes(b"0" * 1_000_000)
-    for logs, quick in (([small], True), ([small, large], False), ([packed], False), ([tmp_path / "none.csv"], True)):
+    huge = tmp_path / "huge.csv"
+    with huge.open("wb") as f:
+        f.truncate(60_000_000)
+    for logs, level in (
+        ([huge], None), ([small, huge], None), ([small], 0), ([small, large], 1), ([packed], 1),
+        ([tmp_path / "none.csv"], 0),
+    ):  # fmt: skip
         monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=2")
         assert cli.main(["diagnose", *map(str, logs), *SHEET, "--out", str(tmp_path / "out")]) == 0
         flags = os.environ["XLA_FLAGS"].split()
-        assert ("--xla_cpu_use_fusion_emitters=false" in flags) == quick
+        assert ("--xla_cpu_use_fusion_emitters=false" in flags) == (level is not None)
+        assert f"--xla_backend_optimization_level={level}" in flags or level is None
         assert flags[-1] == "--xla_backend_optimization_level=2"
     once = os.environ["XLA_FLAGS"]
     cli.main(["check", str(large)])

@@ -93,7 +93,7 @@ def plan_of(
         else:
             nulls.append(absent(c, facts))
     known = [e for e in nulls if of_library(type(e))]
-    if kernel is not None and not searched and kernel.serves(vehicle, target):
+    if kernel is not None and kernel.serves(vehicle, target):
         groups = _shared(vehicle, known, kernel)
     else:
         groups = _separate(vehicle, known, effects)

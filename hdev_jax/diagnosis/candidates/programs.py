@@ -22,7 +22,7 @@ Place = tuple[str, int | None]  # a coefficient's path, and its group
 Structure = tuple[tuple[str, int | None, float, float], ...]
 # These two change the time alone, not what is found.
 PER_PASS = 4  # columns in one pass: 9 ms for 14,000 rows, one alone 7.5 ms
-SIDE_BY_SIDE = 2 * PER_PASS  # coefficients' derivatives in multiples of so many, so that few programs are compiled
+SIDE_BY_SIDE = 2 * PER_PASS  # coefficients' derivatives in one pass: always as many, so that one program serves all
 
 
 class _Part(NamedTuple):
@@ -67,11 +67,11 @@ class Program:
         *, lanes: int = SIDE_BY_SIDE,
     ) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]:  # fmt: skip
         """The prediction at these values, in the target's unit, and its derivatives in the parameters `free`, per unit
-        of each, side by side in a multiple of `lanes`."""
+        of each, `lanes` of them in a pass."""
         along = np.zeros((-(-len(free) // lanes) * lanes, len(values)))
         along[np.arange(len(free)), free] = 1.0
-        shown, slopes = self._along(segments, target, values, along)
-        return shown, slopes[:, : len(free)]
+        passes = [self._along(segments, target, values, along[k : k + lanes]) for k in range(0, len(along), lanes)]
+        return passes[0][0], np.concatenate([slopes for _, slopes in passes], axis=1)[:, : len(free)]
 
     def _along(
         self, segments: Segments, target: TargetName, values: Float[np.ndarray, " parameter"],

@@ -1,5 +1,6 @@
 """The kernel that the vehicles of one search share: every effect of the library is in it, at its null where it was not
-found, so that it is compiled once."""
+found, so that it is compiled once. (Effects with a search of their own are in it once they are found: it is compiled
+again for each.)"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -100,7 +101,7 @@ class SharedKernel:
         """Whether the vehicle is computed by the shared programs: the declared model has its own, and so have vehicles
         with other effects than this library's."""
         beside = [e for e in vehicle.effects if type(e) not in DECLARED]
-        known = all(of_library(type(e)) and self.library.get(e.id) is type(e) and not e.searched for e in beside)
+        known = all(of_library(type(e)) and self.library.get(e.id) is type(e) for e in beside)
         return bool(beside) and known and self.serves(vehicle, target)
 
     def _of_table(
@@ -119,13 +120,15 @@ class SharedKernel:
         )  # fmt: skip
         varied = {id(x) for x in jax.tree.leaves([leaf_of(vehicle, path) for path, _ in others])}
         held = tuple(np.asarray(x).tobytes() for x in rest if id(x) not in varied)
-        key = tuple(i for i, e in beside.items() if apart(e)), tuple(others), held
+        searched = [e for e in beside.values() if e.searched]
+        by_trip = tuple((jax.tree.structure(e), *map(np.shape, jax.tree.leaves(e))) for e in searched)
+        key = tuple(i for i, e in beside.items() if apart(e)), by_trip, tuple(others), held
         if key not in self._programs:
             self._programs[key] = self.program(vehicle, declared=others)
         program, values, place = self._programs[key], [], {}
         for k, (path, group, _, _) in enumerate(program.structure):
             leaf = leaf_of(vehicle, path) if not path.startswith(heads) else self._leaf(beside, *path.split(".")[1:])
-            values.append(float(leaf if group is None else leaf.values[group]))
+            values.append(float(leaf if group is None else np.asarray(leaf.values)[group]))
             place[path, group] = k
         return program, np.array(values), [place[in_effect(c.path), c.group] for c in table.free]
 
@@ -136,12 +139,13 @@ class SharedKernel:
 
     def _completed(self, vehicle: Vehicle) -> tuple[Vehicle, Collection[str], dict[str, Effect]]:
         """A vehicle whose found effects have the limits that they were found without, at their null; the ids of these
-        effects; the other effects of the library that are part of the kernel, at their null, by id."""
+        effects; the other effects of the library that are part of the kernel, at their null, by id. An effect with a
+        search of its own is part of it once it is found."""
         found, rest = {}, {}
-        for c in (c for c in self.library.values() if of_library(c) and not c.searched):
+        for c in (c for c in self.library.values() if of_library(c)):
             if vehicle.has(c.id):
                 found[c.id] = _with_limits(vehicle.effect(c.id), self._null(c))
-            elif not (apart(c) or unavailable(c, self.facts.sample, vehicle.entry, vehicle.stands_in)):
+            elif not (apart(c) or c.searched or unavailable(c, self.facts.sample, vehicle.entry, vehicle.stands_in)):
                 rest[c.id] = self._null(c)
         return vehicle.minus(*found).plus(*found.values()), tuple(found), rest
 

@@ -23,7 +23,7 @@ from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
-from hdev_jax.inference import Clusters, predict
+from hdev_jax.inference import Clusters
 from hdev_jax.inference.rows import Chunk
 from hdev_jax.physics.battery import ModeChange, StepChange
 
@@ -64,7 +64,7 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
 
     def write(out: np.ndarray, chunk: Chunk) -> None:
         plan.write(out[:, :-1], chunk.segments)
-        out[:, -1] = np.nan_to_num(np.asarray(predict(state.fit.vehicle, chunk.segments, training.target)))
+        out[:, -1] = np.nan_to_num(training.kernel.predict(state.fit.vehicle, chunk.segments, training.target))
 
     evidence = evidence_of(baseline, plan.width + 1, write)
     every = np.stack([_alone(evidence, c.columns[0]).grams for c in plan.candidates])

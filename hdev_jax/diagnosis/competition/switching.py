@@ -24,7 +24,6 @@ from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
-from hdev_jax.inference import predict
 from hdev_jax.inference.clusters import Clusters
 from hdev_jax.inference.states import (
     Decoded,
@@ -231,7 +230,7 @@ def _without_slow_loads(training: Training, state: State) -> tuple[list[str], np
     if not ids:
         return [], np.zeros(len(training.trip))
     car = state.fit.vehicle.minus(*ids)
-    each = [np.asarray(predict(car, c.segments, training.target))[: c.rows] for c in training.chunks]
+    each = [training.kernel.predict(car, c.segments, training.target)[: c.rows] for c in training.chunks]
     return ids, as_watts(training.target, state.fit.predicted - np.concatenate(each), training.seconds)
 
 

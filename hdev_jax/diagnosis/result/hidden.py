@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from hdev_jax.diagnosis.candidates.shared import SharedKernel
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.diagnosis.result.intervals import Open
 from hdev_jax.inference import Calibration, cluster_rows
@@ -67,8 +68,12 @@ class Given:
         return {i: {"power_w": Open(np.array([0.0, x]), np.full(2, 0.5))} for i, x in away.items()}
 
 
-def given_states(problem: Problem, split: Split, state: State, fit: Calibration, seed: int) -> Given | None:
-    """The states on every row of the log by what was fitted to the training trips; None where nothing is hidden."""
+def given_states(
+    problem: Problem, split: Split, state: State, fit: Calibration, seed: int, *, kernel: SharedKernel
+) -> Given | None:
+    """The states on every row of the log by what was fitted to the training trips; None where nothing is hidden.
+
+    The `kernel` of the search predicts."""
     if state.hidden is None or not state.hidden.ids:
         return None
     ids, seconds = state.hidden.ids, np.asarray(problem.segments.duration_s)
@@ -76,8 +81,11 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
     def known(on: np.ndarray) -> Segments:
         return problem.segments.with_channels(**{state_channel(i): on[:, k] for k, i in enumerate(ids)})
 
+    def predicted(on: Segments) -> np.ndarray:
+        return problem.predict(fit.vehicle, on, compute=kernel.predict)
+
     off = known(np.zeros((len(seconds), len(ids))))
-    left = as_watts(problem.target, problem.measured - problem.predict(fit.vehicle, off), seconds)
+    left = as_watts(problem.target, problem.measured - predicted(off), seconds)
     rows = rows_of(problem.segments, left, samples=TARGETS[problem.target].weight != "row")
     model, _ = fit_switching(state.hidden.model, rows.take(problem.rows(split.train)), 1)
     decoded = decode(model, rows)
@@ -87,8 +95,8 @@ def given_states(problem: Problem, split: Split, state: State, fit: Calibration,
     power = {i: float(np.asarray(fit.vehicle.effect(i).power_w)) for i in ids}
     both = [(power[i], errors.get(f"effects.{i}.power_w", 0.0)) for i in ids]
     return Given(
-        where, problem.predict(fit.vehicle, where), problem.predict(fit.vehicle, known(decoded.ahead)) + error, ids,
-        model, power, lambda: _kwh(problem, split, rows, model, decoded, both, seed),
+        where, predicted(where), predicted(known(decoded.ahead)) + error, ids, model, power,
+        lambda: _kwh(problem, split, rows, model, decoded, both, seed),
     )  # fmt: skip
 
 

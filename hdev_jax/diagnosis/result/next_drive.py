@@ -146,28 +146,32 @@ def advise(
     **Arguments:** `pairs` of a found effect's id and the rival's class; `best`, how many drives for each pair.
     **Returns:** advice, the shortest first; one with an empty `drive` for a pair that no drive here separates.
     """
+    rivals = {rival.id: rival for _, rival in pairs}
+    # of a long log one rival's columns at a time; drives are short
+    logged = {k: _information(problem, state, rows, [rival])[k] for k, rival in rivals.items()}
+    pairs = [(found, rival) for found, rival in pairs if logged[rival.id] and len(_places(state, found)[0])]
+    if not pairs:
+        return []
+    drives = {name: simulate(parts, problem) for name, parts in DRIVES.items()}
+    every = [*rivals.values()]
+    driven = {k: _information(problem, state, padded(d, np.zeros(len(d))), every) for k, d in drives.items()}
     out = []
     for found, rival in pairs:
         at, size = _places(state, found)
-        logged = _information(problem, state, rows, rival)
-        if not logged or not len(at):
-            continue
         # of the rival's forms, the one that is hardest to separate from the found effect
-        logged = [information + _prior(state) for information in logged]
-        which = max(range(len(logged)), key=lambda k: _relative_sd(logged[k], size, at))
-        now = _relative_sd(logged[which], size, at)
+        forms = [information + _prior(state) for information in logged[rival.id]]
+        which = max(range(len(forms)), key=lambda k: _relative_sd(forms[k], size, at))
+        now = _relative_sd(forms[which], size, at)
         options = []
-        for name, parts in DRIVES.items():
-            drive = simulate(parts, problem)
-            extras = _information(problem, state, padded(drive, np.zeros(len(drive))), rival)
-            if which >= len(extras):
+        for name, drive in drives.items():
+            if which >= len(driven[name][rival.id]):
                 continue
-            extra = extras[which]
-            repeats = _repeats(logged[which], extra, size, at)
+            extra = driven[name][rival.id][which]
+            repeats = _repeats(forms[which], extra, size, at)
             if repeats is not None:
                 kilometres = repeats * float(np.sum(drive.distance_m)) / 1e3
                 hours = repeats * float(np.sum(drive.duration_s)) / 3600
-                after = _relative_sd(logged[which] + repeats * extra, size, at)
+                after = _relative_sd(forms[which] + repeats * extra, size, at)
                 options.append(Advice(found, rival.id, name, kilometres, hours, min(now, 1e6), after))
         nothing = Advice(found, rival.id, "", 0.0, 0.0, min(now, 1e6), 1e6)
         out += sorted(options, key=lambda a: a.hours)[:best] or [nothing]
@@ -199,16 +203,18 @@ def _places(state: State, found: str) -> tuple[np.ndarray, np.ndarray]:
     return at, np.asarray(state.fit.values)[at]
 
 
-def _information(problem: Problem, state: State, rows: Fit, rival: type[Effect]) -> list[np.ndarray]:
-    """Fisher information of these rows on [free coefficients, rival's size], for each form of the rival."""
+def _information(
+    problem: Problem, state: State, rows: Fit, rivals: Sequence[type[Effect]]
+) -> dict[str, list[np.ndarray]]:
+    """Fisher information of these rows on [free coefficients, rival's size], for each form of each rival."""
     fit = state.fit
     jac = jacobian(fit.vehicle, fit.table, rows.segments, problem.target)[: rows.rows]
-    candidates, matrix, _ = columns(fit.vehicle, [rival], rows.segments, rows.rows, problem.target)
-    out = []
+    candidates, matrix, _ = columns(fit.vehicle, rivals, rows.segments, rows.rows, problem.target)
+    out: dict[str, list[np.ndarray]] = {rival.id: [] for rival in rivals}
     for c in candidates:
         if len(c.columns) == 1 and c.kind == "size":
             both = np.concatenate([jac, matrix[:, [c.columns[0]]]], axis=1)
-            out.append(both.T @ both / (fit.sigma**2 * fit.inflation))
+            out[c.id].append(both.T @ both / (fit.sigma**2 * fit.inflation))
     return out
 
 
