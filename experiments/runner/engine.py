@@ -222,8 +222,8 @@ def _collected(plan: Plan, pairs: list[tuple[dict[str, Any], Any]], run: Run) ->
 
 def _environment(where: Where) -> dict[str, Any]:
     """What decides speed, and which commit of the checkout runs, beside what every run records."""
+    known = {"workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         git = ["git", "-C", str(store.HERE), "describe", "--always", "--dirty", "--abbrev=12"]
-        commit = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-        return {"commit": commit, "workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}
-    return {"workers": where.workers, "scheduler": where.scheduler, "machine": platform.machine()}
+        known["commit"] = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    return known
