@@ -28,7 +28,7 @@ from experiments.measured.road_load import PAIRS
 from experiments.measured.withheld import WITHHELD, compare_logs, write_adapter
 from experiments.runner.store import sources_of
 from hdev_jax.verbs.opening import digest
-from hdev_jax.verbs.predict import strongly_correlated
+from hdev_jax.verbs.predict import correlated_pairs
 
 __all__ = ["Job", "jobs", "kept", "main"]
 
@@ -164,7 +164,7 @@ def kept(job: Job, work: Path) -> dict[str, Any] | None:
     covariance = _json(out / "predictive.json").get("covariance")
     if covariance is None:
         raise SystemExit(f"{out} lacks predictive.json: remove the folder, and the run is made again")
-    together = strongly_correlated(covariance["names"], np.array(covariance["matrix"]))
+    together = correlated_pairs(covariance["names"], np.array(covariance["matrix"]))
     return {**result, "cost": cost, "ran": ran, "together": together, "coefficients": _coefficients(out)}
 
 

@@ -27,6 +27,7 @@ from experiments.measured.tables import (
     size_rows,
     size_table,
     table,
+    together,
 )
 from experiments.measured.withheld import WITHHELD
 from experiments.runner.pages.site import folded
@@ -108,14 +109,19 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
                 low, high = pooled_interval(by_trip)
                 within = f" (90 %: {low:.2f} to {high:.2f}, over {len(by_trip)} test trips)"
             found = f"All {len(runs)} find {named(always)}." if always else "No effect is found by all."
+            for pair, each in together(runs):
+                if len(each) == len(runs) > 1:
+                    found += f" Of {pair} each determines only a combination."
             if turned := [r for r in size_rows(runs) if len({np.sign(v) for _, v, _ in r.cells.values()}) > 1]:
                 said = names.verbose_join([" or ".join(f"`{p}`" for p in row.paths) for row in turned])
                 found += f" The sign of {said} differs."
             if len(runs) > 1:
                 found += f" {_agreeing(runs)}"
+            slow = sum(r["unexplained"]["memory_s"] is not None for r in runs.values())
             out.append(
                 f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. {found} "
-                f"In {open_} of {len(runs)} the diagnosis reports unexplained structure."
+                f"In {open_} of {len(runs)} the diagnosis reports structure that no effect explains, in {slow} a "
+                "residual that drifts within trips."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)
@@ -159,9 +165,10 @@ def _details(runs: Runs, head: str, caution: str) -> list[str]:
 def _agreement(runs: Runs, caution: str) -> list[str]:
     """How many sizes agree between training sets, and which do not."""
     lines = [f"{_agreeing(runs)} {caution}"]
-    if together := {k: r["together"] for k, r in runs.items() if r["together"]}:
-        lines += ["", "Strongly correlated coefficients, by training set:", ""]
-        lines += [f"- {k}: {line}." for k, said in together.items() for line in said]
+    if pairs := together(runs):
+        lines += ["", "Strongly correlated coefficients (training set: correlation), of which a log determines only a "
+                  "combination:", ""]  # fmt: skip
+        lines += [f"- {pair} ({', '.join(f'{k}: {c:.2f}' for k, c in each)})." for pair, each in pairs]
     return lines
 
 

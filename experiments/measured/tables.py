@@ -29,6 +29,7 @@ __all__ = [
     "size_rows",
     "size_table",
     "table",
+    "together",
 ]
 
 Runs = Mapping[str, Mapping[str, Any]]  # diagnosis.json by the name of its training set
@@ -198,7 +199,7 @@ def nearest(result: Mapping[str, Any]) -> str:
 
 
 def left_table(runs: Runs, head: str, unit: str) -> list[str]:
-    """What each run leaves: error, noise floor, and what the diagnosis says of the rest."""
+    """What each run leaves: error, what a learner would take off it, and what the diagnosis says of the rest."""
     rows = []
     for run, r in runs.items():
         u = r["unexplained"]
@@ -209,11 +210,21 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
              words.number(u["noise_floor_rmse"]), share, on, signature(u), nearest(r)]
         )  # fmt: skip
     return table(
-        [head, "verdict", f"test RMSE after [{unit}]", f"noise floor [{unit}]",
+        [head, "verdict", f"test RMSE after [{unit}]", f"the same, less what LightGBM predicts [{unit}]",
          "share of the remaining test variance that LightGBM predicts", "depends on", "what is left",
          "best rejected candidate"],
         rows,
     )  # fmt: skip
+
+
+def together(runs: Runs) -> list[tuple[str, list[tuple[str, float]]]]:
+    """Pairs of strongly correlated coefficients, in words, and their correlation in each training set that has them."""
+    found: dict[frozenset[str], list[tuple[str, float]]] = {}
+    for run, r in runs.items():
+        for *pair, correlation in r["together"]:
+            both = frozenset(name.removeprefix("effects.") for name in pair)
+            found.setdefault(both, []).append((run, correlation))
+    return [(names.verbose_join([f"`{n}`" for n in sorted(pair)]), each) for pair, each in found.items()]
 
 
 def signature(unexplained: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.runner.compare import tally
 from experiments.runner.figures import save_figure, styled
 from experiments.runner.tables import write_tables
 from hdev_jax.learn.gears.classifiers import LEAST_ROWS
@@ -71,12 +72,9 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
         "Rows of unseen routes by true gear (down) and predicted gear (across)",
     )
     _figure(run, short, shown)
-    compared = [r for r in rows if r["paper"] and r["ours"]]
-    headline = "accuracy_unseen_routes"
     return {
         "artefact": config.artefact, "data": f"synthetic fleet, seed {config.seed}, {config.routes} routes",
-        "synthetic": True, "rows": rows, "headline": headline, "bound": bound,
-        "better_than_paper": sum(r["ours"][headline] >= r["paper"][headline] for r in compared), "of": len(compared),
+        "synthetic": True, "rows": rows, "bound": bound, **tally(rows, "accuracy_unseen_routes", more_is_better=True),
         "missed": [*_missed(config, found, bound)],
         "notes": [
             "rows of training, of unseen routes and of unseen variants "

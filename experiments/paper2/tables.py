@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.runner.compare import tally
 from experiments.runner.tables import readable, write_tables
 from hdev_jax.errors import InputError
 from hdev_jax.rundir import Run
@@ -41,11 +42,10 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     compared = [r for r in rows if r["ours"] and r["paper"] and first in r["paper"]]
     return {
-        "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows, "headline": first,
-        "better_than_paper": sum(abs(r["ours"][first]) <= abs(r["paper"][first]) for r in compared),
-        "of": len(compared), "notes": [*config.notes, *_described(config, found)], "logs": 1 + len(config.test),
+        "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,
+        **tally(rows, first), "notes": [*config.notes, *_described(config, found)], "logs": 1 + len(config.test),
         "missed": [
-            f"{r['name']} has {first} {r['ours'][first]:.4g}, the paper {r['paper'][first]:.4g}"
+            f"{r['name']}: {readable(first)} {r['ours'][first]:.4g}, the paper's {r['paper'][first]:.4g}"
             for r in compared if abs(r["ours"][first]) > abs(r["paper"][first])
         ],
     }  # fmt: skip

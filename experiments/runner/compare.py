@@ -1,12 +1,25 @@
 """A run's metrics: what they must hold, and the paper's numbers beside ours."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any
 
 from experiments.runner.tables import readable
 
-__all__ = ["check", "comparison", "decides", "findings", "headlines", "missed", "notes", "numbers"]
+__all__ = [
+    "as_good",
+    "check",
+    "comparison",
+    "decides",
+    "findings",
+    "headlines",
+    "merged",
+    "missed",
+    "notes",
+    "numbers",
+    "tally",
+]
 
 DECIDES = "Main error of each model"
 OVER_STARTS = "; median and range are over the random starts of its fit"
@@ -27,8 +40,8 @@ def check(metrics: Mapping[str, Any]) -> None:
 def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A line for each number that the paper has: `name, quantity, paper, ours, ratio, why_not`.
 
-    `ratio` is ours over the paper's, of errors with a sign their sizes, None where either is none or the paper's is 0;
-    `why_not`, the reason where we have no number.
+    `ratio` is ours over the paper's, of errors with a sign their sizes; None where either is none, the paper's is 0, or
+    ours is of synthetic data, which are not the paper's. `why_not`, the reason where we have no number.
     """
     lines = []
     for row in metrics["rows"]:
@@ -36,7 +49,7 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         for quantity, paper in (row["paper"] or {}).items():
             if _number(paper) is not None:
                 own = _number(ours.get(quantity))
-                ratio = abs(own / paper) if own is not None and paper else None
+                ratio = _ratio(metrics, own, paper)
                 reason = None if own is not None else row.get("reason", "not computed")
                 lines.append(
                     {
@@ -54,7 +67,7 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A line for each row of a run that says which quantity decides (`metrics["headline"]`), whether the paper has it.
 
-    With the spread over starts, where the row has one (`spread`: least, median, most).
+    `ratio` as in `comparison`; with the spread over starts, where the row has one (`spread`: least, median, most).
     """
     quantity, lines = metrics.get("headline"), []
     if quantity is None:
@@ -65,7 +78,7 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         lines.append(
             {
                 "name": readable(row["name"]), "quantity": readable(quantity), "paper": paper, "ours": own,
-                "ratio": abs(own / paper) if own is not None and paper else None,
+                "ratio": _ratio(metrics, own, paper),
                 "median": spread.get("median"),
                 "range over starts": [spread["least"], spread["most"]] if spread else None,
                 "why_not": row.get("reason"),
@@ -74,9 +87,50 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     return lines
 
 
+def tally(rows: Sequence[Mapping[str, Any]], quantity: str, *, more_is_better: bool = False) -> dict[str, Any]:
+    """What metrics hold of the quantity that decides: its key, and in how many rows ours is at least as good."""
+    pairs = [(r["ours"][quantity], r["paper"][quantity]) for r in rows if r["ours"] and quantity in (r["paper"] or {})]
+    better = sum(own >= paper if more_is_better else abs(own) <= abs(paper) for own, paper in pairs)
+    return {"headline": quantity, "better_than_paper": better, "of": len(pairs)}
+
+
+def as_good(every: Iterable[Mapping[str, Any]]) -> list[str]:
+    """In how many comparisons of several runs on measured data ours is at least as good as the paper: a number that
+    stands in several tables counts once."""
+    compared = [
+        x for m in every if m["of"] and not m["synthetic"] for x in headlines(m) if None not in (x["paper"], x["ours"])
+    ]
+    compared = merged([{"part": "", **x} for x in compared])
+    better = sum(x["ratio"] <= 1.0 for x in compared)
+    return [f"At least as good as the paper in {better} of {len(compared)} comparisons."] if compared else []
+
+
+def merged(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Lines of several runs (`part`, and what `headlines` has), one for each number: its parts are joined."""
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    parts: dict[tuple[Any, ...], list[str]] = {}
+    for x in lines:
+        key = (x["name"], x["quantity"], x["paper"], x["ours"])
+        found.setdefault(key, dict(x))
+        parts.setdefault(key, []).append(x["part"])
+    return [{**x, "part": _joined(parts[key])} for key, x in found.items()]
+
+
+def _joined(parts: Sequence[str]) -> str:
+    """`Table 4` and `Table 8` are `Tables 4, 8`."""
+    split = [re.fullmatch(r"(.*(?:table|figure)) (\d+)", p, re.IGNORECASE) for p in parts]
+    if len(parts) == 1 or not all(split) or len({m[1] for m in split if m}) > 1:
+        return ", ".join(parts)
+    return f"{split[0][1]}s {', '.join(m[2] for m in split if m)}" if split[0] else ""
+
+
 def decides(lines: Sequence[Mapping[str, Any]]) -> str:
     """The caption of a table of headlines."""
     return DECIDES + (OVER_STARTS if any(x["range over starts"] for x in lines) else "")
+
+
+def _ratio(metrics: Mapping[str, Any], ours: float | None, paper: float | None) -> float | None:
+    return abs(ours / paper) if ours is not None and paper and not metrics["synthetic"] else None
 
 
 def _number(x: Any) -> float | None:
@@ -96,7 +150,12 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
     if metrics.get("skipped"):
         n = len(metrics["skipped"])
         said.append(f"{n} {'log' if n == 1 else 'logs'} could not be simulated as configured.")
-    if metrics["of"] == 1:
+    if metrics["of"] and metrics["synthetic"]:
+        better, of = metrics["better_than_paper"], metrics["of"]
+        said.append(
+            f"At least as good, on synthetic data, as the paper on its own data in {better} of {of} comparisons."
+        )
+    elif metrics["of"] == 1:
         said.append(f"Ours is {'at least' if metrics['better_than_paper'] else 'not'} as good as the paper.")
     elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")

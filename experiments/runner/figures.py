@@ -32,33 +32,29 @@ def save_figure(run: Run, fig: Any, name: str) -> None:
 def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
     """The deciding error of each model over the paper's, as PNG; None where fewer than `LEAST_COMPARED` have both.
 
-    **Arguments:** `rows`: `part, name, quantity, paper, ours` (`compare.headlines`) and, over all random starts of a
-    fit, `range over starts`. Accuracies, of which more is better, are left out.
+    **Arguments:** `rows`: `part, name, quantity, paper, ours, ratio` (`compare.merged`) and, over all random starts of
+    a fit, `range over starts`. Those without a ratio are left out.
     """
-    models: dict[tuple[Any, ...], list[str]] = {}
-    spread: dict[tuple[Any, ...], Any] = {}
-    for x in rows:
-        if x["paper"] and x["ours"] and "accuracy" not in x["quantity"]:
-            key = (x["name"], x["quantity"], x["paper"], x["ours"])
-            models.setdefault(key, []).append(x["part"])
-            spread[key] = x.get("range over starts")
+    models = [x for x in rows if x["ratio"] is not None]
     if len(models) < LEAST_COMPARED:
         return None
     with style():
         fig = figure(7.0, 0.9 + 0.24 * len(models))
         ax = fig.subplots()
-        for i, key in enumerate(models):
-            paper, ours = abs(key[2]), abs(key[3])
-            if span := spread[key]:
-                ax.plot([abs(s) / paper for s in span], [i, i], color="#c3cad1", linewidth=4, solid_capstyle="butt")
-            ax.plot(ours / paper, i, "o", color=AFTER if ours <= paper else BEFORE, markersize=5)
-            ax.annotate(f"{ours / paper:.2f}", (ours / paper, i), (0, 4), textcoords="offset points", ha="center",
+        ends = []
+        for i, x in enumerate(models):
+            ratio = x["ratio"]
+            span = [abs(end / x["paper"]) for end in x.get("range over starts") or ()]
+            if span:
+                ax.plot(span, [i, i], color="#c3cad1", linewidth=4, solid_capstyle="butt")
+            ax.plot(ratio, i, "o", color=AFTER if ratio <= 1.0 else BEFORE, markersize=5)
+            ax.annotate(f"{ratio:.2f}", (ratio, i), (0, 4), textcoords="offset points", ha="center",
                         va="bottom", fontsize=6.5, color=INK)  # fmt: skip
+            ends += [1.0, ratio, *span]
         ax.axvline(1.0, color=GREY, linewidth=0.9)
-        ax.set_yticks(range(len(models)), [f"{k[0]}, {k[1]} ({', '.join(c)})" for k, c in models.items()])
+        ax.set_yticks(range(len(models)), [f"{x['name']}, {x['quantity']} ({x['part']})" for x in models])
         ax.set_ylim(len(models) - 0.5, -0.7)
         ax.set_xscale("log")
-        ends = [abs(v) / abs(k[2]) for k in models for v in (k[2], k[3], *(spread[k] or ()))]
         low, high = min(ends) / 1.15, max(ends) * 1.15
         ax.set_xlim(low, high)
         ticks = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0, 100.0)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.compare import comparison, decides, headlines
+from experiments.runner.compare import as_good, comparison, decides, headlines, merged
 from experiments.runner.compute import Where, compute
 from experiments.runner.config import artefact, changes, shown, shown_point
 from experiments.runner.engine import Plan, claim_folder, plan, refuse_hurry, run_config, unfinished
@@ -143,14 +143,11 @@ def _summary(came: Outcomes, links: Mapping[str, Sequence[tuple[str, str]]]) -> 
         for path, run in every
     ]  # fmt: skip
     lines = [{"part": _title(path, run), **line} for path, run in every for line in comparison(run)]
-    first = [{"part": _title(path, run), **line} for path, run in every for line in headlines(run)]
-    measured = {_title(path, run) for path, run in every if not run["synthetic"]}  # synthetic data is not the paper's
-    theirs = [x for x in first if x["paper"] is not None and x["part"] in measured]
+    first = merged([{"part": _title(path, run), **line} for path, run in every for line in headlines(run)])
+    theirs = [x for x in first if x["ratio"] is not None]  # on the paper's own data
     alone = [x for x in first if x not in theirs]
     said = [] if came.made else ["No config of the list has been run."]
-    if compared := sum(run["of"] for _, run in every):
-        better = sum(run["better_than_paper"] for _, run in every)
-        said.append(f"At least as good as the paper in {better} of {compared} comparisons.")
+    said += as_good(run for _, run in every)
     said += [f"Not made: {why}." for why in came.reasons()]
     folded = [
         Folded("On synthetic data, and models that the papers do not have", tables=_table(decides(alone), alone)),

@@ -19,7 +19,7 @@ from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_o
 from hdev_jax.verbs.result import PREDICTIVE, Prediction, Result
 from hdev_jax.verbs.states import one_step_ahead
 
-__all__ = ["predict", "predictive_of", "sheet_digest", "strongly_correlated"]
+__all__ = ["correlated_pairs", "predict", "predictive_of", "sheet_digest", "strongly_correlated"]
 
 Noise = Literal["normal", "student_t"]
 STRONG = 0.95  # correlation of two coefficients, above which neither is read by itself
@@ -55,14 +55,18 @@ def sheet_digest(text: str) -> str:
 
 def strongly_correlated(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[str]:
     """A sentence for each pair of coefficients whose estimates are strongly correlated."""
+    return [
+        f"{one} and {other} are strongly correlated ({r:+.2f}): the log determines only their combination"
+        for one, other, r in correlated_pairs(names, covariance)
+    ]
+
+
+def correlated_pairs(names: Sequence[str], covariance: Float[np.ndarray, "k k"]) -> list[tuple[str, str, float]]:
+    """Pairs of coefficients whose estimates are strongly correlated, and their correlation."""
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(sd, sd)
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > STRONG, 1)), strict=True)
-    return [
-        f"{names[i]} and {names[k]} are strongly correlated ({correlation[i, k]:+.2f}): the log determines only their "
-        "combination"
-        for i, k in pairs
-    ]
+    return [(names[i], names[k], float(correlation[i, k])) for i, k in pairs]
 
 
 def predict(

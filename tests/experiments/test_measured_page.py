@@ -45,7 +45,7 @@ def result(effects: list[dict], rmse: float = 9.0, turned_down=(), left: str | N
         "unexplained": {
             "significant": left is not None, "share_of_test_variance": 0.04, "noise_floor_rmse": 8.0,
             "depends_on": ["time_s"] if left else [], "signature": f"What is left: {left or 'noise'}.",
-            "expression": None,
+            "expression": None, "memory_s": None,
         },
         "verdict": "effects_found" if left is None else "effects_found_and_unexplained_structure",
         "subsets": {"standing still": {"before": block(5.0)["test"], "after": block(4.0)["test"]}},
@@ -329,7 +329,7 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
     text = (docs / "real_logs.md").read_text()
     assert logs.kept(jobs[0], work)["coefficients"] == {"machine.motoring_efficiency": (0.92, 0.01)}  # pyright: ignore
     assert "trained on trip" in text
-    assert "- 2: iron and offset are strongly correlated (-0.99)" in text
+    assert "- `iron` and `offset` (1: -0.99, 2: -0.99)." in text
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
     for end in ("", ".begun"):
         (work / f"niro_2{end}").rename(work / f"niro_3{end}")

@@ -6,9 +6,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 TEXT = " ".join(README.split())
-REAL, PLANTED, SIMULATORS, WRONG = (
+REAL, PLANTED, SIMULATORS, WRONG, PAPER_2 = (
     (ROOT / "docs" / name).read_text(encoding="utf-8")
-    for name in ("real_logs.md", "planted_summary.md", "simulators_quick.md", "wrong.md")
+    for name in ("real_logs.md", "planted_summary.md", "simulators_quick.md", "wrong.md", "paper2.md")
 )
 
 
@@ -44,7 +44,12 @@ def test_errors_on_measured_logs_are_those_of_the_page():
     mse, numbers = sorted(float(r[2]) for r in each), sorted(int(r[3]) for r in each)
     assert f"MSE {mse[0]:.3f} to {mse[-1]:.3f} kW² with {numbers[0]} to {numbers[-1]} parameters" in README
     assert "best network (NARXS, its table VIII), trained on trip 1: MSE 0.1604" in REAL
+    assert f"(trained on trip 1: {float(each[0][2]):.3f})" in README
     assert "0.1604 kW² for the best network of [paper 2](docs/paper2.md) (NARXS), trained on trip 1" in README
+    again = [x.split("|") for x in PAPER_2.splitlines() if x.startswith("| NARXS | test MSE, mean [kW²] | 0.1604 |")]
+    fitted, median = {(f"{float(x[4]):.3f}", f"{float(x[6]):.3f}") for x in again}.pop()
+    assert f"the same network fitted here: {fitted} (median of 16 random starts: {median})" in README
+    assert "NARXS (16 starts)" in PAPER_2
 
 
 def test_shares_of_synthetic_logs_are_those_of_the_page():
@@ -77,8 +82,12 @@ def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
     )
     winds = cell(SIMULATORS, wind, "n")
     assert f"a headwind is missed in {(1 - cell(SIMULATORS, wind, 'right')) * winds:.0f} of {winds:.0f}" in TEXT
-    rivals = [percent(cell(SIMULATORS, name, "false name")) for name in ("LassoCV", "STLSQ (PySINDy)")]
     none = cell(SIMULATORS, "nothing", "n")
-    assert f"On all {n + none:.0f} logs (these and {none:.0f} in which nothing was changed), LassoCV and STLSQ" in TEXT
-    assert f"give a false name in {rivals[0]} and {rivals[1]} %." in TEXT
+    assert f"On all {n + none:.0f} logs (these and {none:.0f} in which nothing was changed) a false name" in TEXT
+    ours, lasso, stlsq = (
+        [f"{100 * cell(SIMULATORS, name, column):.1f}" for column in ("false name", "named")]
+        for name in ("hdev_jax", "LassoCV", "STLSQ (PySINDy)")
+    )
+    assert f"a false name is given in {ours[0]} % and the change is named in {ours[1]} %;" in TEXT
+    assert f"by LassoCV in {' and '.join(lasso)} %, by STLSQ in {' and '.join(stlsq)} %." in TEXT
     assert f"a false name is given in {false} % of the logs in which one thing was changed" in " ".join(WRONG.split())

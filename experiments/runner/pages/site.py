@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.runner.compare import comparison, decides, findings, headlines, missed, notes
+from experiments.runner.compare import as_good, comparison, decides, findings, headlines, merged, missed, notes
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
 from experiments.runner.pages.html import MOST_ROWS
@@ -57,13 +57,11 @@ def write_list_docs(
         kind = kind_of(next(iter(runs)))
         lines = [f"# {kind if kind != 'Study' else _titled(home)}", "", *about(Path(configs)), ""]
         lines += [line for why in missing for line in (f"Not made: {why}.", "")]
-        compared, better = (sum(m[k] for _, m in every) for k in ("of", "better_than_paper"))
-        lines += [f"At least as good as the paper in {better} of {compared} comparisons.", ""] if compared else []
-        first = [{"part": heading(stem), **x} for stem, m in every for x in headlines(m)]
+        lines += [line for said in as_good(m for _, m in every) for line in (said, "")]
+        first = merged([{"part": heading(stem), **x} for stem, m in every for x in headlines(m)])
         with_paper = [x for x in first if x["paper"] is not None]
         alone = [x for x in first if x["paper"] is None]
-        measured = {heading(stem) for stem, m in every if not m["synthetic"]}  # synthetic data is not the paper's
-        lines += _against([x for x in with_paper if x["part"] in measured], docs, home.name)
+        lines += _against(with_paper, docs, home.name)
         if with_paper:
             lines += [*_open(_decides(with_paper)), ""]
         if alone:

@@ -149,7 +149,7 @@ def remainder(
         sizes.append(slope.rms * float(np.sqrt(np.mean(train.residual**2))))
         parts.insert(0, slope.words)
     if drift.words:
-        parts_of_signature = [*(parts or [f"looks like noise, {colour(noise)}"]), drift.words]
+        parts_of_signature = [*(parts or [f"explained by no channel of the log, {colour(noise)}"]), drift.words]
         signature = "What is left: " + "; ".join(parts_of_signature)
     elif parts:
         signature = "What is left: " + "; ".join(parts)
