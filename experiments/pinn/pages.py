@@ -30,6 +30,7 @@ from experiments.pinn.results import (
 from experiments.pinn.scores import QUANTILES, TAUGHT, pooled
 from experiments.runner.tables import write_tables
 from hdev_jax.errors import InputError
+from hdev_jax.physics import LIBRARY
 from hdev_jax.report import names
 from hdev_jax.rundir import Run
 
@@ -225,9 +226,16 @@ def _effects(results: Results) -> list[dict[str, Any]]:
         having = [f[id] for f in found if id in f]
         keys = sorted({k for h in having for k in h})
         values = {k: float(np.median([h[k] for h in having if k in h])) for k in keys}
-        text = ", ".join(f"{k} {x:.3g}" for k, x in values.items())
+        units = {p.name: p.unit for p in LIBRARY[id].parameters} if id in LIBRARY else {}
+        text = ", ".join(
+            f"{names.parameter(k, id)} {_with_unit(x, units.get(k.partition('[')[0]))}" for k, x in values.items()
+        )
         out.append({"effect": names.effect(id), "vehicles": f"{len(having)} of {len(found)}", "median": text})
     return out
+
+
+def _with_unit(x: float, unit: str | None) -> str:
+    return f"{x:.3g}" if unit in (None, "1") else f"{x:.3g} {unit}"
 
 
 def _quantiles(results: Results) -> dict[str, dict[str, Any]]:

@@ -159,7 +159,7 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
         said.append(f"Ours is {'at least' if metrics['better_than_paper'] else 'not'} as good as the paper.")
     elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
-    said += _sentences(metrics.get("findings", []))
+    said += [line[0].upper() + line[1:] for line in _sentences(metrics.get("findings", []))]
     if short := metrics.get("missed"):
         said.append("One target is missed." if len(short) == 1 else f"{len(short)} targets are missed.")
     return said

@@ -45,7 +45,7 @@ _WORDS = {
     "test_mean": "test MSE, mean [kW²]", "step_test_mean": "test MSE, one step ahead, mean [kW²]",
     "free_test_mean": "test MSE, free run, mean [kW²]",
     "free_worst_energy_percent": "energy error in free run, worst trip [%]", "physics_tabular": "physics, tables",
-    "physics_predicted": "physics, predicted coefficients",
+    "physics_predicted": "physics, predicted coefficients", "training_mse": "training MSE [kW²]",
     "step_worst_energy_percent": "energy error one step ahead, worst trip [%]",
     "network without physics": "network, physics as input only", "LightGBM, no kernel": "LightGBM, log columns only",
     "network, no kernel": "network, log columns only",
