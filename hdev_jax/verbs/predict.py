@@ -66,7 +66,7 @@ def correlated_pairs(names: Sequence[str], covariance: Float[np.ndarray, "k k"])
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(sd, sd)
     pairs = zip(*np.nonzero(np.triu(np.abs(correlation) > STRONG, 1)), strict=True)
-    return [(names[i], names[k], float(correlation[i, k])) for i, k in pairs]
+    return [(names[int(i)], names[int(k)], float(correlation[i, k])) for i, k in pairs]
 
 
 def predict(
