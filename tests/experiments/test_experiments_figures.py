@@ -1,6 +1,6 @@
 """The figure that leads a page of many runs, and how comparisons that stand in several tables are counted."""
 
-from experiments.runner.compare import as_good, merged, tally
+from experiments.runner.compare import as_good, findings, merged, tally
 from experiments.runner.figures import against_paper
 
 
@@ -35,3 +35,7 @@ def test_a_number_that_stands_in_two_tables_is_compared_once_and_synthetic_data_
     assert (fleet["better_than_paper"], fleet["of"]) == (1, 1)
     assert as_good([one, two, fleet]) == ["At least as good as the paper in 2 of 3 comparisons."]
     assert as_good([fleet]) == []
+    said = findings({**fleet, "tasks_left_out": 0, "findings": ["trees are small"]})
+    assert said == [
+        "At least as good, on synthetic data, as the paper on its own data in 1 of 1 comparisons.", "Trees are small.",
+    ]  # fmt: skip
