@@ -91,17 +91,19 @@ def tally(rows: Sequence[Mapping[str, Any]], quantity: str, *, more_is_better: b
     """What metrics hold of the quantity that decides: its key, and in how many rows ours is at least as good."""
     pairs = [(r["ours"][quantity], r["paper"][quantity]) for r in rows if r["ours"] and quantity in (r["paper"] or {})]
     better = sum(own >= paper if more_is_better else abs(own) <= abs(paper) for own, paper in pairs)
-    return {"headline": quantity, "better_than_paper": better, "of": len(pairs)}
+    return {
+        "headline": quantity, "more_is_better": more_is_better, "better_than_paper": better, "of": len(pairs),
+    }  # fmt: skip
 
 
 def as_good(every: Iterable[Mapping[str, Any]]) -> list[str]:
     """In how many comparisons of several runs on measured data ours is at least as good as the paper: a number that
     stands in several tables counts once."""
-    compared = [
-        x for m in every if m["of"] and not m["synthetic"] for x in headlines(m) if None not in (x["paper"], x["ours"])
-    ]
-    compared = merged([{"part": "", **x} for x in compared])
-    better = sum(x["ratio"] <= 1.0 for x in compared)
+    compared = merged([
+        {"part": "", **x, "good": x["ratio"] >= 1.0 if m.get("more_is_better") else x["ratio"] <= 1.0}
+        for m in every if m["of"] and "headline" in m for x in headlines(m) if x["ratio"] is not None
+    ])  # fmt: skip
+    better = sum(x["good"] for x in compared)
     return [f"At least as good as the paper in {better} of {len(compared)} comparisons."] if compared else []
 
 
