@@ -109,9 +109,9 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
                 low, high = pooled_interval(by_trip)
                 within = f" (90 %: {low:.2f} to {high:.2f}, over {len(by_trip)} test trips)"
             found = f"All {len(runs)} find {named(always)}." if always else "No effect is found by all."
-            for pair, each in together(runs):
-                if len(each) == len(runs) > 1:
-                    found += f" Of {pair} each determines only a combination."
+            for pair, correlations in together(runs):
+                if len(correlations) == len(runs) > 1:
+                    found += f" {pair} are strongly correlated in every run: only their combination is determined."
             if turned := [r for r in size_rows(runs) if len({np.sign(v) for _, v, _ in r.cells.values()}) > 1]:
                 said = names.verbose_join([" or ".join(f"`{p}`" for p in row.paths) for row in turned])
                 found += f" The sign of {said} differs."

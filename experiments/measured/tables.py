@@ -199,7 +199,7 @@ def nearest(result: Mapping[str, Any]) -> str:
 
 
 def left_table(runs: Runs, head: str, unit: str) -> list[str]:
-    """What each run leaves: error, what a learner would take off it, and what the diagnosis says of the rest."""
+    """What each run leaves: error, noise floor, and what the diagnosis says of the rest."""
     rows = []
     for run, r in runs.items():
         u = r["unexplained"]
@@ -210,7 +210,7 @@ def left_table(runs: Runs, head: str, unit: str) -> list[str]:
              words.number(u["noise_floor_rmse"]), share, on, signature(u), nearest(r)]
         )  # fmt: skip
     return table(
-        [head, "verdict", f"test RMSE after [{unit}]", f"the same, less what LightGBM predicts [{unit}]",
+        [head, "verdict", f"test RMSE after [{unit}]", f"noise floor [{unit}]",
          "share of the remaining test variance that LightGBM predicts", "depends on", "what is left",
          "best rejected candidate"],
         rows,

@@ -330,6 +330,8 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
     assert logs.kept(jobs[0], work)["coefficients"] == {"machine.motoring_efficiency": (0.92, 0.01)}  # pyright: ignore
     assert "trained on trip" in text
     assert "- `iron` and `offset` (1: -0.99, 2: -0.99)." in text
+    assert "`iron` and `offset` are strongly correlated in every run: only their combination is determined." in text
+    assert "pooled over 2 training trips." in text
     assert "for it was not run: niro_3, niro_4" in capsys.readouterr().err
     for end in ("", ".begun"):
         (work / f"niro_2{end}").rename(work / f"niro_3{end}")
