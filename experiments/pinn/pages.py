@@ -124,10 +124,11 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
 
 def _of_fewer(lines: list[dict[str, Any]]) -> list[str]:
     """Models that were evaluated on fewer trips than the others: their errors do not compare."""
-    most = max(x.get("trips", 0) for x in lines)
+    tested = [x for x in lines if x.get("trips") and ": " not in x["model"]]
+    most = max((x["trips"] for x in tested), default=0)
     return [
         f"'{x['model']}' was evaluated on {x['trips']} of the {most} trips, so that its errors do not compare"
-        for x in lines if 0 < x.get("trips", 0) < most and ": " not in x["model"]
+        for x in tested if x["trips"] < most
     ]  # fmt: skip
 
 

@@ -67,7 +67,8 @@ def comparison(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A line for each row of a run that says which quantity decides (`metrics["headline"]`), whether the paper has it.
 
-    `ratio` as in `comparison`; with the spread over starts, where the row has one (`spread`: least, median, most).
+    `ratio` as in `comparison`, of errors only; with the spread over starts, where the row has one (`spread`: least,
+    median, most).
     """
     quantity, lines = metrics.get("headline"), []
     if quantity is None:
@@ -78,7 +79,7 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
         lines.append(
             {
                 "name": readable(row["name"]), "quantity": readable(quantity), "paper": paper, "ours": own,
-                "ratio": _ratio(metrics, own, paper),
+                "ratio": None if metrics.get("more_is_better") else _ratio(metrics, own, paper),
                 "median": spread.get("median"),
                 "range over starts": [spread["least"], spread["most"]] if spread else None,
                 "why_not": row.get("reason"),
@@ -89,22 +90,33 @@ def headlines(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def tally(rows: Sequence[Mapping[str, Any]], quantity: str, *, more_is_better: bool = False) -> dict[str, Any]:
     """What metrics hold of the quantity that decides: its key, and in how many rows ours is at least as good."""
-    pairs = [(r["ours"][quantity], r["paper"][quantity]) for r in rows if r["ours"] and quantity in (r["paper"] or {})]
-    better = sum(own >= paper if more_is_better else abs(own) <= abs(paper) for own, paper in pairs)
+    judged = _judged(rows, quantity, more_is_better)
     return {
-        "headline": quantity, "more_is_better": more_is_better, "better_than_paper": better, "of": len(pairs),
+        "headline": quantity, "more_is_better": more_is_better, "better_than_paper": sum(judged.values()),
+        "of": len(judged),
     }  # fmt: skip
 
 
 def as_good(every: Iterable[Mapping[str, Any]]) -> list[str]:
     """In how many comparisons of several runs on measured data ours is at least as good as the paper: a number that
     stands in several tables counts once."""
-    compared = merged([
-        {"part": "", **x, "good": x["ratio"] >= 1.0 if m.get("more_is_better") else x["ratio"] <= 1.0}
-        for m in every if m["of"] and "headline" in m for x in headlines(m) if x["ratio"] is not None
-    ])  # fmt: skip
-    better = sum(x["good"] for x in compared)
-    return [f"At least as good as the paper in {better} of {len(compared)} comparisons."] if compared else []
+    compared: dict[tuple[Any, ...], bool] = {}
+    for m in every:
+        if not m["synthetic"] and "headline" in m:
+            compared |= _judged(m["rows"], m["headline"], m.get("more_is_better", False))
+    if not compared:
+        return []
+    return [f"At least as good as the paper in {sum(compared.values())} of {len(compared)} comparisons."]
+
+
+def _judged(rows: Sequence[Mapping[str, Any]], quantity: str, more_is_better: bool) -> dict[tuple[Any, ...], bool]:
+    """Whether ours is at least as good, by name, quantity and the two numbers; errors with a sign by their sizes."""
+    out = {}
+    for row in rows:
+        paper, own = _number((row["paper"] or {}).get(quantity)), _number((row["ours"] or {}).get(quantity))
+        if paper is not None and own is not None:
+            out[row["name"], quantity, paper, own] = own >= paper if more_is_better else abs(own) <= abs(paper)
+    return out
 
 
 def merged(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -120,10 +132,11 @@ def merged(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _joined(parts: Sequence[str]) -> str:
     """`Table 4` and `Table 8` are `Tables 4, 8`."""
-    split = [re.fullmatch(r"(.*(?:table|figure)) (\d+)", p, re.IGNORECASE) for p in parts]
-    if len(parts) == 1 or not all(split) or len({m[1] for m in split if m}) > 1:
+    parts = list(dict.fromkeys(parts))
+    split = [m for p in parts if (m := re.fullmatch(r"(.*(?:table|figure)) (\d+)", p, re.IGNORECASE))]
+    if len(parts) == 1 or len(split) < len(parts) or len({m[1] for m in split}) > 1:
         return ", ".join(parts)
-    return f"{split[0][1]}s {', '.join(m[2] for m in split if m)}" if split[0] else ""
+    return f"{split[0][1]}s {', '.join(m[2] for m in split)}"
 
 
 def decides(lines: Sequence[Mapping[str, Any]]) -> str:

@@ -33,9 +33,9 @@ def against_paper(rows: Sequence[Mapping[str, Any]]) -> bytes | None:
     """The deciding error of each model over the paper's, as PNG; None where fewer than `LEAST_COMPARED` have both.
 
     **Arguments:** `rows`: `part, name, quantity, paper, ours, ratio` (`compare.merged`) and, over all random starts of
-    a fit, `range over starts`. Those without a ratio are left out.
+    a fit, `range over starts`. Those without a ratio, or of 0, are left out.
     """
-    models = [x for x in rows if x["ratio"] is not None]
+    models = [x for x in rows if x["ratio"]]
     if len(models) < LEAST_COMPARED:
         return None
     with style():

@@ -143,9 +143,11 @@ def _summary(came: Outcomes, links: Mapping[str, Sequence[tuple[str, str]]]) -> 
         for path, run in every
     ]  # fmt: skip
     lines = [{"part": _title(path, run), **line} for path, run in every for line in comparison(run)]
-    first = merged([{"part": _title(path, run), **line} for path, run in every for line in headlines(run)])
-    theirs = [x for x in first if x["ratio"] is not None]  # on the paper's own data
-    alone = [x for x in first if x not in theirs]
+    first = [
+        (run["synthetic"] or line["paper"] is None, {"part": _title(path, run), **line})
+        for path, run in every for line in headlines(run)
+    ]  # fmt: skip
+    theirs, alone = (merged([line for apart, line in first if apart is of_ours]) for of_ours in (False, True))
     said = [] if came.made else ["No config of the list has been run."]
     said += as_good(run for _, run in every)
     said += [f"Not made: {why}." for why in came.reasons()]

@@ -1,6 +1,6 @@
 """The figure that leads a page of many runs, and how comparisons that stand in several tables are counted."""
 
-from experiments.runner.compare import as_good, findings, merged, tally
+from experiments.runner.compare import as_good, findings, headlines, merged, tally
 from experiments.runner.figures import against_paper
 
 
@@ -35,8 +35,10 @@ def test_a_number_that_stands_in_two_tables_is_compared_once_and_synthetic_data_
     assert (fleet["better_than_paper"], fleet["of"]) == (1, 1)
     assert as_good([one, two, fleet]) == ["At least as good as the paper in 2 of 3 comparisons."]
     assert as_good([fleet]) == []
-    measured = metrics([("trees", 0.9, 0.95), ("forest", 0.9, 0.8), ("bias", 0.0, 0.1)], more_is_better=True)
-    assert as_good([measured]) == ["At least as good as the paper in 1 of 2 comparisons."], "one has no ratio"
+    fits = metrics([("trees", 0.9, 0.95), ("forest", 0.3, -0.5), ("none", 0.0, 0.1)], more_is_better=True)
+    assert (fits["better_than_paper"], fits["of"]) == (2, 3)
+    assert as_good([fits]) == ["At least as good as the paper in 2 of 3 comparisons."], "as the run says itself"
+    assert [x["ratio"] for x in headlines(fits)] == [None] * 3, "no errors"
     said = findings({**fleet, "tasks_left_out": 0, "findings": ["trees are small"]})
     assert said == [
         "At least as good, on synthetic data, as the paper on its own data in 1 of 1 comparisons.", "Trees are small.",
