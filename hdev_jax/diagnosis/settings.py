@@ -80,13 +80,13 @@ class Settings:
         3.0, "largest |prior_z| to which an effect may move a declared coefficient", "sd", "0.3 %, two-sided"
     )
 
-    # is X still needed beside Y
+    # is X significant given Y
     stays: float = _number(
-        0.01, "largest p-value at which an effect stays beside those added later", "1",
+        0.01, "largest p-value at which an effect stays, given those added later", "1",
         "Wald test, 1 %: it entered at some 0.1 %, the FDR over the library",
     )  # fmt: skip
     wald: float = _number(
-        0.05, "largest p-value at which an effect is needed beside another of its class", "1", "Wald test, 5 %"
+        0.05, "largest p-value at which an effect is significant given another of its class", "1", "Wald test, 5 %"
     )
     class_share: float = _number(
         0.8, "least share of an effect's gain that another of its class reaches", "1", "chosen on seeds 1-99"

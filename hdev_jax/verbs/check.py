@@ -48,7 +48,7 @@ def check(
         lines.append(f"{name:{wide}s} {rows[i]:7d} {minutes[i]:7.1f} {km[i]:8.2f} {total} {per}")
     if log.instruments:
         lines += ["", "instruments", *(f"  {i.line()}" for i in log.instruments)]
-    lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger"]
+    lines += ["", "targets: " + (", ".join(log.targets) or "none is measured"), "", "ledger: changes to the log"]
     lines += [f"  {line}" for line in log.ledger.lines()] or ["  nothing was dropped, filled or clipped"]
     found = suspicions(log)
     if vehicle is not None:

@@ -1,4 +1,4 @@
-"""Is X still needed beside Y? One question: in the backward step, in exchanges, for classes, and beside unnamed terms.
+"""Is X significant given Y? One question: in the backward step, in exchanges, for classes, and beside unnamed terms.
 
 The equations of the model without X are those of the model with it, X's columns moved from the base to the candidates
 and its part put back into the residual: no second pass over the rows.

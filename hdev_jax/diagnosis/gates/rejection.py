@@ -64,7 +64,7 @@ SENTENCES = {
     Kind.FAR: "it would move {name} to {z:+.1f} prior sd from the sheet's value",
     Kind.PLACEBO: "a placebo ({how}) does as well",
     Kind.UNSTABLE: "ranks first in only {percent:.0f} % of resampled sets of {unit}",
-    Kind.SUPERFLUOUS: "not needed beside {beside}",
+    Kind.SUPERFLUOUS: "not significant given {beside}",
     Kind.NOT_HELD_OUT: "contradicted: the model with all found effects predicts the held-out trips worse",
     Kind.INSTRUMENT: "no instrument fault is named, as {percent:.0f} % of the remaining variance is not noise",
     Kind.FOUND: "found",

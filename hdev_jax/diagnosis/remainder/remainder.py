@@ -149,8 +149,8 @@ def remainder(
         sizes.append(slope.rms * float(np.sqrt(np.mean(train.residual**2))))
         parts.insert(0, slope.words)
     if drift.words:
-        parts_of_signature = [*(parts or [f"explained by no channel of the log, {colour(noise)}"]), drift.words]
-        signature = "What is left: " + "; ".join(parts_of_signature)
+        before = "; ".join(parts) or f"no channel of the log explains it, and it is {colour(noise)}"
+        signature = f"What is left: {before}; {drift.words}"
     elif parts:
         signature = "What is left: " + "; ".join(parts)
     else:
