@@ -54,7 +54,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
 def _ours(config: Any, result: Mapping[str, Any], settings: Any, own: str) -> dict[str, Any]:
     """The paper's keys, from the configuration `own` that the row is of, and the other one beside it.
 
-    Energies are in kWh, errors of energy in %: `pe_` with their sign, `energy_error_` without, as the paper has them.
+    Energies are in kWh, errors of energy in %: `signed_energy_error` with their sign, `energy_error` without, as the
+    paper has them.
     """
     trips = result["trips"]
     out: dict[str, Any] = {f"trip{t}": trips[t][f"{own}_mse"] for t in trips}
@@ -67,9 +68,9 @@ def _ours(config: Any, result: Mapping[str, Any], settings: Any, own: str) -> di
         for kind in ("", "_positive", "_negative"):
             out[f"energy{kind}_trip{t}"] = m[f"{own}_energy{kind}"]
             out[f"measured{kind}_trip{t}"] = m[f"energy{kind}"]
-            out[f"pe{kind}_trip{t}"] = m[f"{own}_pe{kind}"]
+            out[f"signed_energy_error{kind}_trip{t}"] = m[f"{own}_pe{kind}"]
             out[f"energy_error{kind}_trip{t}"] = abs(m[f"{own}_pe{kind}"])
-            out[f"free_pe{kind}_trip{t}"] = m[f"free_pe{kind}"]
+            out[f"free_signed_energy_error{kind}_trip{t}"] = m[f"free_pe{kind}"]
     out |= {"free_run": own == "free", "parameters": result["parameters"], "rule": settings.rule}
     if result["settings_found"]:
         out["settings_found"] = result["settings_found"]
@@ -121,11 +122,11 @@ def _described(config: Any, found: Mapping[str, Any]) -> Sequence[str]:
     several = [n for n in found if len(found[n]["losses"]) > 1]
     starts = {n: f"{n} ({len(found[n]['losses'])} starts)" for n in several}
     rules = {
-        "least": "ours is the random start with the lowest training loss on trip 1, which is not always the lowest MSE",
-        "ensemble": "ours is the mean of all starts' predictions",
+        "least": "the random start with the lowest training loss on trip 1, which is not always the lowest MSE",
+        "ensemble": "the mean of all starts' predictions",
     }  # fmt: skip
     said = [
-        f"{', '.join(starts[n] for n in names)}: {words}"
+        f"column ours of {', '.join(starts[n] for n in names)}: {words}"
         for rule, words in rules.items()
         if (names := [n for n in several if config.models[n].rule == rule])
     ]

@@ -5,32 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from experiments.pinn.results import PHYSICS, WAYS
+from experiments.pinn.results import MODELS, NAMED, OURS, PAPER_MODEL, in_words
 from experiments.pinn.scores import TAUGHT, pooled
 from experiments.runner.figures import save_figure, styled
-from experiments.runner.tables import readable
 from hdev_jax.errors import InputError
 from hdev_jax.learn.pinn.fit import PAPER_WEIGHTS
 from hdev_jax.report.canvas import AFTER, BEFORE, GREY, INK, figure, plain_log, tidy
 from hdev_jax.rundir import Run
 
-__all__ = [
-    "MODELS", "NAMED", "OURS", "PAPER_MODEL", "coefficient_boxes", "in_words", "learning_curves", "model_bars",
-    "weight_maps",
-]  # fmt: skip
+__all__ = ["coefficient_boxes", "learning_curves", "model_bars", "weight_maps"]
 
-MODELS = ("A", "B", "C", "D")
-PAPER_MODEL = "paper"  # the network as printed, and ours, among the models of a config
-OURS = "ours"
 MOST_BARS = 20
-# Names of the paper's rows in metrics.json.
-NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, {PHYSICS}": "physics_predicted",
-         WAYS["tabular"]: "physics_tabular"}  # fmt: skip
-
-
-def in_words(way: str) -> str:
-    """What readers see of a model's name in tables and figures."""
-    return readable(NAMED.get(way, way))
 
 
 @styled

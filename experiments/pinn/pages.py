@@ -1,52 +1,45 @@
-"""Pages of the networks' studies: the table with figures 6 and 7, error against the amount of data, loss weights."""
+"""Pages of the networks' studies: the table of models, and figures 6 and 7."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from experiments.pinn.figures import (
-    MODELS,
-    NAMED,
-    OURS,
-    PAPER_MODEL,
-    coefficient_boxes,
-    in_words,
-    learning_curves,
-    model_bars,
-    weight_maps,
-)
+from experiments.pinn.figures import coefficient_boxes, model_bars
 from experiments.pinn.results import (
     FORM,
+    HELD,
+    MODELS,
+    OURS,
+    PAPER_MODEL,
     PHYSICS,
     WAYS,
     Results,
     distinct,
     diverged,
     gathered_scores,
+    given,
+    in_words,
+    named,
     still_better,
     trainings,
 )
-from experiments.pinn.scores import QUANTILES, TAUGHT, pooled
+from experiments.pinn.scores import QUANTILES, pooled
 from experiments.runner.tables import write_tables
-from hdev_jax.errors import InputError
 from hdev_jax.physics import LIBRARY
 from hdev_jax.report import names
 from hdev_jax.rundir import Run
 
-__all__ = ["coefficients", "grid", "shares", "table"]
+__all__ = ["coefficients", "table"]
 
 THEIRS = "the paper's RMSE and PE are of its private fleet; ours are of {}, so that the two are not comparable"
-HELD = ("the inputs include the energy of the calibrated kernel and the efficiencies at its operating point, so only "
-        "models with 'log columns only' are without physics")  # fmt: skip
-GIVEN = "models 'ours' and 'known effects' are given the effects that the fleet hides"
-DIAGNOSED = "models 'as diagnosed' have the effects that the diagnosis of training routes names"
-RATIO = "coefficient error: size of the median ratio of predicted to true value, minus one; spray counts as air drag"
+DIAGNOSED = "models 'effects as diagnosed' have the effects that the diagnosis of training routes names"
+RATIO = "coefficient error: median ratio of predicted to true value, minus one, no sign; spray counts as air drag"
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
 NAMEABLE = {
     WAYS["kernel"]: "a linear fit of the known effects",
-    f"{OURS}, effects as diagnosed, {FORM}": "a linear fit of the effects named by diagnosis, for all vehicles,",
+    f"{OURS}, effects as diagnosed, {FORM}": "a linear fit of the effects named by diagnosis",
 }
 
 
@@ -74,14 +67,14 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
     rows, lines = [], []
     for (way, use), found in gathered.items():
         p = pooled(found)
-        name = NAMED.get(way, way)
+        name = named(way)
         paper = config.paper.get(name) if use == "test" else None
         lines.append(_line(way, use, found, every[way, use], paper or {}))
         mine = {"rmse": p.pop("rmse_wh"), "pe": p.pop("pe_percent"), **p}
         rows.append({"name": name if use == "test" else f"{name} ({use})", "paper": paper, "ours": mine})
     for model, (n, lost) in trainings(results).items():
         if n == lost:
-            name, said = NAMED.get(model, model), f"diverged, {lost} of {n} trainings"
+            name, said = named(model), f"diverged, {lost} of {n} trainings"
             lines.append({"model": f"{in_words(model)}: {said}", "n": 0})
             rows.append({"name": name, "paper": config.paper.get(name), "ours": None, "reason": said})
     write_tables(run, "table", lines, config.caption)
@@ -105,7 +98,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
         "findings": [
             *([THEIRS.format("measured buses" if config.data == "ztbus" else "a synthetic one with other noise")]
               if any(r["paper"] for r in rows) else []),
-            *([GIVEN] if config.data == "fleet" else []),
+            *(given(results) if config.data == "fleet" else []),
             *([DIAGNOSED] if any("diagnosed" in way for way, _ in gathered) else []),
             *_of_fewer(lines),
         ],
@@ -116,7 +109,7 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             *([RATIO] if any(x.get("c_rr error, median of vehicles [%]") is not None for x in lines) else []),
             *diverged(results),
             *still_better(results),
-            *(f"effects in '{way}': {', '.join(map(names.effect, e)) or 'none'}" for way, e in used.items()),
+            *(f"effects in '{in_words(way)}': {', '.join(map(names.effect, e)) or 'none'}" for way, e in used.items()),
             *_nameable(gathered),
         ],
     }  # fmt: skip
@@ -140,16 +133,18 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     base, learned = square.get(WAYS["bayesian"]), square.get(LEARNED)
     if base is None or learned is None or base - learned < LEAST_LEARNED * base:
         return []
-    what = (
-        f"'{LEARNED}' lowers the RMSE of the calibrated declared physics from {base**0.5:.4g} to {learned**0.5:.4g} Wh"
-    )
-    out = []
+    parts = []
     for way, whose in NAMEABLE.items():
         if way in square:
             share = (base - square[way]) / (base - learned)
             removed = f"lowers the squared error {share:.2f} times as much" if share > 0 else "does not lower the error"
-            out.append(f"{what}; {whose} {removed}, without a network")
-    return out
+            parts.append(f"{whose} {removed}")
+    if not parts:
+        return []
+    return [
+        f"'{in_words(LEARNED)}' lowers the RMSE of the calibrated declared physics from {base**0.5:.4g} to "
+        f"{learned**0.5:.4g} Wh; without a network, {' and '.join(parts)}"
+    ]
 
 
 def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
@@ -172,8 +167,8 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
         "better_than_paper": 0, "of": 0, "missed": [],
         "notes": [
             "the paper prints no numbers for its boxes, and its true values are unknown",
-            "coefficient error: size of the median over rows of predicted over true value, minus one; it is not the "
-            "error of the column 50 %",
+            "coefficient error: median over rows of predicted over true value, minus one, without its sign; it is "
+            "not the error of the column 50 %",
             *diverged(results),
         ],
     }  # fmt: skip
@@ -192,19 +187,19 @@ def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound:
         limit = 1.0 if config.data == "fleet" else 3.0
         pe = mine["pe_percent"] if config.data == "fleet" else mine["trip_pe_mean"]
         if abs(pe) > limit:
-            out.append(f"ours: PE {pe:+.2f} %, target ±{limit:g}")
+            out.append(f"PE {pe:+.2f} %, target ±{limit:g}")
         if PAPER_MODEL in test and mine["rmse_wh"] > 0.9 * test[PAPER_MODEL]["rmse_wh"]:
-            out.append(f"ours: RMSE {mine['rmse_wh'] / test[PAPER_MODEL]['rmse_wh']:.3g} times the paper's, target 0.9")
+            out.append(f"RMSE {mine['rmse_wh'] / test[PAPER_MODEL]['rmse_wh']:.3g} times the paper's, target 0.9")
         best = min(test, key=lambda k: test[k]["rmse_wh"])
         if config.data == "ztbus" and best != OURS:
-            out.append(f"ours: RMSE {mine['rmse_wh']:.1f} Wh, the best is {best} with {test[best]['rmse_wh']:.1f}")
+            out.append(f"RMSE {mine['rmse_wh']:.1f} Wh, the best is {in_words(best)} with {test[best]['rmse_wh']:.1f}")
         for k in ("c_rr", "cda_m2"):
             if mine.get(f"{k}_error_percent", 0.0) > 5.0:
-                out.append(f"ours: {k} off by {mine[f'{k}_error_percent']:.1f} % in the median of vehicles, target 5")
+                out.append(f"{k} off by {mine[f'{k}_error_percent']:.1f} % in the median of vehicles, target 5")
             if mine.get(f"{k}_error_worst", 0.0) > 5.0:
-                out.append(f"ours: {k} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, target 5")
-    out += [f"{n}: {100 * max(b.values()):.1f} % at a bound" for n, b in at_bound.items() if n == OURS]
-    return out
+                out.append(f"{k} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, target 5")
+    out += [f"{100 * max(b.values()):.1f} % at a bound" for n, b in at_bound.items() if n == OURS]
+    return [x if x.startswith("RMSE is") else f"{in_words(OURS)}: {x}" for x in out]
 
 
 def _at_bound(results: Results) -> dict[str, dict[str, float]]:
@@ -236,7 +231,7 @@ def _effects(results: Results) -> list[dict[str, Any]]:
 
 
 def _with_unit(x: float, unit: str | None) -> str:
-    return f"{x:.3g}" if unit in (None, "1") else f"{x:.3g} {unit}"
+    return number(x) if unit in (None, "1") else f"{number(x)} {unit}"
 
 
 def _quantiles(results: Results) -> dict[str, dict[str, Any]]:
@@ -252,90 +247,3 @@ def _quantiles(results: Results) -> dict[str, dict[str, Any]]:
             for id, c in result["network"].get("test", {}).get("coefficients", {}).items():
                 into.setdefault(id, c)
     return out
-
-
-def shares(config: Any, results: Results, run: Run) -> dict[str, Any]:
-    """Error by the amount of training data: a learning curve of each model, with the spread over seeds."""
-    lines, curves, routes = [], {}, {}
-    for share in sorted({t["data"]["share"] for t, _ in results}):
-        part = [(t, r) for t, r in results if t["data"]["share"] == share]
-        counts = next((r["counts"] for _, r in part if "counts" in r), None)
-        routes |= {share: counts["routes"]} if counts and counts["routes"] else {}
-        gathered = gathered_scores(part)
-        if any(use == TAUGHT for _, use in curves) and not any(use == TAUGHT for _, use in gathered):
-            # by now every vehicle has training routes
-            gathered |= {(way, TAUGHT): found for (way, use), found in gathered.items() if use == "test"}
-        for (way, use), found in gathered.items():
-            seeds = [pooled([f])["rmse_wh"] for f in found]
-            curves.setdefault((way, use), []).append((share, seeds))
-            lines.append({"share [%]": 100.0 * share, "training routes": counts and counts["routes"],
-                          "model": in_words(way), "evaluated on": use, "RMSE [Wh]": float(np.median(seeds)),
-                          "smallest": min(seeds), "largest": max(seeds), "PE [%]": pooled(found)["pe_percent"],
-                          "training rows": counts and counts["training"],
-                          "n": found[0]["rows"], "seeds": len(seeds)})  # fmt: skip
-    write_tables(run, "shares", lines, config.caption)
-    learning_curves(run, curves, routes)
-    return {
-        "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "better_than_paper": 0, "of": 0,
-        "rows": [{"name": f"{x['model']}, {x['share [%]']:g} %, {x['evaluated on']}", "paper": None,
-                  "ours": {"rmse_wh": x["RMSE [Wh]"], "pe_percent": x["PE [%]"]}} for x in lines],
-        "missed": _against_black_boxes(config, curves),
-        "notes": [
-            "Figure: the line is the median over seeds, the band covers all of them. A seed draws a network's first "
-            "weights; routes are drawn once, and LightGBM draws nothing",
-            f"{TAUGHT}: vehicles without a training route are left out",
-            HELD, GIVEN, *still_better(results), *diverged(results),
-        ],
-    }  # fmt: skip
-
-
-def _against_black_boxes(config: Any, curves: Mapping[tuple[str, str], list[tuple[float, list[float]]]]) -> list[str]:
-    """Where ours is not 30 % better than the network without physics or LightGBM, at the least data and on unseen."""
-    out = []
-    if (OURS, "test") not in curves:
-        return out
-    for use in ("test", TAUGHT, "unseen"):
-        for other in ("network without physics", "network, no kernel", "lightgbm", "LightGBM, no kernel"):
-            if (other, use) not in curves or (OURS, use) not in curves:
-                continue
-            others, mine_at = dict(curves[other, use]), dict(curves[OURS, use])
-            for share in sorted(others)[: None if use == "unseen" else 1]:
-                if share not in mine_at:
-                    out.append(f"{100 * share:g} % of the routes, {use}: ours has no result")
-                    continue
-                ratio = float(np.median(mine_at[share]) / np.median(others[share]))
-                if ratio > 0.7:
-                    out.append(
-                        f"{100 * share:g} % of the routes, {use}: RMSE {ratio:.3g} times that of {in_words(other)}, "
-                        "target 0.7"
-                    )
-    return out
-
-
-def grid(config: Any, results: Results, run: Run) -> dict[str, Any]:
-    """Heat maps of the error over pairs of loss weights, the third as printed; medians over seeds."""
-    found: dict[tuple[float, ...], list[float]] = {}
-    for task, result in results:
-        if "network" in result:
-            found.setdefault(tuple(task["weights"]), []).append(pooled([result["network"]["test"]])["rmse_wh"])
-    if not found:
-        raise InputError("every training of the grid diverged; lower the rate")
-    lines = [{"λ₁": w[0], "λ₂": w[1], "λ₃": w[2], "seeds": len(x), "RMSE [Wh]": float(np.median(x)), "smallest": min(x),
-              "largest": max(x)} for w, x in sorted(found.items())]  # fmt: skip
-    write_tables(run, "grid", lines, config.caption)
-    weight_maps(run, {w: float(np.median(x)) for w, x in found.items()})
-    best = min(lines, key=lambda x: x["RMSE [Wh]"])
-    lost = sum("diverged" in r for _, r in results)
-    where = f"{best['λ₁']:g}, {best['λ₂']:g}, {best['λ₃']:g}"
-    medians, spread = [x["RMSE [Wh]"] for x in lines], max(x["largest"] - x["smallest"] for x in lines)
-    note = (
-        f"The lowest median RMSE is {best['RMSE [Wh]']:.2f} Wh, at λ = {where}; the {len(lines)} medians differ by at "
-        f"most {max(medians) - min(medians):.1f} Wh, the seeds of one setting by at most {spread:.1f} Wh; {lost} of "
-        f"{len(results)} trainings diverged"
-    )
-    return {
-        "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "better_than_paper": 0, "of": 0,
-        "rows": [{"name": f"{x['λ₁']:g}, {x['λ₂']:g}, {x['λ₃']:g}", "paper": None, "ours": {"rmse_wh": x["RMSE [Wh]"]}}
-                 for x in lines],
-        "missed": [], "findings": [note], "notes": ["Table 2 has the paper's weights, not the best of this grid"],
-    }  # fmt: skip

@@ -3,13 +3,37 @@
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["FORM", "PHYSICS", "WAYS", "Results", "distinct", "diverged", "gathered_scores", "still_better", "trainings"]
+from experiments.runner.tables import readable
+
+__all__ = [
+    "FORM", "HELD", "MODELS", "NAMED", "OURS", "PAPER_MODEL", "PHYSICS", "WAYS", "Results", "distinct", "diverged",
+    "gathered_scores", "given", "in_words", "named", "still_better", "trainings",
+]  # fmt: skip
 
 Results = Sequence[tuple[dict[str, Any], dict[str, Any]]]
 WAYS = {"tabular": "physics, tables", "bayesian": "physics, Bayesian coefficients",
         "kernel": "physics, known effects, linear fit", "diagnosed": "physics, diagnosed effects"}  # fmt: skip
 FORM = "its linear fit before training"
 PHYSICS = "its physics part alone"
+MODELS = ("A", "B", "C", "D")
+PAPER_MODEL = "paper"  # the network as printed, and ours, among the models of a config
+OURS = "ours"
+# Names of the paper's rows in metrics.json.
+NAMED = {PAPER_MODEL: "PINN", f"{PAPER_MODEL}, {PHYSICS}": "physics_predicted",
+         WAYS["tabular"]: "physics_tabular"}  # fmt: skip
+HELD = ("the inputs include the energy of the calibrated kernel and the efficiencies at its operating point, so only "
+        "models with 'log columns only' are without physics")  # fmt: skip
+
+
+def named(way: str) -> str:
+    """What metrics.json calls a way of predicting: "ours" is there the side of a comparison, not a model."""
+    way = NAMED.get(way, way)
+    return f"our network{way.removeprefix(OURS)}" if way.partition(",")[0].partition(" ")[0] == OURS else way
+
+
+def in_words(way: str) -> str:
+    """What readers see of a model's name in tables and figures."""
+    return readable(named(way))
 
 
 def gathered_scores(results: Results) -> dict[tuple[str, str], list[dict[str, Any]]]:
@@ -54,11 +78,21 @@ def trainings(results: Results) -> dict[str, tuple[int, int]]:
 
 def still_better(results: Results) -> list[str]:
     """Which models were still getting better when their epochs were over."""
-    still = sorted({t["name"] for t, r in results if r.get("still_better")})
+    still = sorted({f"'{in_words(t['name'])}'" for t, r in results if r.get("still_better")})
     return [f"validation error still falling at the last epoch, in some training: {', '.join(still)}"] if still else []
 
 
 def diverged(results: Results) -> list[str]:
     """How many trainings diverged, where any did."""
-    lost = [f"{model} {k} of {n}" for model, (n, k) in trainings(results).items() if k]
+    lost = [f"'{in_words(model)}' {k} of {n}" for model, (n, k) in trainings(results).items() if k]
     return [f"diverged trainings, left out of all errors: {', '.join(lost)}"] if lost else []
+
+
+def given(results: Results) -> list[str]:
+    """Which models know the effects that the synthetic fleet hides, where any does."""
+    names = [in_words(WAYS["kernel"])] if any("kernel" in r for _, r in results) else []
+    names += [in_words(t["name"]) for t, r in results if t["model"].get("effects") is True and "network" in r]
+    if not names:
+        return []
+    said = " and ".join(f"'{n}'" for n in dict.fromkeys(names))
+    return [f"{said} {'are' if len(set(names)) > 1 else 'is'} given the effects that the fleet hides"]

@@ -12,13 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from experiments.pinn import pages as pinn_pages
+from experiments.pinn import sweeps
 from experiments.pinn.buses import bus_sources
 from experiments.pinn.closed import kernel, said, trainable
 from experiments.pinn.data import Data, load
 from experiments.pinn.diagnosed import diagnosed, found_effects
 from experiments.pinn.known import known, of_fleet
-from experiments.pinn.models import bayesian, boosted, names_of
-from experiments.pinn.networks import trained
+from experiments.pinn.models import bayesian, boosted, names_of, trained
 from experiments.pinn.scores import scores
 from experiments.runner.config import Strict
 from experiments.runner.data import fingerprint
@@ -31,8 +31,8 @@ from hdev_jax.rundir import Run
 __all__ = ["SOURCES", "Config", "Model", "chosen", "collect", "run", "run_together", "tasks", "together"]
 
 SOURCES = (
-    "closed.py", "data.py", "diagnosed.py", "known.py", "models.py", "networks.py", "pooled.py", "scores.py",
-    "buses.py", "../paper1/halves.py",
+    "closed.py", "data.py", "diagnosed.py", "known.py", "models.py", "pooled.py", "scores.py", "buses.py",
+    "../paper1/halves.py",
 )  # fmt: skip
 
 
@@ -273,6 +273,6 @@ def _by_vehicle(data: Data, task: dict[str, Any]) -> dict[str, Any]:
 
 def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, Any]]], run: Run) -> dict[str, Any]:
     """Tables and figures of the page that the config asks for."""
-    pages = {"table": pinn_pages.table, "coefficients": pinn_pages.coefficients, "shares": pinn_pages.shares,
-             "grid": pinn_pages.grid}  # fmt: skip
+    pages = {"table": pinn_pages.table, "coefficients": pinn_pages.coefficients, "shares": sweeps.shares,
+             "grid": sweeps.grid}  # fmt: skip
     return pages[config.page](config, results, run)

@@ -69,7 +69,8 @@ def readable(key: str) -> str:
         return _WORDS.get(key, key)
     *words, last = key.split("_")
     unit = f" [{_UNITS[last]}]" if words and last in _UNITS else ""
-    return " ".join(_SHORT.get(w, w) for w in (words if unit else [*words, last])) + unit
+    said = " ".join(_SHORT.get(w, w) for w in (words if unit else [*words, last])) + unit
+    return re.sub(r"\btrip(\d+)$", r"trip \1", said)
 
 
 def worded(text: str) -> str:

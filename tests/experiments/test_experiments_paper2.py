@@ -108,8 +108,8 @@ def test_a_table_has_each_model_in_the_papers_configuration(trips, tmp_path):
     change = 100 * (ahead["ours"]["test_mean"] / linear["ours"]["test_mean"] - 1)
     assert ahead["ours"]["change_percent"] == pytest.approx(change)
     assert "change_percent" not in linear["ours"]
-    for name in ("pe_trip2", "pe_positive_trip2", "pe_negative_trip2"):
-        assert ahead["ours"][name.replace("pe", "energy_error", 1)] == abs(ahead["ours"][name]) > 0
+    for name in ("energy_error_trip2", "energy_error_positive_trip2", "energy_error_negative_trip2"):
+        assert ahead["ours"][name] == abs(ahead["ours"][f"signed_{name}"]) > 0
     assert (absent["ours"], absent["reason"]) == (None, "not run")
     assert any("NARXP: predicted one step ahead" in note for note in metrics["notes"])
     assert metrics["of"] == 1

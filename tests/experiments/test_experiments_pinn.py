@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from experiments.paper1.halves import coefficient
-from experiments.pinn import networks as pinn_networks
+from experiments.pinn import models as pinn_models
 from experiments.pinn import pooled as pinn_pooled
 from experiments.pinn import study as pinn
 from experiments.pinn.closed import closed, kernel, said, sized, trainable
@@ -380,11 +380,11 @@ def test_few_rows_train_for_as_many_steps_as_many(monkeypatch):
         plans.append(plan)
         raise DivergedError("enough")
 
-    monkeypatch.setattr(pinn_networks, "networks", networks)
+    monkeypatch.setattr(pinn_models, "networks", networks)
     (task,) = tasks(config("paper1/table2", "epochs=10", 'only=["paper"]'))
     data = load("fleet", 3, 24, (), 1.0, None, 0, ("A", "B"))
     for rows in (1000, 20 * 1024):
-        pinn_networks.trained(data, None, np.zeros(rows), [{**task, "effects": {}}], pinn.Model(**task["model"]))
+        pinn_models.trained(data, None, np.zeros(rows), [{**task, "effects": {}}], pinn.Model(**task["model"]))
     assert [(p.epochs, p.patience, p.stop_after) for p in plans] == [(170, 68, 204), (10, 4, 12)]
 
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from experiments.pinn import figures as pinn_figures
-from experiments.pinn import networks as pinn_networks
+from experiments.pinn import models as pinn_models
 from experiments.pinn import pages as pinn_pages
 from experiments.pinn import study as pinn
+from experiments.pinn import sweeps
 from experiments.pinn.data import Data, Member
 from experiments.pinn.scores import TAUGHT, pooled, scores
 from experiments.runner.config import CONFIGS, resolve, typed
@@ -128,7 +129,7 @@ def test_the_table_counts_rows_once_and_bounds_over_all_trainings(run, no_figure
     assert rows["physics_tabular"]["ours"]["pe"] == pytest.approx(50.0)
     assert rows["network without physics"]["ours"] is None
     assert rows["network without physics"]["reason"] == "diverged, 1 of 1 trainings"
-    said = "diverged trainings, left out of all errors: paper 1 of 4, network without physics 1 of 1"
+    said = "diverged trainings, left out of all errors: 'PINN' 1 of 4, 'network, physics as input only' 1 of 1"
     assert said in out["notes"]
     (bounds,) = written(run, "bounds")
     assert [float(bounds[k]) for k in ("c_rr", "C_d·A")] == pytest.approx([100 * 3 / 9, 100 * 1 / 9], abs=0.1)
@@ -145,14 +146,14 @@ def test_missed_targets_are_listed(run, no_figures):
     unit = np.sqrt((100**2 + 200**2 + 50**2) / 3)
     assert pinn_pages.table(config(), results, run)["missed"] == [
         f"RMSE is not in the order of table 2: {0.01 * unit:.2f}, {0.2 * unit:.2f}, {0.1 * unit:.2f}",
-        "ours: PE +2.00 %, target ±1",
-        "ours: RMSE 2 times the paper's, target 0.9",
-        "ours: c_rr off by 15.0 % in the median of vehicles, target 5",
-        "ours: c_rr off by 15.0 % in the worst vehicle, target 5",
-        "ours: 33.3 % at a bound",
+        "our network: PE +2.00 %, target ±1",
+        "our network: RMSE 2 times the paper's, target 0.9",
+        "our network: c_rr off by 15.0 % in the median of vehicles, target 5",
+        "our network: c_rr off by 15.0 % in the worst vehicle, target 5",
+        "our network: 33.3 % at a bound",
     ]
     buses = pinn_pages.table(config("studies/pinn_buses"), results, run)["missed"]
-    assert f"ours: RMSE {0.02 * unit:.1f} Wh, the best is paper with {0.01 * unit:.1f}" in buses
+    assert f"our network: RMSE {0.02 * unit:.1f} Wh, the best is PINN with {0.01 * unit:.1f}" in buses
     good = [(task("ours"), {"network": scored(MEASURED * 1.001)}), (task("paper"), {"network": paper})]
     assert pinn_pages.table(config(), good, run)["missed"] == []
 
@@ -189,7 +190,7 @@ def test_ours_against_black_boxes_at_the_least_data_and_on_what_is_unseen(run, n
         at(0.1, "ours", 2.0), at(0.1, "ours", 4.0), at(0.1, "ours", 3.0), at(0.1, "network without physics", 4.0),
         at(1.0, "ours", 1.0), at(1.0, "network without physics", 1.0),
     ]  # fmt: skip
-    out = pinn_pages.shares(config("studies/pinn_data"), results, run)
+    out = sweeps.shares(config("studies/pinn_data"), results, run)
     assert out["missed"] == [
         "10 % of the routes, test: RMSE 0.75 times that of network, physics as input only, target 0.7",
         "10 % of the routes, test, vehicles trained on: RMSE 0.75 times that of network, physics as input only, "
@@ -201,8 +202,8 @@ def test_ours_against_black_boxes_at_the_least_data_and_on_what_is_unseen(run, n
     expected = {"seeds": 3, "RMSE [Wh]": 3, "smallest": 2, "largest": 4, "training routes": 2, "training rows": 90}
     assert {k: float(first[k]) for k in expected} == expected
     assert (
-        "validation error still falling at the last epoch, in some training: network without physics, ours"
-        in out["notes"]
+        "validation error still falling at the last epoch, in some training: 'network, physics as input only', "
+        "'our network'" in out["notes"]
     )
     # where every route trains, every vehicle is trained on
     assert [x["share [%]"] for x in written(run, "shares") if x["evaluated on"] == TAUGHT] == ["10", "10", "100", "100"]
@@ -220,14 +221,15 @@ def test_how_much_of_what_is_learned_has_a_name(run, no_figures):
         ),
     ]
     notes = pinn_pages.table(config(), results, run)["notes"]
-    said = [n for n in notes if "lowers the RMSE" in n]
-    assert all("from 4 to 2 Wh" in n for n in said)
-    assert ["0.81 times as much" in said[0], "0.58 times as much" in said[1], len(said)] == [True, True, 2]
+    (said,) = [n for n in notes if "lowers the RMSE" in n]
+    assert "'our network without effects'" in said
+    assert "from 4 to 2 Wh" in said
+    assert said.index("0.81 times as much") < said.index("0.58 times as much")
     alone = [x for x in written(run, "table") if x["model"].endswith("linear fit before training")]
     assert [(x["n"], float(x["RMSE [Wh]"])) for x in alone] == [("3", 3.0)], "no seed changes a closed form"
     other = [(results[0][0], {**vehicles, "kernel": scored(MEASURED + 5.0)}), results[1]]
     (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if "lowers the RMSE" in n]
-    assert "does not lower the error, without a network" in none
+    assert none.endswith("a linear fit of the known effects does not lower the error")
     worse = [results[0], (task("ours without effects"), {"network": scored(MEASURED + 3.95)})]
     assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if "lowers the RMSE" in n]
 
@@ -238,7 +240,7 @@ def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures)
         for w, error in ((0.01, 2.0), (0.01, 6.0), (0.01, 3.0), (1.0, 4.0))
     ]
     lost = (task("paper", weights=[9.0, 0.1, 0.01]), {"diverged": True})
-    out = pinn_pages.grid(config("studies/pinn_weights"), [*results, lost], run)
+    out = sweeps.grid(config("studies/pinn_weights"), [*results, lost], run)
     assert out["rows"] == [
         {"name": "1, 0.1, 0.01", "paper": None, "ours": {"rmse_wh": pytest.approx(3.0)}},
         {"name": "1, 0.1, 1", "paper": None, "ours": {"rmse_wh": pytest.approx(4.0)}},
@@ -248,7 +250,7 @@ def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures)
         "one setting by at most 4.0 Wh; 1 of 5 trainings diverged"
     ]
     with pytest.raises(InputError, match="every training of the grid diverged"):
-        pinn_pages.grid(config("studies/pinn_weights"), [lost], run)
+        sweeps.grid(config("studies/pinn_weights"), [lost], run)
 
 
 def test_both_bounds_of_both_coefficients_count_in_every_member():
@@ -256,7 +258,7 @@ def test_both_bounds_of_both_coefficients_count_in_every_member():
         SimpleNamespace(c_rr=np.array([0.0199, 0.0001, 0.0100, 0.0100]), cda_m2=np.array([3.0, 9.0, 6.0, 3.0])),
         SimpleNamespace(c_rr=np.array([0.0197, 0.0003, 0.0100, 0.0199]), cda_m2=np.array([3.1, 8.9, 8.97, 6.0])),
     ]
-    found = pinn_networks._at_bound(
+    found = pinn_models._at_bound(
         Recipe(features=(), clamp=0.5), np.full(4, 6.0), near, np.array([True, True, True, False])
     )
     assert found == {"rows": 6, "c_rr": 2, "cda_m2": 3}
@@ -266,8 +268,8 @@ def test_a_training_that_diverges_is_a_result(monkeypatch):
     def diverges(*_, **__):
         raise DivergedError("training: the loss or its slope is not finite")
 
-    monkeypatch.setattr(pinn_networks, "networks", diverges)
-    monkeypatch.setattr(pinn_networks, "names_of", lambda *_: ("slope",))
+    monkeypatch.setattr(pinn_models, "networks", diverges)
+    monkeypatch.setattr(pinn_models, "names_of", lambda *_: ("slope",))
     whole = json.loads(json.dumps({**next(t for t in pinn.tasks(config()) if t["name"] == "paper"), "effects": {}}))
     spec = pinn.Model(**whole["model"])
-    assert pinn_networks.trained(four_rows(), None, USE, [whole, whole], spec) == [{"diverged": True}] * 2
+    assert pinn_models.trained(four_rows(), None, USE, [whole, whole], spec) == [{"diverged": True}] * 2
