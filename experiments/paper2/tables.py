@@ -70,7 +70,7 @@ def _ours(config: Any, result: Mapping[str, Any], settings: Any, own: str) -> di
             out[f"measured{kind}_trip{t}"] = m[f"energy{kind}"]
             out[f"signed_energy_error{kind}_trip{t}"] = m[f"{own}_pe{kind}"]
             out[f"energy_error{kind}_trip{t}"] = abs(m[f"{own}_pe{kind}"])
-            out[f"free_signed_energy_error{kind}_trip{t}"] = m[f"free_pe{kind}"]
+            out[f"signed_energy_error_in_free_run{kind}_trip{t}"] = m[f"free_pe{kind}"]
     out |= {"free_run": own == "free", "parameters": result["parameters"], "rule": settings.rule}
     if result["settings_found"]:
         out["settings_found"] = result["settings_found"]

@@ -15,8 +15,8 @@ NEAR_ORACLE = 1.05
 # of the noise, from which on an oracle's error is out of reach of a model that found nothing: √(1 + 0.5²) = 1.118
 TELLING = 0.5
 CAPTION = (
-    "Planted effects: intervals of sizes (n sizes, of effects named by their own id) and test errors (n logs), over "
-    "all logs with an effect to be named; target met: the share is in the target range"
+    "Planted effects: intervals of coefficients (n coefficients, of effects named by their own id) and test errors (n "
+    "logs), over all logs with an effect to be named; target met: the share is in the target range"
 )
 
 
@@ -34,7 +34,7 @@ def _share(name: str, hits: int, n: int, wanted: tuple[float, float] | None) -> 
 
 def _covered(able: Group) -> list[dict[str, Any]]:
     """Do intervals hold what they should, over all logs with an effect of the library and over each kind of log."""
-    name = "90 % intervals that hold the planted size"
+    name = "90 % intervals that hold the planted coefficient"
     kinds = list(dict.fromkeys(t["entry"] for t, _ in able))
     rows = []
     for words, of in (("", kinds), *((f", logs that enter at the {k}", [k]) for k in kinds if len(kinds) > 1)):
@@ -57,8 +57,8 @@ def _near_oracle(able: Group) -> list[dict[str, Any]]:
     rows = []
     for size in sorted({s for s, inside, _ in near if inside}):
         hits = [ok for s, inside, ok in near if inside and s == size]
-        rows.append(_share(f"{name}, size {size:g}", sum(hits), len(hits), None))
-    for words, inside in ((f"size {TELLING:g} and above", True), ("truths in another form", False)):
+        rows.append(_share(f"{name}, effect/noise {size:g}", sum(hits), len(hits), None))
+    for words, inside in ((f"effect/noise {TELLING:g} and above", True), ("truths in another form", False)):
         hits = [ok for s, held, ok in near if held == inside and s >= TELLING]
         if hits:
             rows.append(_share(f"{name}, {words}", sum(hits), len(hits), (ORACLE, 1.0)))

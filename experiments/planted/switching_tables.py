@@ -123,7 +123,7 @@ def collect(config: Any, results: Sequence[Log], run: Run) -> dict[str, Any]:
         "findings": [*_found_sentences(planted), *_interval_sentence(planted), *_false_sentences(empty, planted),
                      *_beside_sentence(beside)],
         "notes": [
-            "Size: the power of the load divided by the RMS of the noise; in segments, by the RMS of the noise's "
+            "Load/noise: the power of the load divided by the RMS of the noise; in segments, by the RMS of the noise's "
             "energy over the median duration of a row. Samples have the battery's power each second, with torque "
             "and motor speed measured; segments have the energy of each row, and the model goes from speed and "
             "slope to the battery. The noise is AR(1), 0.9 from row to row, unless the row of the table says "
@@ -229,7 +229,7 @@ def _found_sentences(planted: Sequence[Log]) -> list[str]:
     parts = []
     for size in sorted({t["loads"][0]["size"] for t, _ in one}):
         every = [scored(t["effects"], r).all_found for t, r in one if t["loads"][0]["size"] == size]
-        parts.append(f"{sum(every)} of {len(every)} logs at size {size:g}")
+        parts.append(f"{sum(every)} of {len(every)} logs at load/noise {size:g}")
     return [f"A single load is found in {names.verbose_join(parts)}"] if parts else []
 
 

@@ -27,7 +27,7 @@ TABLES = {
         ("right", "interval_95", "wanted", "met", "false_name", "called_unexplained"),
     ),
     "planted_errors": (
-        "Planted effects: errors, sizes, time",
+        "Planted effects: errors, coefficients, time",
         ("within_5_percent_of_oracle", "after_over_noise", "size_within_3_sd", "size_covered_90", "seconds"),
     ),
     "planted_names": (
@@ -50,9 +50,9 @@ MOST_SAID = 6  # counts that a page begins with
 BY_TWIN = "Planted effects: one without a twin has to be named alone, one with a twin in a class with it"
 LEGEND = {  # of each table that is there; the first of every page
     "": (
-        "Size: RMS of what the effect adds to a row and the declared coefficients cannot absorb, divided by the RMS "
-        "of the noise. Noise: white; AR(1) with a coefficient of {ar:g}; AR(1) + white, a fifth of the variance is "
-        "white; random intercepts of trips, half of the variance; Student's t, AR(1) with innovations of 3 degrees "
+        "Effect/noise: RMS of what the effect adds to a row and the declared coefficients cannot absorb, divided by "
+        "the RMS of the noise. Noise: white; AR(1) with a coefficient of {ar:g}; AR(1) + white, a fifth of the variance "
+        "is white; random intercepts of trips, half of the variance; Student's t, AR(1) with innovations of 3 degrees "
         "of freedom; variance by trip, AR(1) whose variance differs by trip. Logs hold energy by road segment; logs "
         "called shaft hold samples of electric power with the motor's torque and speed",
     ),
@@ -68,8 +68,8 @@ LEGEND = {  # of each table that is there; the first of every page
     "planted_errors": (
         "Within 5 % of a fit that knows the cause: share of logs whose test RMSE is at most 5 % above that of such "
         "a fit on the same training trips. Test RMSE over noise: test RMSE divided by the RMS of the noise, median. "
-        "Sizes: of planted effects that are the name, or the first name, of an entry. Seconds: of one diagnosis, "
-        "median, with others running on the same machine; the first logs of each kind include compiling",
+        "Coefficients: of planted effects that are the name, or the first name, of an entry. Seconds: of one "
+        "diagnosis, median, with others running on the same machine; the first logs of each kind include compiling",
     ),
     "planted_names": (
         "Top-ranked: share of logs in which the planted effect is the first of each class. Named alone: share "
@@ -138,7 +138,7 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
 
 
 def _findings(config: Config, done: Group) -> list[str]:
-    """What leads the page: right answers where nothing was planted and where one effect is to be named, by size."""
+    """What leads the page: right answers where nothing was planted, and where one effect is to be named."""
     groups: dict[str, list[bool]] = {}
     for task, result in done:
         case, planted = config.cases[task["case"]], task["effects"]
@@ -185,11 +185,11 @@ def _short_of(row: dict[str, Any]) -> str:
 
 
 def _sized(task: dict[str, Any]) -> str:
-    return f", size {task['size']:g}" if task["effects"] and task["size"] else ""
+    return f", effect/noise {task['size']:g}" if task["effects"] and task["size"] else ""
 
 
 def grouped(config: Config, done: Group) -> list[tuple[str, Group]]:
-    """Logs by setting: the case, the size, the number of trips and the noise."""
+    """Logs by setting: the case, effect/noise, the number of trips and the noise."""
     groups: dict[tuple[str, str], Group] = {}
     for task, result in done:
         key = f"{config.cases[task['case']].name}{_sized(task)}, {task['trips']} trips, {task['noise']}"

@@ -23,7 +23,8 @@ _TEX = {
 
 # What readers see of a key, a column's, a quantity's or a model's, where the key's own words and unit do not say it.
 _WORDS = {
-    "inside_90": "coverage of 90 % interval [%]", "size_covered_90": "share of sizes in 90 % intervals",
+    "inside_90": "coverage of 90 % interval [%]", "size_covered_90": "share of coefficients in 90 % intervals",
+    "size_within_3_sd": "coefficient within 3 sd",
     "nodes_in_90": "share of nodes in 90 % intervals", "interval_95": "95 % interval", "false_95": "95 % interval",
     "false_percent": "false names [%]", "c_rr": "c_rr", "c_rr_bias_percent": "bias of c_rr [%]",
     "null_logs": "logs without payload error", "payload_logs": "logs with payload error",

@@ -284,7 +284,7 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch, l
     assert first["synthetic"] is True
     assert first["skipped"] == []
     rows = {r["name"]: r["ours"] for r in first["rows"]}
-    assert rows["one effect, size 1, 12 trips, ar1"]["named_exactly"] == 1.0
+    assert rows["one effect, effect/noise 1, 12 trips, ar1"]["named_exactly"] == 1.0
     assert rows["nothing planted, 12 trips, ar1"]["false_name"] == 0.0
     for name in (
         "tables/planted.md",

@@ -58,14 +58,14 @@ def test_shares_of_synthetic_logs_are_those_of_the_page():
         (0.5, "half as large as the noise is identified in"),
         (0.25, "a quarter as large in"),
     ):
-        name = f"one effect, size {size}, 12 trips, AR(1)"
+        name = f"one effect, effect/noise {size}, 12 trips, AR(1)"
         assert f"{words} {percent(cell(PLANTED, name, 'right'))} % of {cell(PLANTED, name, 'n'):.0f}" in TEXT
         alone.append(percent(cell(PLANTED, name, "named alone")))
     assert f"named alone ({alone[0]} and {alone[1]} %)" in TEXT
     quiet = "nothing planted, all together"
     n = cell(PLANTED, quiet, "n")
     assert f"an effect is named in {(1 - cell(PLANTED, quiet, 'right')) * n:.0f} of {n:.0f} logs" in TEXT
-    outside = [f"a {what} outside the library, size 1, 24 trips, AR(1)" for what in ("cause", "cycle")]
+    outside = [f"a {what} outside the library, effect/noise 1, 24 trips, AR(1)" for what in ("cause", "cycle")]
     wrong = sum(cell(PLANTED, name, "false name") * cell(PLANTED, name, "n") for name in outside)
     assert f"a wrong one is named in {wrong:.0f} of {sum(cell(PLANTED, name, 'n') for name in outside):.0f}." in TEXT
 
