@@ -30,7 +30,7 @@ from experiments.measured.tables import (
     together,
 )
 from experiments.measured.withheld import WITHHELD
-from experiments.runner.pages.site import folded
+from experiments.runner.pages.site import folded, wrapped
 from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.report import names
 
@@ -78,7 +78,7 @@ def page(results: Results, *, warm: Mapping[str, float], rest: Mapping[str, Any]
         if section:
             lines += ["", *section[0]]
             drawn |= section[1]
-    return "\n".join(lines).rstrip() + "\n", drawn
+    return wrapped("\n".join(lines).rstrip()) + "\n", drawn
 
 
 def write(docs: Path, text: str, drawn: Mapping[str, bytes]) -> None:
@@ -120,8 +120,8 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             slow = sum(r["unexplained"]["memory_s"] is not None for r in runs.values())
             out.append(
                 f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. {found} "
-                f"In {open_} of {len(runs)} the diagnosis reports structure that no effect explains, in {slow} a "
-                "residual that drifts within trips."
+                f"In {open_} of {len(runs)} the diagnosis reports structure that no effect explains. In {slow} of "
+                f"{len(runs)} the residual drifts within trips."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)

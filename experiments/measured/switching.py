@@ -67,7 +67,7 @@ def _by_trip(result: Mapping[str, Any], block: str) -> list[Mapping[str, Any]]:
 def _share(state: Mapping[str, Any], temp_c: float) -> str:
     for c, share, low, high in state["share_on"]:
         if c == temp_c:
-            if high < 0.005:
+            if high < 0.01:
                 return "< 1 %"
             return f"{100 * share:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     return "–"

@@ -195,7 +195,7 @@ def nearest(result: Mapping[str, Any]) -> str:
         if c["id"] not in found and (c["score"] or 0.0) > SETTINGS.suspicious and c["kind"] not in IMPOSSIBLE
     ]  # fmt: skip
     best = max(able, key=lambda c: c["score"], default=None)
-    return "–" if best is None else f"`{best['id']}` (score {words.number(best['score'])}): {best['why_not']}"
+    return "–" if best is None else f"`{best['id']}` (gain {words.number(best['score'])}): {best['why_not']}"
 
 
 def left_table(runs: Runs, head: str, unit: str) -> list[str]:

@@ -51,10 +51,10 @@ BY_TWIN = "Planted effects: one without a twin has to be named alone, one with a
 LEGEND = {  # of each table that is there; the first of every page
     "": (
         "Effect/noise: RMS of what the effect adds to a row and the declared coefficients cannot absorb, divided by "
-        "the RMS of the noise. Noise: white; AR(1) with a coefficient of {ar:g}; AR(1) + white, a fifth of the variance "
-        "is white; random intercepts of trips, half of the variance; Student's t, AR(1) with innovations of 3 degrees "
-        "of freedom; variance by trip, AR(1) whose variance differs by trip. Logs hold energy by road segment; logs "
-        "called shaft hold samples of electric power with the motor's torque and speed",
+        "the RMS of the noise. Noise: white; AR(1) with a coefficient of {ar:g}; AR(1) + white, a fifth of the "
+        "variance is white; random intercepts of trips, half of the variance; Student's t, AR(1) with innovations of "
+        "3 degrees of freedom; variance by trip, AR(1) whose variance differs by trip. Logs hold energy by road "
+        "segment; logs called shaft hold samples of electric power with the motor's torque and speed",
     ),
     "planted": (
         "Right: the share of logs with the right answer, with Wilson's 95 % interval. If effects of the library were "

@@ -7,6 +7,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from experiments.planted.study import Config, tasks
 from experiments.runner import store
@@ -15,7 +17,7 @@ from experiments.runner.config import CONFIGS, artefact, changes, every_config, 
 from experiments.runner.data import MissingDataError
 from experiments.runner.engine import plan, run_config
 from experiments.runner.log import Log
-from experiments.runner.pages.site import MOST_ROWS, part, write_docs
+from experiments.runner.pages.site import MOST_ROWS, part, wrapped, write_docs
 from experiments.runner.tables import wilson
 from hdev_jax.errors import InputError
 from hdev_jax.physics import LIBRARY
@@ -318,3 +320,17 @@ def test_a_long_table_of_a_page_of_many_runs_is_folded():
     assert "<details" not in "\n".join(whole)
     assert f"<summary>Table of {MOST_ROWS + 1} rows</summary>" in "\n".join(some)
     assert all(f"| {k} | 1 |" in "\n".join(some) for k in range(MOST_ROWS + 1))
+
+
+WORDS = ("white", "+", "-", "2.", "`a b`", "noise,", "[x](y.md)", "#")
+
+
+@given(st.lists(st.sampled_from(WORDS), min_size=30, max_size=90))
+def test_a_wrapped_page_says_the_same_and_begins_no_list_inside_a_sentence(words):
+    for begin in ("A sentence ", "- an item ", "  - an item "):
+        line = begin + " ".join(words)
+        lines = wrapped(line).split("\n")
+        assert " ".join(x.strip() for x in lines) == line.strip()
+        assert not [x for x in lines[1:] if re.match(r" *([-+*#>]|\d+[.)]) ", x)]
+    table = "| a | " + " ".join(words) + " |"
+    assert wrapped(table) == table

@@ -199,7 +199,11 @@ def test_a_window_without_rows_is_one_line(trips, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "sets"),
-    [("table8", 'order=["nope"]'), ("pedal", 'model="nope"'), ("selection", 'groups.NARXP.model="nope"')],
+    [
+        ("table8", 'order=["nope"]'),
+        ("input_accelerator_pedal", 'model="nope"'),
+        ("selection", 'groups.NARXP.model="nope"'),
+    ],
 )
 def test_a_model_that_no_one_defined_is_one_line(trips, name, sets, tmp_path, monkeypatch):
     monkeypatch.setattr(paper2_pedal, "kia_fingerprint", lambda only="": "made up")
@@ -217,11 +221,11 @@ def test_a_model_that_no_one_defined_is_one_line(trips, name, sets, tmp_path, mo
         ("online", "memories_min=[0.0]", "memories_min.0"), ("online", "huber_kw=0.0", "huber_kw"),
         ("table4", "models.NARXP.huber_kw=-1.0", "huber_kw"), ("table4", "models.NNS.ridge_slope=-1.0", "ridge_slope"),
         ("table4", "models.physics.kernel_order=7", "kernel_order"), ("table7", "models.LSTM.rate=0.0", "rate"),
-        ("fig12", 'train="9"', "train"), ("fig5", "rows=-5", "rows"), ("pedal", "share=1.0", "share"),
+        ("fig12", 'train="9"', "train"), ("fig5", "rows=-5", "rows"), ("input_accelerator_pedal", "share=1.0", "share"),
         ("selection", "recurrent_starts=0", "recurrent_starts"), ("selection", "blocks=1", "blocks"),
         ("table8", 'show=["change_percent", "test_mean"]', ".*decides no table"),
         ("fig13", "window=[40.0, 10.0]", ".*ends at 10"),
-        ("pedal", "seed=-1", "seed"), ("fig5", "seed=-1", "seed"),
+        ("input_accelerator_pedal", "seed=-1", "seed"), ("fig5", "seed=-1", "seed"),
     ],
 )  # fmt: skip
 def test_a_value_out_of_range_is_one_line(name, sets, key, tmp_path):

@@ -166,9 +166,9 @@ def test_sizes_agree_as_far_as_equal_ones_of_so_many_sets_differ():
 def test_an_effect_whose_sign_turns_is_told_first(results):
     offsets = {"niro_1": -5.5, "niro_2": 0.7}  # Nm
     turned = {k: result([effect("torque_offset", "offset_nm", v, 0.1, "Nm")]) for k, v in offsets.items()}
-    text, _ = page.page(turned, warm={}, rest={})
+    text = " ".join(page.page(turned, warm={}, rest={})[0].split())
     assert "The sign of `torque_offset.offset_nm` differs." in text.partition("## Kia Niro")[0]
-    text, _ = page.page(results, warm={}, rest={})
+    text = " ".join(page.page(results, warm={}, rest={})[0].split())
     assert "agree on the sign" not in text
 
 
@@ -218,7 +218,7 @@ def test_a_channel_that_nothing_reads_is_a_control(results):
 
 def test_what_two_runs_do_not_have_in_common_is_said(results):
     results["ztbus_1_no_steering"]["ran"]["seed"] = 7
-    text, _ = page.page(results, warm={}, rest={})
+    text = " ".join(page.page(results, warm={}, rest={})[0].split())
     assert text.count("**Not the same in both: seed.**") == 1
     del results["ztbus_1_no_temperature"]["ran"]["fdr"]  # what a run does not say, it does not share
     assert "The same: sheet, split, seed.\n" in page.page(results, warm={}, rest={})[0]
@@ -234,7 +234,7 @@ def test_road_load_without_the_force_stands_beside_that_with_it(results):
             "driveline.efficiency": (0.9, 0.01),
         },
     }
-    text, _ = page.page(results, warm={}, rest={})
+    text = " ".join(page.page(results, warm={}, rest={})[0].split())
     assert "## Road load without the force" in text
     assert "| Kia Niro, trip 1 | `road.c_rr` | 0.01 ± 0.0003 | 0.0104 ± 0.0004 | +0.8 | yes |" in text
     assert "| Kia Niro, trip 1 | `road.cda_m2` | 0.7 ± 0.01 | 0.75 ± 0.01 | +3.5 | no |" in text
@@ -243,7 +243,7 @@ def test_road_load_without_the_force_stands_beside_that_with_it(results):
 
 def test_runs_that_find_nothing_in_common(results):
     results["niro_2"]["effects"] = []
-    text, _ = page.page(results, warm={}, rest={})
+    text = " ".join(page.page(results, warm={}, rest={})[0].split())
     assert "No effect is found by all." in text
 
 
@@ -326,7 +326,7 @@ def test_kept_runs_make_the_page_without_data(results, tmp_path, monkeypatch, ca
         )
         (work / name / "predictive.json").write_text(json.dumps({"covariance": covariance}))
     assert logs.main(["--work", str(work), "--docs", str(docs), "--kept", "--write"]) == 0
-    text = (docs / "real_logs.md").read_text()
+    text = " ".join((docs / "real_logs.md").read_text().split())
     assert logs.kept(jobs[0], work)["coefficients"] == {"machine.motoring_efficiency": (0.92, 0.01)}  # pyright: ignore
     assert "trained on trip" in text
     assert "- `iron` and `offset` (1: -0.99, 2: -0.99)." in text

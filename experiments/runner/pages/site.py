@@ -2,6 +2,7 @@
 
 import json
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,11 @@ from experiments.runner.pages.html import MOST_ROWS
 from experiments.runner.store import HERE
 from experiments.runner.tables import cells, markdown
 
-__all__ = ["about", "folded", "heading", "kind_of", "part", "title_of", "write_docs", "write_list_docs"]
+__all__ = ["about", "folded", "heading", "kind_of", "part", "title_of", "wrapped", "write_docs", "write_list_docs"]
 
 MOST_COLUMNS = 8  # of the table that a page shows
 MOST_MISSED = 4  # targets that a page shows; more are folded
+WIDTH = 120
 
 
 def write_docs(
@@ -36,7 +38,7 @@ def write_docs(
         lines += _lines(folder, Path(config), docs, name, "" if len(folders) == 1 else f"{k}_")
     lines += ["", _by(f"{' '.join([every, *flags])} --tasks DIR --out OUT --docs docs")]
     docs.mkdir(parents=True, exist_ok=True)  # a page without figures has made no folder
-    (docs / f"{name}.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (docs / f"{name}.md").write_text(wrapped("\n".join(lines)) + "\n", encoding="utf-8")
 
 
 def write_list_docs(
@@ -77,7 +79,7 @@ def write_list_docs(
             lines += ["## Paper against ours", "", *folded("Every number of the paper", every_number), ""]
         lines += [_by(f"{' '.join([shown(configs), *flags])} --out OUT --docs docs")]
         pages.append(docs / f"{home.name}.md")
-        pages[-1].write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+        pages[-1].write_text(wrapped("\n".join(lines).rstrip()) + "\n", encoding="utf-8")
     return pages
 
 
@@ -178,6 +180,23 @@ def _split(row: str) -> list[str]:
 def folded(title: str, text: str) -> list[str]:
     """A part of a page that opens on a click, on the site and where Markdown is shown as it is."""
     return ['<details markdown="1">', f"<summary>{title}</summary>", "", text, "", "</details>"]
+
+
+def wrapped(text: str) -> str:
+    """Markdown whose sentences are in lines of at most `WIDTH`, so that what changes in them is seen in a diff."""
+    out, code = [], False
+    for line in text.split("\n"):
+        code ^= line.startswith("```")
+        if code or len(line) <= WIDTH or line.startswith(("|", "#", "!", "<")):
+            out.append(line)
+            continue
+        own = re.match(r" *((-|\d+[.]) )?", line)
+        begin = own.group() if own else ""
+        # a plus or a number with a dot would begin a list if it began a line
+        text = re.sub(r" (?=([-+*#>]|\d+[.)]) )", "\0", line.removeprefix(begin))
+        lines = textwrap.wrap(text, WIDTH - len(begin), break_long_words=False, break_on_hyphens=False)
+        out += [(" " * len(begin) if k else begin) + x.replace("\0", " ") for k, x in enumerate(lines)]
+    return "\n".join(out)
 
 
 def _titled(config: Path) -> str:
