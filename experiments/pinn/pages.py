@@ -27,7 +27,7 @@ from experiments.pinn.results import (
 from experiments.pinn.scores import QUANTILES, pooled
 from experiments.runner.tables import write_tables
 from hdev_jax.physics import LIBRARY
-from hdev_jax.report import names
+from hdev_jax.report import names, words
 from hdev_jax.rundir import Run
 
 __all__ = ["coefficients", "table"]
@@ -231,7 +231,7 @@ def _effects(results: Results) -> list[dict[str, Any]]:
 
 
 def _with_unit(x: float, unit: str | None) -> str:
-    return number(x) if unit in (None, "1") else f"{number(x)} {unit}"
+    return words.number(x) if unit in (None, "1") else f"{words.number(x)} {unit}"
 
 
 def _quantiles(results: Results) -> dict[str, dict[str, Any]]:

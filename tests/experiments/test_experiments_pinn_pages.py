@@ -273,3 +273,19 @@ def test_a_training_that_diverges_is_a_result(monkeypatch):
     whole = json.loads(json.dumps({**next(t for t in pinn.tasks(config()) if t["name"] == "paper"), "effects": {}}))
     spec = pinn.Model(**whole["model"])
     assert pinn_models.trained(four_rows(), None, USE, [whole, whole], spec) == [{"diverged": True}] * 2
+
+
+def test_effects_found_are_said_with_their_units_and_who_is_given_them(run, no_figures):
+    found = {"regen_limit": {"power_w": 2e5, "share": 1.0}, "auxiliary_power": {"power_w": 823.4}}
+    physics = {"kernel": scored(MEASURED + 1.0), "found": found}
+    own = {**task("ours"), "model": {**task("ours")["model"], "effects": True}}
+    out = pinn_pages.table(
+        config(), [(task("physics", "vehicles", vehicle=0), physics), (own, {"network": scored()})], run
+    )
+    said = {x["effect"]: x["median"] for x in written(run, "effects")}
+    assert said["constant auxiliary load"] == "power 823 W"
+    assert said["limit of regeneration"].startswith("power 200,000 W")
+    given = "'physics, known effects, linear fit' and 'our network' are given the effects that the fleet hides"
+    assert given in out["findings"]
+    bare = pinn_pages.table(config(), [(task("paper"), {"network": scored()})], run)
+    assert not [x for x in bare["findings"] if "the fleet hides" in x]
