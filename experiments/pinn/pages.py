@@ -218,7 +218,7 @@ def _effects(results: Results) -> list[dict[str, Any]]:
     """Effects by how many vehicles' diagnoses named them, with medians of their parameters."""
     found = [r["found"] for _, r in results if "found" in r]
     out = []
-    for id in sorted({e for f in found for e in f}, key=lambda e: -sum(e in f for f in found)):
+    for id in sorted({e for f in found for e in f}, key=lambda e: (-sum(e in f for f in found), names.effect(e))):
         having = [f[id] for f in found if id in f]
         keys = sorted({k for h in having for k in h})
         values = {k: float(np.median([h[k] for h in having if k in h])) for k in keys}
