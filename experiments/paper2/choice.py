@@ -11,7 +11,7 @@ from hdev_jax.rundir import Run
 
 __all__ = ["chosen_keys", "collect"]
 
-RULES = ("least", "ensemble")
+RULES = {"least": "the start with the lowest training loss", "ensemble": "the mean prediction of all starts"}
 CHOSEN = ("units", "rate", "ridge_slope", "outputs")  # numbers that may be at the edge of the grid
 
 
@@ -55,7 +55,10 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
             if not is_used:
                 missed.append(f"{group.model} of the tables is not the best on trip 1, which is {name}")
             if result["starts"] > 1 and model.rule != rule:
-                missed.append(f"{group.model} of the tables has the rule {model.rule}; on trip 1 {rule} is better")
+                missed.append(
+                    f"for {group.model} the tables have {RULES[model.rule]}; on held-out rows of trip 1 {RULES[rule]} "
+                    "is better"
+                )
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     return {
         "artefact": config.artefact, "data": "kia_niro", "synthetic": False, "rows": rows,

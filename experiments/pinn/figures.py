@@ -36,7 +36,7 @@ def coefficient_boxes(run: Run, quantiles: Mapping[str, Any], name: str, label: 
         if table:
             ax.plot([i - 0.4, i + 0.4], [table[name][2]] * 2, color="#c03030", linewidth=1.4,
                     label="value from tables" if i == 0 else None)  # fmt: skip
-    ax.set_xticks(range(len(models)), [f"model {m}" for m in models])
+    ax.set_xticks(range(len(models)), [f"type {m}" for m in models])
     ax.set_ylabel(label)
     ax.set_ylim(bottom=0)
     ax.set_title(f"{label} on test routes of the synthetic fleet: 5, 25, 50, 75, 95 %")
@@ -73,7 +73,7 @@ def model_bars(run: Run, gathered: Mapping[tuple[str, str], list[dict[str, Any]]
         ax.set_xlabel(label)
         ax.axvline(0, color="black", linewidth=0.6)
         tidy(ax, grid="x")
-    fig.suptitle(f"Errors on test rows, {data}; blue: ours, orange: the paper's network")
+    fig.suptitle(f"Errors on test rows, {data}; blue: our network, orange: the paper's network")
     save_figure(run, fig, "models")
 
 

@@ -32,15 +32,15 @@ from hdev_jax.rundir import Run
 
 __all__ = ["coefficients", "table"]
 
-THEIRS = "the paper's RMSE and PE are of its private fleet; ours are of {}, so that the two are not comparable"
-DIAGNOSED = "models 'effects as diagnosed' have the effects that the diagnosis of training routes names"
+THEIRS = (
+    "the paper's RMSE and PE (percentage error of the total energy, with its sign) are of its private fleet; ours are "
+    "of {}, so that the two are not comparable"
+)
+DIAGNOSED = "models with 'effects as diagnosed' have the effects that the diagnosis of training routes names"
 RATIO = "coefficient error: median ratio of predicted to true value, minus one, no sign; spray counts as air drag"
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
-NAMEABLE = {
-    WAYS["kernel"]: "a linear fit of the known effects",
-    f"{OURS}, effects as diagnosed, {FORM}": "a linear fit of the effects named by diagnosis",
-}
+NAMEABLE = (WAYS["kernel"], f"{OURS}, effects as diagnosed, {FORM}")
 
 
 def _line(
@@ -133,17 +133,16 @@ def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[
     base, learned = square.get(WAYS["bayesian"]), square.get(LEARNED)
     if base is None or learned is None or base - learned < LEAST_LEARNED * base:
         return []
-    parts = []
-    for way, whose in NAMEABLE.items():
-        if way in square:
-            share = (base - square[way]) / (base - learned)
-            removed = f"lowers the squared error {share:.2f} times as much" if share > 0 else "does not lower the error"
-            parts.append(f"{whose} {removed}")
+    parts = [
+        f"{(base - square[way]) / (base - learned):.2f} by '{in_words(way)}' ({square[way] ** 0.5:.4g} Wh)"
+        for way in NAMEABLE if way in square
+    ]  # fmt: skip
     if not parts:
         return []
     return [
-        f"'{in_words(LEARNED)}' lowers the RMSE of the calibrated declared physics from {base**0.5:.4g} to "
-        f"{learned**0.5:.4g} Wh; without a network, {' and '.join(parts)}"
+        f"how far named effects, without a network, lower the mean squared error of the calibrated declared physics "
+        f"(RMSE {base**0.5:.4g} Wh), as a multiple of what '{in_words(LEARNED)}' lowers it ({learned**0.5:.4g} Wh): "
+        f"{', '.join(parts)}"
     ]
 
 

@@ -249,7 +249,8 @@ def _false_sentences(empty: Sequence[Log], planted: Sequence[Log]) -> list[str]:
     out = []
     if n:
         most = f"95 % interval up to {100.0 * wilson(wrong, n)[1]:.2g} %"
-        out = [f"With nothing planted a load is named in {wrong} of {n} logs ({most})"]
+        others = sum(bool(r["named"]) for _, r in empty) - wrong
+        out = [f"With nothing planted a load is named in {wrong} of {n} logs ({most}), another effect in {others}"]
     others = [(t, r["without"]) for t, r in planted if "named" in r.get("without", {})]
     if others:
         out.append(f"With another effect and no load, a load is named in {_with_load(others)} of {len(others)} logs")

@@ -171,7 +171,8 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
             f"At least as good, on synthetic data, as the paper on its own data in {better} of {of} comparisons."
         )
     elif metrics["of"] == 1:
-        said.append(f"Ours is {'at least' if metrics['better_than_paper'] else 'not'} as good as the paper.")
+        good = "at least" if metrics["better_than_paper"] else "not"
+        said.append(f"Ours is {good} as good as the paper in its main error ({readable(metrics['headline'])}).")
     elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += [line[0].upper() + line[1:] for line in _sentences(metrics.get("findings", []))]

@@ -161,7 +161,7 @@ def _handed_out(
     if named.found and not any(f.score.candidate.effect.searched for f in named.found):
         levels = training.clusters.kind == "trip"
         if not held_out_gain(problem, split, predicted[0], predicted[-1], levels=levels) > -settings.ahead:
-            tell("contradicted by the held-out trips: nothing is named")
+            tell("rejected by the held-out trips: nothing is named")
             named, steps, predicted, state = none_named(named, steps[0]), steps[:1], predicted[:1], None
     given = given_states(problem, split, named, steps[-1], seed, kernel=training.kernel)
     explained = predicted[-1] if given is None else given.predicted

@@ -221,17 +221,18 @@ def test_how_much_of_what_is_learned_has_a_name(run, no_figures):
         ),
     ]
     notes = pinn_pages.table(config(), results, run)["notes"]
-    (said,) = [n for n in notes if "lowers the RMSE" in n]
-    assert "'our network without effects'" in said
-    assert "from 4 to 2 Wh" in said
-    assert said.index("0.81 times as much") < said.index("0.58 times as much")
+    (said,) = [n for n in notes if n.startswith("how far named effects")]
+    assert "(RMSE 4 Wh)" in said
+    assert "'our network without effects' lowers it (2 Wh)" in said
+    assert "0.81 by 'physics, known effects, linear fit' (2.5 Wh)" in said
+    assert "0.58 by 'our network, effects as diagnosed, its linear fit before training' (3 Wh)" in said
     alone = [x for x in written(run, "table") if x["model"].endswith("linear fit before training")]
     assert [(x["n"], float(x["RMSE [Wh]"])) for x in alone] == [("3", 3.0)], "no seed changes a closed form"
     other = [(results[0][0], {**vehicles, "kernel": scored(MEASURED + 5.0)}), results[1]]
-    (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if "lowers the RMSE" in n]
-    assert none.endswith("a linear fit of the known effects does not lower the error")
+    (none,) = [n for n in pinn_pages.table(config(), other, run)["notes"] if n.startswith("how far named effects")]
+    assert "-0.75 by 'physics, known effects, linear fit' (5 Wh)" in none
     worse = [results[0], (task("ours without effects"), {"network": scored(MEASURED + 3.95)})]
-    assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if "lowers the RMSE" in n]
+    assert not [n for n in pinn_pages.table(config(), worse, run)["notes"] if n.startswith("how far named effects")]
 
 
 def test_the_grid_has_medians_over_seeds_and_says_what_diverged(run, no_figures):

@@ -143,9 +143,9 @@ def test_check_shows_the_passes(tmp_path):
     frame = passes(6).drop(columns=["x", "slope"])
     log = read(tmp_path, frame.rename(columns={"latitude_deg": "latitude", "longitude_deg": "longitude"}))
     line = next(x for x in check(log).splitlines() if x.startswith("  altitude: "))
-    assert "cells passed 6 times (median)" in line
-    assert "% by one pass" in line
-    assert any("cells passed" in e.reason and e.column == "grade_rad" for e in log.ledger)
+    assert "more than once, 6 times in the median" in line
+    assert "% from one pass" in line
+    assert any("passed more than once" in e.reason and e.column == "grade_rad" for e in log.ledger)
 
 
 def test_laps_of_one_trip_are_passes():

@@ -65,7 +65,7 @@ SENTENCES = {
     Kind.PLACEBO: "a placebo ({how}) does as well",
     Kind.UNSTABLE: "ranks first in only {percent:.0f} % of resampled sets of {unit}",
     Kind.SUPERFLUOUS: "not significant given {beside}",
-    Kind.NOT_HELD_OUT: "contradicted: the model with all found effects predicts the held-out trips worse",
+    Kind.NOT_HELD_OUT: "rejected by the held-out trips: the model with all found effects predicts them worse",
     Kind.INSTRUMENT: "no instrument fault is named, as {percent:.0f} % of the remaining variance is not noise",
     Kind.FOUND: "found",
     Kind.DECLARED: "declared in the sheet",

@@ -32,10 +32,11 @@ class Repeated:
     disagree: int
 
     def line(self) -> str:
-        """`2400 of 2500 cells passed 10 times (median), their slope's error 0.85 % by one pass, 0.37 % by all`."""
+        """How many cells several passes tell the slope of, and how well."""
         return (
-            f"{self.cells} of {self.of} cells passed {self.passes:.0f} times (median), their slope's error "
-            f"{100 * self.alone_rad:.2g} % by one pass, {100 * self.together_rad:.2g} % by all"
+            f"{self.cells} of {self.of} cells lie in places passed more than once, {self.passes:.0f} times in the "
+            f"median: error of their slope {100 * self.alone_rad:.2g} % from one pass, "
+            f"{100 * self.together_rad:.2g} % from all"
         )
 
 
