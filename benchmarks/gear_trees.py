@@ -27,6 +27,7 @@ from timing import median_seconds
 from trees import HELD, accuracy, columns, models
 
 from experiments.paper1.gears import fleet_rows
+from experiments.runner.pages.site import wrapped
 from hdev_jax.learn.gears.classifiers import Classifier
 
 PAGE = Path(__file__).parents[1] / "docs" / "gear_speed.md"
@@ -173,7 +174,7 @@ def main(argv: list[str] | None = None) -> int:
     if given.json:
         given.json.write_text(json.dumps(out, indent=1) + "\n", encoding="utf-8")
     if given.write:
-        PAGE.write_text(page(out), encoding="utf-8")
+        PAGE.write_text(wrapped(page(out)), encoding="utf-8")
     return 0
 
 

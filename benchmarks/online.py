@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.runner.pages.site import wrapped
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import Prior, Statistics, follow
 from hdev_jax.inference.sheet import Sheet
@@ -145,7 +146,7 @@ def main(argv: list[str] | None = None) -> int:
     if given.json:
         given.json.write_text(json.dumps(out, indent=1) + "\n")
     if given.write:
-        PAGE.write_text(page(out))
+        PAGE.write_text(wrapped(page(out)))
     missed = [f"{k} {out[k]:.3g}, at most {limit:g}" for k, limit in LIMITS.items() if out[k] > limit]
     print("within the limits" if not missed else "MISSED\n  " + "\n  ".join(missed))
     return 1 if missed else 0

@@ -185,7 +185,7 @@ def size_table(runs: Runs, head: str) -> list[str]:
 
 
 def nearest(result: Mapping[str, Any]) -> str:
-    """The rejected candidate that comes nearest, with its score and the reason; a dash for none.
+    """The rejected candidate that comes nearest, with its gain and the reason; a dash for none.
 
     One whose best size is impossible, or that the log cannot tell from a fitted coefficient, is near to nothing.
     """

@@ -36,7 +36,6 @@ THEIRS = (
     "the paper's RMSE and PE (percentage error of the total energy, with its sign) are of its private fleet; ours are "
     "of {}, so that the two are not comparable"
 )
-DIAGNOSED = "models with 'effects as diagnosed' have the effects that the diagnosis of training routes names"
 RATIO = "coefficient error: median ratio of predicted to true value, minus one, no sign; spray counts as air drag"
 LEARNED = f"{OURS} without effects"
 LEAST_LEARNED = 0.05  # of the squared error; a share of less says nothing
@@ -99,7 +98,6 @@ def table(config: Any, results: Results, run: Run) -> dict[str, Any]:
             *([THEIRS.format("measured buses" if config.data == "ztbus" else "a synthetic one with other noise")]
               if any(r["paper"] for r in rows) else []),
             *(given(results) if config.data == "fleet" else []),
-            *([DIAGNOSED] if any("diagnosed" in way for way, _ in gathered) else []),
             *_of_fewer(lines),
         ],
         "notes": [
@@ -159,7 +157,7 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
             lines.append({"vehicle": m, "method": in_words(way),
                           **{f"{k} %": x for k, x in zip(QUANTILES, q, strict=True)},
                           "coefficient error [%]": 100 * found[m][f"{name}_error"]})  # fmt: skip
-            rows.append({"name": f"{m}, {way}", "paper": None, "ours": {"median": q[2], "true_median": t[2]}})
+            rows.append({"name": f"{m}, {named(way)}", "paper": None, "ours": {"median": q[2], "true_median": t[2]}})
     write_tables(run, "coefficients", lines, config.caption)
     return {
         "artefact": config.artefact, "data": "synthetic fleet", "synthetic": True, "rows": rows,
@@ -176,11 +174,11 @@ def coefficients(config: Any, results: Results, run: Run) -> dict[str, Any]:
 def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound: Mapping[str, Any]) -> list[str]:
     """What ours is meant to reach, and does not."""
     test = {way: pooled(f) for (way, use), f in gathered.items() if use == "test"}
-    out = []
+    every, out = [], []
     if {PAPER_MODEL, f"{PAPER_MODEL}, {PHYSICS}", WAYS["tabular"]} <= set(test) and config.data == "fleet":
         order = [test[k]["rmse_wh"] for k in (PAPER_MODEL, f"{PAPER_MODEL}, {PHYSICS}", WAYS["tabular"])]
         if not order[0] < order[1] < order[2]:
-            out.append("RMSE is not in the order of table 2: " + ", ".join(f"{x:.2f}" for x in order))
+            every.append("RMSE is not in the order of table 2: " + ", ".join(f"{x:.2f}" for x in order))
     if OURS in test:
         mine = test[OURS]
         limit = 1.0 if config.data == "fleet" else 3.0
@@ -192,13 +190,13 @@ def _missed(config: Any, gathered: Mapping[Any, list[dict[str, Any]]], at_bound:
         best = min(test, key=lambda k: test[k]["rmse_wh"])
         if config.data == "ztbus" and best != OURS:
             out.append(f"RMSE {mine['rmse_wh']:.1f} Wh, the best is {in_words(best)} with {test[best]['rmse_wh']:.1f}")
-        for k in ("c_rr", "cda_m2"):
+        for k, shown in (("c_rr", "c_rr"), ("cda_m2", "C_d·A")):
             if mine.get(f"{k}_error_percent", 0.0) > 5.0:
-                out.append(f"{k} off by {mine[f'{k}_error_percent']:.1f} % in the median of vehicles, target 5")
+                out.append(f"{shown} off by {mine[f'{k}_error_percent']:.1f} % in the median of vehicles, target 5")
             if mine.get(f"{k}_error_worst", 0.0) > 5.0:
-                out.append(f"{k} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, target 5")
+                out.append(f"{shown} off by {mine[f'{k}_error_worst']:.1f} % in the worst vehicle, target 5")
     out += [f"{100 * max(b.values()):.1f} % at a bound" for n, b in at_bound.items() if n == OURS]
-    return [x if x.startswith("RMSE is") else f"{in_words(OURS)}: {x}" for x in out]
+    return [*every, *(f"{in_words(OURS)}: {x}" for x in out)]
 
 
 def _at_bound(results: Results) -> dict[str, dict[str, float]]:
@@ -230,7 +228,7 @@ def _effects(results: Results) -> list[dict[str, Any]]:
 
 
 def _with_unit(x: float, unit: str | None) -> str:
-    return words.number(x) if unit in (None, "1") else f"{words.number(x)} {unit}"
+    return words.number(x, unit="" if unit in (None, "1") else unit)
 
 
 def _quantiles(results: Results) -> dict[str, dict[str, Any]]:

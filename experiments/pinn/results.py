@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from experiments.runner.tables import readable
+from hdev_jax.report import names
 
 __all__ = [
     "FORM", "HELD", "MODELS", "NAMED", "OURS", "PAPER_MODEL", "PHYSICS", "WAYS", "Results", "distinct", "diverged",
@@ -89,10 +90,15 @@ def diverged(results: Results) -> list[str]:
 
 
 def given(results: Results) -> list[str]:
-    """Which models know the effects that the synthetic fleet hides, where any does."""
-    names = [in_words(WAYS["kernel"])] if any("kernel" in r for _, r in results) else []
-    names += [in_words(t["name"]) for t, r in results if t["model"].get("effects") is True and "network" in r]
-    if not names:
-        return []
-    said = " and ".join(f"'{n}'" for n in dict.fromkeys(names))
-    return [f"{said} {'are' if len(set(names)) > 1 else 'is'} given the effects that the fleet hides"]
+    """Which models know the effects that the synthetic fleet hides, and which have those that a diagnosis named."""
+    known = [in_words(WAYS["kernel"])] if any("kernel" in r for _, r in results) else []
+    known += [in_words(t["name"]) for t, r in results if t["model"].get("effects") is True and "network" in r]
+    named_by = [in_words(t["name"]) for t, r in results if t["model"].get("effects") == "diagnosed" and "network" in r]
+    out = []
+    for models, one, several, what in (
+        (known, "is", "are", "given the effects that the fleet hides"),
+        (named_by, "has", "have", "the effects that the diagnosis of training routes names"),
+    ):
+        if quoted := [f"'{n}'" for n in dict.fromkeys(models)]:
+            out.append(f"{names.verbose_join(quoted)} {one if len(quoted) == 1 else several} {what}")
+    return out

@@ -74,7 +74,7 @@ def power_figure(run: Run, done: Group, rivals: Sequence[str]) -> None:
                   label=f"{LABELS[method]}, {trips} trips ({kinds} effects)")  # fmt: skip
         axes.vlines(beside, 100 * low, 100 * high, color=colour, lw=1)
         lowest = min(lowest, 95 * float(np.min(low)))
-    axes.set(xscale="log", xlabel="size of the planted effect over the noise (RMS)", ylim=(lowest, 102),
+    axes.set(xscale="log", xlabel="effect/noise (RMS)", ylim=(lowest, 102),
              ylabel="named exactly [%]", title="Synthetic logs of road segments with one planted effect")  # fmt: skip
     sizes = sorted({t["size"] for t, _ in single})
     axes.set_xticks(sizes, [f"{s:g}" for s in sizes])

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.runner.pages.site import wrapped
 from experiments.runner.tables import markdown
 from hdev_jax.diagnosis.settings import described
 from hdev_jax.errors import InputError
@@ -126,7 +127,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         found = _read(options.run) if options.run else []
         options.docs.mkdir(parents=True, exist_ok=True)
-        (options.docs / "settings.md").write_text(page(found, command=command), encoding="utf-8")
+        (options.docs / "settings.md").write_text(wrapped(page(found, command=command)), encoding="utf-8")
     except (InputError, OSError) as e:
         print(f"settings_page: {e}", file=sys.stderr)
         return 2

@@ -17,8 +17,8 @@ from experiments.runner.config import CONFIGS, artefact, changes, every_config, 
 from experiments.runner.data import MissingDataError
 from experiments.runner.engine import plan, run_config
 from experiments.runner.log import Log
-from experiments.runner.pages.site import MOST_ROWS, part, wrapped, write_docs
-from experiments.runner.tables import wilson
+from experiments.runner.pages.site import MOST_ROWS, WIDTH, part, wrapped, write_docs
+from experiments.runner.tables import readable, wilson
 from hdev_jax.errors import InputError
 from hdev_jax.physics import LIBRARY
 
@@ -322,15 +322,37 @@ def test_a_long_table_of_a_page_of_many_runs_is_folded():
     assert all(f"| {k} | 1 |" in "\n".join(some) for k in range(MOST_ROWS + 1))
 
 
-WORDS = ("white", "+", "-", "2.", "`a b`", "noise,", "[x](y.md)", "#")
+WORDS = ("white", "noise,", "held-out", "+", "-", "=", "2.", "3)", ">5", ">=", "##", "<b>", "`a b`", "[x](y.md)")
 
 
-@given(st.lists(st.sampled_from(WORDS), min_size=30, max_size=90))
-def test_a_wrapped_page_says_the_same_and_begins_no_list_inside_a_sentence(words):
-    for begin in ("A sentence ", "- an item ", "  - an item "):
-        line = begin + " ".join(words)
-        lines = wrapped(line).split("\n")
-        assert " ".join(x.strip() for x in lines) == line.strip()
-        assert not [x for x in lines[1:] if re.match(r" *([-+*#>]|\d+[.)]) ", x)]
-    table = "| a | " + " ".join(words) + " |"
-    assert wrapped(table) == table
+BEGINNINGS = ("A sentence ", "- an item ", "12. ")
+
+
+@given(st.lists(st.sampled_from(WORDS), min_size=30, max_size=90), st.sampled_from(BEGINNINGS))
+def test_a_wrapped_page_says_the_same_and_begins_nothing_inside_a_sentence(words, begin):
+    line = f"{begin}a {' a '.join(words)} end."  # so that a short word stands somewhere in each line
+    first, *more = wrapped(line).split("\n")
+    assert all(len(x) <= WIDTH for x in (first, *more))
+    assert " ".join([first, *(x.strip() for x in more)]) == line
+    assert not [x for x in more if re.match(r" *([-+*=]+( |$)|[#<>]|\d+[.)]( |$))", x)]
+    for other in (f"| a | {line} |", f"# {line}", f"![{line}](x.png)", f"<summary>{line}</summary>", f"{line}  "):
+        assert wrapped(other) == other
+    for fence in ("```", "  ~~~"):
+        assert wrapped(f"{fence}sh\n{line}\n{fence}") == f"{fence}sh\n{line}\n{fence}"
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [("median_error_percent", "median error [%]"), ("energy_error_trip1", "energy error trip 1"),
+     ("trip4", "trip 4"), ("c_rr", "c_rr"), ("step_ms", "step [ms]"), ("physics, tables", "physics, tables")],
+)  # fmt: skip
+def test_a_key_is_read_as_words(key, words):
+    assert readable(key) == words
+
+
+def test_the_page_of_paper_2_says_which_of_its_models_are_means_of_starts():
+    models = resolve(CONFIGS / "paper2" / "_base.toml")["models"]
+    means = [name for name, m in models.items() if m.get("rule") == "ensemble"]
+    assert f"for {' and '.join(sorted(means, reverse=True))} the mean prediction of all starts" in (
+        CONFIGS / "paper2.toml"
+    ).read_text(encoding="utf-8")

@@ -169,7 +169,7 @@ def test_coefficients_are_those_of_the_first_seed(run, no_figures):
     found = {r["name"]: r["ours"] for r in out["rows"]}
     assert found == {
         "A, tables": {"median": pytest.approx(0.008), "true_median": pytest.approx(0.0055)},
-        "A, paper": {"median": pytest.approx(0.0063), "true_median": pytest.approx(0.0055)},
+        "A, PINN": {"median": pytest.approx(0.0063), "true_median": pytest.approx(0.0055)},
     }
     assert [float(x["coefficient error [%]"]) for x in written(run, "coefficients")] == pytest.approx(
         [100 * (np.median([0.008 / 0.006, 0.008 / 0.005]) - 1), 15.0], rel=0.01
@@ -283,9 +283,10 @@ def test_effects_found_are_said_with_their_units_and_who_is_given_them(run, no_f
     out = pinn_pages.table(
         config(), [(task("physics", "vehicles", vehicle=0), physics), (own, {"network": scored()})], run
     )
+    assert [x["effect"] for x in written(run, "effects")] == ["constant auxiliary load", "limit of regeneration"]
     said = {x["effect"]: x["median"] for x in written(run, "effects")}
-    assert said["constant auxiliary load"] == "power 823 W"
-    assert said["limit of regeneration"].startswith("power 200,000 W")
+    assert said["constant auxiliary load"] == "power 823\N{NO-BREAK SPACE}W"
+    assert said["limit of regeneration"].startswith("power 200,000\N{NO-BREAK SPACE}W")
     given = "'physics, known effects, linear fit' and 'our network' are given the effects that the fleet hides"
     assert given in out["findings"]
     bare = pinn_pages.table(config(), [(task("paper"), {"network": scored()})], run)

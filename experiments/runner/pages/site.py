@@ -182,19 +182,24 @@ def folded(title: str, text: str) -> list[str]:
     return ['<details markdown="1">', f"<summary>{title}</summary>", "", text, "", "</details>"]
 
 
+# What would be Markdown at the beginning of a line: a list, a heading, a quotation, HTML, a fence, an underline.
+_NOT_FIRST = re.compile(r" (?=[-+*=]+(?: |$)|[#<>]|~~~|```|\d+[.)](?: |$))")
+
+
 def wrapped(text: str) -> str:
     """Markdown whose sentences are in lines of at most `WIDTH`, so that what changes in them is seen in a diff."""
     out, code = [], False
     for line in text.split("\n"):
-        code ^= line.startswith("```")
-        if code or len(line) <= WIDTH or line.startswith(("|", "#", "!", "<")):
+        fence = line.lstrip().startswith(("```", "~~~"))
+        code ^= fence
+        own = re.match(r" *(?:(?:-|\d+[.]) )?", line)
+        begin = own.group() if own else ""
+        kept = line.startswith(("|", "#", "!", "<")) or line.endswith("  ") or (line[:4].isspace() and begin.isspace())
+        if code or fence or kept or len(line) <= WIDTH:
             out.append(line)
             continue
-        own = re.match(r" *((-|\d+[.]) )?", line)
-        begin = own.group() if own else ""
-        # a plus or a number with a dot would begin a list if it began a line
-        text = re.sub(r" (?=([-+*#>]|\d+[.)]) )", "\0", line.removeprefix(begin))
-        lines = textwrap.wrap(text, WIDTH - len(begin), break_long_words=False, break_on_hyphens=False)
+        said = _NOT_FIRST.sub("\0", line.removeprefix(begin))
+        lines = textwrap.wrap(said, WIDTH - len(begin), break_long_words=False, break_on_hyphens=False)
         out += [(" " * len(begin) if k else begin) + x.replace("\0", " ") for k, x in enumerate(lines)]
     return "\n".join(out)
 

@@ -149,8 +149,8 @@ def remainder(
         sizes.append(slope.rms * float(np.sqrt(np.mean(train.residual**2))))
         parts.insert(0, slope.words)
     if drift.words:
-        before = "; ".join(parts) or f"no channel of the log explains it, and it is {colour(noise)}"
-        signature = f"What is left: {before}; {drift.words}"
+        found = "; ".join(parts) or f"no channel of the log explains it, and it is {colour(noise)}"
+        signature = f"What is left: {found}; {drift.words}"
     elif parts:
         signature = "What is left: " + "; ".join(parts)
     else:
