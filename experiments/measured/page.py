@@ -38,6 +38,10 @@ __all__ = ["page", "write"]
 
 Results = Mapping[str, Mapping[str, Any]]
 FOLDER = "figures/real_logs"
+STABILITY = (
+    "The number after *found* is the share of resampled sets of training data in which the effect, or one of its "
+    "class, ranks first again."
+)
 COLD_C = 12.0  # heating runs below: splits the missions of ZTBus into about a third and two thirds
 HEAD = """# Measured logs
 
@@ -187,7 +191,9 @@ def _agreeing(runs: Runs) -> str:
 
 def _left_notes(runs: Runs) -> list[str]:
     on = {c for r in runs.values() for c in r["unexplained"]["depends_on"]}
-    return ["", "`predicted` is the model's own prediction."] if "predicted" in on else []
+    of = {"predicted": "final model", "declared": "calibrated sheet, without the effects found"}
+    said = [f"`{name}` is the prediction of the {model}." for name, model in of.items() if name in on]
+    return ["", " ".join(said)] if said else []
 
 
 def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
@@ -216,7 +222,7 @@ def _niro(runs: Runs) -> tuple[list[str], dict[str, bytes]]:
         "Paper 2's best network (NARXS, its table VIII), trained on trip 1: MSE 0.1604 kW² in free run; its LSTM: "
         "0.2322 kW².",
     ]
-    lines += ["", "### Stability over training trips", "", *found_table(runs, "trip")]
+    lines += ["", "### Stability over training trips", "", STABILITY, "", *found_table(runs, "trip")]
     lines += _picture("niro_sizes.png", "Kia Niro: sizes by training trip with 90 % bars")
     lines += _details(runs, "trip", f"No two of the {len(runs)} training sets share a row.")
     lines += ["### What stays unexplained", "", *left_table(runs, "trained on trip", "kW"), *_left_notes(runs)]
@@ -277,7 +283,7 @@ def _ztbus(runs: Runs, warm: Mapping[str, float]) -> tuple[list[str], dict[str, 
         ["fold", "missions to train / test", "before, RMSE [kW]", "after", "parameters", "effects found", "cost"], rows
     )
     lines += ["", *_pooled(before, after, warm), "", *loads_section(runs, "fold", "kW")]
-    lines += ["### Stability over folds", "", *found_table(runs, "fold")]
+    lines += ["### Stability over folds", "", STABILITY, "", *found_table(runs, "fold")]
     lines += _picture("ztbus_sizes.png", "ZTBus: sizes by fold with 90 % bars")
     caution = "Folds share training missions, so the differences in sd are lower limits."
     lines += _details(runs, "fold", caution)

@@ -56,8 +56,8 @@ def collect(config: Any, results: Any, run: Run) -> dict[str, Any]:
                 missed.append(f"{group.model} of the tables is not the best on trip 1, which is {name}")
             if result["starts"] > 1 and model.rule != rule:
                 missed.append(
-                    f"for {group.model} the tables have {RULES[model.rule]}; on held-out rows of trip 1 {RULES[rule]} "
-                    "is better"
+                    f"the tables are meant to have what is better on held-out rows of trip 1, for {group.model} "
+                    f"{RULES[rule]}; they have {RULES[model.rule]}"
                 )
     write_tables(run, config.artefact.rpartition("/")[2], lines, config.caption)
     return {

@@ -37,8 +37,7 @@ def constant_target(name: str, measured: np.ndarray) -> Suspicion | None:
     evidence = f"{name} is {measured[0]:.6g} in all {len(measured)} rows"
     if measured[0] != 0.0:
         return Suspicion("constant target", evidence, "name the column that was measured, or another --target")
-    force = "" if name == "traction_force_n" else " with traction_force_n = 0 in place of that column"
-    mend = f"for a coast-down, hdev calibrate{force} gives rolling resistance and drag; to diagnose, log a drive"
+    mend = "for a coast-down, hdev roadload --coastdown gives the road load; to diagnose, log a drive"
     return Suspicion(COASTING, evidence, mend)
 
 
