@@ -172,7 +172,8 @@ def findings(metrics: Mapping[str, Any]) -> list[str]:
         )
     elif metrics["of"] == 1:
         good = "at least" if metrics["better_than_paper"] else "not"
-        said.append(f"Ours is {good} as good as the paper in its main error ({readable(metrics['headline'])}).")
+        of = f" in its main error ({readable(metrics['headline'])})" if "headline" in metrics else ""
+        said.append(f"Ours is {good} as good as the paper{of}.")
     elif metrics["of"]:
         said.append(f"At least as good as the paper in {metrics['better_than_paper']} of {metrics['of']} comparisons.")
     said += [line[0].upper() + line[1:] for line in _sentences(metrics.get("findings", []))]
