@@ -342,7 +342,7 @@ def modules_loaded() -> dict[str, set[str]]:
 
 # Beside its SOURCES, a task's files may import what makes pages, what reads configs and data, and what has a
 # fingerprint of its own.
-PAGES = {"tables", "figures", "drawings", "choice", "pages", "gear_tables", "switching_tables", "config"}
+PAGES = {"tables", "figures", "drawings", "choice", "pages", "sweeps", "gear_tables", "switching_tables", "config"}
 OWN_FINGERPRINT = {"experiments/paper2/diagnosed.py"}
 
 
