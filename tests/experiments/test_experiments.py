@@ -306,7 +306,7 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch, l
     assert part["logs"] == 1, "the first log is the same one, whatever comes after it"
     assert part["tasks_left_out"] == 4
     write_docs(tmp_path / "docs", STUDIES / "planted.toml", [tmp_path / "c"], sets)
-    page = (tmp_path / "docs" / "planted.md").read_text()
+    page = " ".join((tmp_path / "docs" / "planted.md").read_text().split())
     assert "1 synthetic log." in page
     assert "Not run: 4 more tasks of the config" in page
     assert "planted.toml --set cases.single.logs=3 --set" in page
