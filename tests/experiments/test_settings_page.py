@@ -70,7 +70,7 @@ def test_results_of_the_study_fill_half_and_double(tmp_path, capsys):
 
     (tmp_path / "sweep.json").write_text(json.dumps([run({}, 4), run({"mode_side": 1}, 3)]))
     assert main(["--docs", str(tmp_path / "docs"), "--run", str(tmp_path)]) == 0
-    text = (tmp_path / "docs" / "settings.md").read_text(encoding="utf-8")
+    text = " ".join((tmp_path / "docs" / "settings.md").read_text(encoding="utf-8").split())
     assert "with the defaults, 4/4, 1 false." in text
     assert "| `mode_side` | 2 | 1: 3/4, 1 false | 4 |" in text
     assert "No results" in page(command="x")
