@@ -38,6 +38,7 @@ def test_it_is_called_what_it_is_with_its_size_and_memory(like, size):
     assert 0.7 * size < found.sd < 1.4 * size
     assert 120.0 <= found.memory_s <= 720.0
     assert like in found.words
+    assert "e+" not in found.words
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -79,7 +79,7 @@ class Drift:
             return ""
         size = {
             "load": f"like a load of {self.sd / 1e3:.2g} kW (standard deviation)",
-            "force": f"like a force of {self.sd:.2g} N (standard deviation)",
+            "force": f"like a force of {float(f'{self.sd:.2g}'):g} N (standard deviation)",
             "gain": f"like a gain of {100 * self.sd:.2g} % of the power (standard deviation)",
         }.get(self.like, "but like no single load, force or gain")
         return f"it drifts, {size}; its correlation time is about {self.memory_s / 60:.0f} min"
