@@ -125,7 +125,7 @@ def _of_fewer(lines: list[dict[str, Any]]) -> list[str]:
 
 def _nameable(gathered: Mapping[tuple[str, str], list[dict[str, Any]]]) -> list[str]:
     """How much of what a network learns named effects explain: the squared error that the physics with effects takes
-    off the calibrated declared physics, over what ours without effects takes off (over 100 %: the network misses some).
+    off the calibrated declared physics, over what our network without effects takes off (over 1: it misses some).
     """
     square = {way: pooled(f)["rmse_wh"] ** 2 for (way, use), f in gathered.items() if use == "test"}
     base, learned = square.get(WAYS["bayesian"]), square.get(LEARNED)
