@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from planted import FEW, library_of
 
 from experiments.planted.study import Config, tasks
 from experiments.runner import store
@@ -194,39 +195,20 @@ def test_each_experiment_has_a_config_that_tests_run():
 
 # Of these the diagnosis is most of the time, and has tests of its own: here it knows few effects. The fleet of
 # `while_driving` has more.
-FEW = (
-    "air_density",
-    "auxiliary_power",
-    "headwind",
-    "mass_scale",
-    "power_gain",
-    "second_switching_load",
-    "switching_load",
-)
 OF_FLEET = ("cornering", "crosswind", "hvac_power", "regen_cutoff", "regen_limit", "road_surface", "rolling_speed",
             "rolling_temperature", "time_skew", "tyre_warmup", "wet_road")  # fmt: skip
 INSTRUMENTS = ("grade_bias", "grade_noise", "grade_scale", "speed_scale", "time_skew")
 EFFECTS = {"instruments": FEW + INSTRUMENTS, "many": FEW, "switching": FEW, "while_driving": FEW + OF_FLEET}
 
 
-@pytest.fixture
-def library():
-    """The effects, to be made fewer: afterwards all are there again, in their order."""
-    whole = dict(LIBRARY)
-    yield LIBRARY
-    LIBRARY.clear()
-    LIBRARY.update(whole)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("path", parameters(CONFIGS / f"{name}.toml" for name in RUN))
-def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept, library):
+def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept):
     if path.stem == "simulators":
         pytest.importorskip("fastsim", reason="fastsim is in the extra truth")
-    for effect in library.keys() - set(EFFECTS.get(path.stem, library)):
-        del library[effect]
     try:
-        runs = run_config(path, out=tmp_path / "out", kept=kept, tiny=True)
+        with library_of(EFFECTS.get(path.stem, LIBRARY)):
+            runs = run_config(path, out=tmp_path / "out", kept=kept, tiny=True)
     except MissingDataError as e:
         pytest.skip(str(e))
     assert all(r["rows"] for r in runs)
@@ -273,12 +255,10 @@ def test_many_tasks_on_two_workers_are_all_kept(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch, library):
-    for effect in library.keys() - {*FEW}:  # the whole library is tried by tests of the diagnosis
-        del library[effect]
-
+def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     def once(out: str) -> dict:
-        (metrics,) = run_config(STUDIES / "planted_quick.toml", out=tmp_path / out, kept=tmp_path / "kept")
+        with library_of(FEW):  # the whole library is tried by tests of the diagnosis
+            (metrics,) = run_config(STUDIES / "planted_quick.toml", out=tmp_path / out, kept=tmp_path / "kept")
         return metrics
 
     first = once("a")
@@ -302,7 +282,10 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch, l
     assert again["rows"] == first["rows"]
     assert json.loads((tmp_path / "b" / "metrics.json").read_text())["rows"] == first["rows"]
     sets = ["cases.single.logs=3", "cases.null.logs=2"]
-    (part,) = run_config(STUDIES / "planted_quick.toml", sets, out=tmp_path / "c", kept=tmp_path / "kept", fresh=False)
+    with library_of(FEW):
+        (part,) = run_config(
+            STUDIES / "planted_quick.toml", sets, out=tmp_path / "c", kept=tmp_path / "kept", fresh=False
+        )
     assert part["logs"] == 1, "the first log is the same one, whatever comes after it"
     assert part["tasks_left_out"] == 4
     write_docs(tmp_path / "docs", STUDIES / "planted.toml", [tmp_path / "c"], sets)
