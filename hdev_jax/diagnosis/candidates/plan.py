@@ -85,13 +85,14 @@ def plan_of(
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []
+    has, entry, stands_in = {e.id for e in vehicle.effects}, vehicle.entry, vehicle.stands_in
     for c in effects:
-        if vehicle.has(c.id) or (c.searched and not searched):
+        if c.id in has or (c.searched and not searched):
             continue
-        if why := unavailable(c, facts.sample, vehicle.entry, vehicle.stands_in):
+        if why := unavailable(c, facts.sample, entry, stands_in):
             left_out[c.id] = why
         else:
-            nulls.append(absent(c, facts))
+            nulls.append(absent(c, facts) if kernel is None else kernel.null(c))
     known = [e for e in nulls if of_library(type(e))]
     if kernel is not None and kernel.serves(vehicle, target):
         groups = _shared(vehicle, known, kernel)

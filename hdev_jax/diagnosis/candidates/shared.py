@@ -40,7 +40,8 @@ class SharedKernel:
     library: Mapping[str, type[Effect]]
     facts: Facts
     segments: Segments
-    _nulls: dict[str, Effect] = field(default_factory=dict, init=False, repr=False)
+    _nulls: dict[type[Effect], Effect] = field(default_factory=dict, init=False, repr=False)
+    _parts: dict[Any, frozenset[str]] = field(default_factory=dict, init=False, repr=False)
     _last: list[Any] = field(default_factory=list, init=False, repr=False)
     _sound: dict[TargetName, bool] = field(default_factory=dict, init=False, repr=False)
     _programs: dict[Any, Program] = field(default_factory=dict, init=False, repr=False)
@@ -135,24 +136,31 @@ class SharedKernel:
     def _leaf(self, found: Mapping[str, Effect], effect_id: str, name: str) -> Any:
         """A parameter of a found effect, or at its null where it was found without it or not at all."""
         leaf = getattr(found[effect_id], name) if effect_id in found else None
-        return getattr(self._null(self.library[effect_id]), name) if leaf is None else leaf
+        return getattr(self.null(self.library[effect_id]), name) if leaf is None else leaf
 
     def _completed(self, vehicle: Vehicle) -> tuple[Vehicle, Collection[str], dict[str, Effect]]:
         """A vehicle whose found effects have the limits that they were found without, at their null; the ids of these
         effects; the other effects of the library that are part of the kernel, at their null, by id. An effect with a
         search of its own is part of it once it is found."""
-        found, rest = {}, {}
-        for c in (c for c in self.library.values() if of_library(c)):
-            if vehicle.has(c.id):
-                found[c.id] = _with_limits(vehicle.effect(c.id), self._null(c))
-            elif not (apart(c) or c.searched or unavailable(c, self.facts.sample, vehicle.entry, vehicle.stands_in)):
-                rest[c.id] = self._null(c)
+        has, part = {e.id: e for e in vehicle.effects}, self._part_of(vehicle)
+        known = [c for c in self.library.values() if of_library(c)]
+        found = {c.id: _with_limits(has[c.id], self.null(c)) for c in known if c.id in has}
+        rest = {c.id: self.null(c) for c in known if c.id in part and c.id not in has}
         return vehicle.minus(*found).plus(*found.values()), tuple(found), rest
 
-    def _null(self, effect: type[Effect]) -> Effect:
-        if effect.id not in self._nulls:
-            self._nulls[effect.id] = absent(effect, self.facts)
-        return self._nulls[effect.id]
+    def _part_of(self, vehicle: Vehicle) -> frozenset[str]:
+        """Ids of the library's effects that are part of the kernel of such a vehicle, found or not."""
+        key = vehicle.entry, frozenset(vehicle.stands_in)
+        if key not in self._parts:
+            able = (c for c in self.library.values() if not (apart(c) or c.searched))
+            self._parts[key] = frozenset(c.id for c in able if not unavailable(c, self.facts.sample, *key))
+        return self._parts[key]
+
+    def null(self, effect: type[Effect]) -> Effect:
+        """An effect at its null, as the search's log shows it."""
+        if effect not in self._nulls:
+            self._nulls[effect] = absent(effect, self.facts)
+        return self._nulls[effect]
 
 
 def of_library(effect: type[Effect]) -> bool:

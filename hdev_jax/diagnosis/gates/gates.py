@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.passes import evidence_of, written_by_chunk
-from hdev_jax.diagnosis.scores.scores import Scores, best_ways, plausible
+from hdev_jax.diagnosis.scores.scores import Scores, best_ways, plausible, worth
 from hdev_jax.diagnosis.scores.significance import least_clusters
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Chunk
@@ -208,19 +209,19 @@ def stability(a: Asked) -> float:
         )
     }  # fmt: skip
     small = [scores.evidence(s).only(s.candidate) for s in rivals]
-    hits = 0
-    for _ in range(RESAMPLES):
-        drawn = a.rng.integers(0, g, g)
-        weight = np.bincount(drawn, minlength=g).astype(float)
-        gains = []
-        for s, (evidence, candidate) in zip(rivals, small, strict=True):
-            if s.plain:
-                gain = replace(evidence, grams=evidence.grams[drawn]).plain_gain(candidate.columns)
-            else:
-                gain = evidence.gain(evidence.totals(weight), candidate.columns)[0]
-            gains.append(scores.worth(replace(s, gain=gain)))
-        hits += rivals[int(np.argmax(gains))].candidate.id in names and max(gains) > 0
-    return hits / RESAMPLES
+    drawn = np.stack([a.rng.integers(0, g, g) for _ in range(RESAMPLES)])
+    gains = np.stack([_gains_of(s, *own, drawn) for s, own in zip(rivals, small, strict=True)])
+    worths = gains + np.array([[worth(0.0, s.candidate, settings)] for s in rivals])
+    named = np.array([s.candidate.id in names for s in rivals])
+    return float(np.mean(named[np.argmax(worths, axis=0)] & (np.max(worths, axis=0) > 0)))
+
+
+def _gains_of(s: Score, evidence: Evidence, candidate: Candidate, drawn: np.ndarray) -> Float[np.ndarray, " draw"]:
+    """Gains of one candidate alone, its columns' places being of this evidence, with these clusters [draw cluster]."""
+    if s.plain:
+        return np.array([replace(evidence, grams=evidence.grams[d]).plain_gain(candidate.columns) for d in drawn])
+    weights = np.stack([np.bincount(d, minlength=evidence.count) for d in drawn]).astype(float)
+    return evidence.gains_of_draws(weights, candidate.columns)
 
 
 def of_class(a: Asked, *, inexact: float | None = None) -> tuple[str, ...]:

@@ -103,9 +103,9 @@ class NormalEquations:
         return a, b
 
     def _fit(self, gram: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Log-likelihood up to a constant [variance *way] and coefficients, for each variance."""
+        """Log-likelihood up to a constant [*draw variance *way] and coefficients, for each variance."""
         a, b = self._normal(gram, at)
-        alone = (-0.5 * gram[..., -1, -1] - self.cost).reshape(-1, *(1,) * (at.ndim - 1))
+        alone = (-0.5 * gram[..., -1, -1] - self.cost)[(..., *(None,) * (at.ndim - 1))]
         if not a.shape[-1]:
             return alone, b
         x = solved(a, b)
@@ -120,6 +120,20 @@ class NormalEquations:
         likelihood, x = self._fit(gram, self.base + np.asarray(at, dtype=int))
         v = int(np.argmax(likelihood))
         return float(likelihood[v]) - (self.base_likelihood(gram) if before is None else before), x[v, self.base :]
+
+    def gains_of_draws(
+        self, weights: Float[np.ndarray, "draw cluster"], at: Sequence[int]
+    ) -> Float[np.ndarray, " draw"]:
+        """Gain of candidate columns over the base, as `gain`, in each draw, which counts each cluster so many times."""
+        plain = np.tensordot(weights, self.grams, axes=1)
+        by_trip = np.swapaxes(weights[:, self.home][..., None] * self.levels, 1, 2)
+        every = range(len(self.variances))
+        grams = np.stack([plain - (by_trip * self._shrink(v)) @ self.levels for v in every], axis=1)
+        with_it, without = (
+            np.max(self._fit(grams, x)[0], axis=1)
+            for x in (self.base + np.asarray(at, dtype=int), np.empty(0, dtype=int))
+        )
+        return with_it - without
 
     def gains(self, gram: np.ndarray, ways: Sequence[Sequence[int]]) -> Float[np.ndarray, " way"]:
         """Gains of many ways to have an effect, each by its columns, as `gain` of each."""
