@@ -29,7 +29,7 @@ test: export OPENBLAS_NUM_THREADS := 1
 test: export NPROC := 1
 test: export XLA_FLAGS := $(XLA_FLAGS) --xla_cpu_multi_thread_eigen=false
 test: $(READY)
-	@$(PY) -m pytest -n auto --maxprocesses 4 --dist worksteal $(ARGS)
+	@$(PY) -m pytest -n auto --maxprocesses 4 --dist worksteal -m "not slow" $(ARGS)
 
 lint: $(READY)
 	@$(PY) -m ruff check .

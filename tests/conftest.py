@@ -141,12 +141,20 @@ def _plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def _save_noise(self: matplotlib.figure.Figure, to: Any, **options: Any) -> None:
-    if options.get("format") == "png":
-        to.write(_picture())
-    elif options.get("format") == "svg":
-        to.write(b'<svg xmlns="http://www.w3.org/2000/svg" width="900" height="300"/>')
-    else:
+    kind = options.get("format") or Path(to).suffix.removeprefix(".")
+    if kind not in _UNDRAWN:
         _savefig(self, to, **options)
+    elif isinstance(to, str | Path):
+        Path(to).write_bytes(_UNDRAWN[kind]())
+    else:
+        to.write(_UNDRAWN[kind]())
+
+
+_UNDRAWN: dict[str, Callable[[], bytes]] = {
+    "png": _picture,
+    "svg": lambda: b'<svg xmlns="http://www.w3.org/2000/svg" width="900" height="300"/>',
+    "pdf": lambda: b"%PDF-1.4" + bytes(1000),
+}
 
 
 @pytest.fixture(scope="session")

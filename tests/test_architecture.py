@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import jaxtyping
@@ -31,6 +32,7 @@ LAYERS = [
     {"options", "verbs"},
     {"cli", "experiments"},
 ]
+PARTS = {p.stem for p in PACKAGE.iterdir()}
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 PHYSICS_MAY_IMPORT = {"jax", "equinox", "jaxtyping", "numpy", "hdev_jax", *sys.stdlib_module_names}
 
@@ -49,11 +51,17 @@ def dotted(path: Path) -> tuple[str, ...]:
     return parts[:-1] if parts[-1] == "__init__" else parts
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imported(path: Path) -> set[tuple[str, ...]]:
     """Every module that the file imports, wherever in it, as parts of its absolute name."""
     package = dotted(path) if path.name == "__init__.py" else dotted(path)[:-1]
     found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found |= {tuple(alias.name.split(".")) for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -68,8 +76,7 @@ def part(module: tuple[str, ...]) -> str | None:
     """The part of the tree that a module belongs to; None for the package itself and other libraries."""
     if module[0] == "experiments":
         return "experiments"
-    names = {p.stem for p in PACKAGE.iterdir()}
-    return module[1] if module[0] == "hdev_jax" and len(module) > 1 and module[1] in names else None
+    return module[1] if module[0] == "hdev_jax" and len(module) > 1 and module[1] in PARTS else None
 
 
 def label(path: Path) -> str:
@@ -81,7 +88,7 @@ def loaded(path: Path) -> set[str]:
 
     With a module come the packages above it, except those that hold the file itself: these are being loaded already.
     """
-    found, todo = set(), list(ast.parse(path.read_text(encoding="utf-8")).body)
+    found, todo = set(), list(parsed(path).body)
     while todo:
         node = todo.pop()
         if isinstance(node, ast.Import):
@@ -126,30 +133,33 @@ def test_folders_and_modules_stay_small():
     assert not too_large(lines, MOST_LINES, MORE_LINES), "too large, or an exception that is now too generous"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=label)
-def test_imports_point_one_way(path):
-    own = part(dotted(path))
-    if own is None:  # hdev_jax/__init__.py re-exports from everywhere, on first use
-        return
-    assert own in LEVEL, f"{own} is new: say in LAYERS of {Path(__file__).name} where it belongs"
-    for module in imported(path):
-        other = part(module)
-        assert other in (None, own) or LEVEL[other] < LEVEL[own], (
-            f"{own} imports {'.'.join(module)}, which is not below it"
-        )
+def test_imports_point_one_way():
+    # hdev_jax/__init__.py, which is of no part, re-exports from everywhere, on first use
+    homes = {path: own for path in MODULES if (own := part(dotted(path))) is not None}
+    new = set(homes.values()) - LEVEL.keys()
+    assert not new, f"new: say in LAYERS of {Path(__file__).name} where they belong"
+    upwards = [
+        f"{label(path)} imports {'.'.join(module)}" for path, own in homes.items() for module in imported(path)
+        if (other := part(module)) not in (None, own) and LEVEL[other] >= LEVEL[own]
+    ]  # fmt: skip
+    assert upwards == [], "what is imported is not below"
 
 
-@pytest.mark.parametrize("path", [p for p in MODULES if part(dotted(p)) == "physics"], ids=label)
-def test_physics_is_light(path):
-    assert {m[0] for m in imported(path)} <= PHYSICS_MAY_IMPORT
+def test_physics_is_light():
+    physics = [path for path in MODULES if part(dotted(path)) == "physics"]
+    heavy = {label(path): {m[0] for m in imported(path)} - PHYSICS_MAY_IMPORT for path in physics}
+    assert heavy
+    assert {name: found for name, found in heavy.items() if found} == {}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=label)
-def test_module_says_what_it_is_and_what_it_exports(path):
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    assert ast.get_docstring(tree), "a docstring that says in one line what it is"
-    targets = {t.id for n in tree.body if isinstance(n, ast.Assign) for t in n.targets if isinstance(t, ast.Name)}
-    assert "__all__" in targets
+def test_module_says_what_it_is_and_what_it_exports():
+    assert [label(path) for path in MODULES if not ast.get_docstring(parsed(path))] == [], "say in one line what it is"
+    bare = [
+        label(path) for path in MODULES
+        if "__all__" not in {t.id for n in parsed(path).body if isinstance(n, ast.Assign) for t in n.targets
+                             if isinstance(t, ast.Name)}
+    ]  # fmt: skip
+    assert bare == [], "no __all__"
 
 
 def test_import_sets_nothing_and_loads_nothing_heavy():
@@ -173,14 +183,14 @@ def test_every_export_is_there():
         hdev_jax.nothing
 
 
-@pytest.mark.parametrize("path", [p for p in MODULES if p.name == "__init__.py"], ids=label)
-def test_no_module_hides_an_export_of_its_folder(path):
+def test_no_module_hides_an_export_of_its_folder():
     """A name taken from one module that is another module's too: it would be that module once it is loaded."""
-    own = label(path)
-    for node in ast.parse(path.read_text(encoding="utf-8")).body:
-        for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-            name = alias.asname or alias.name
-            assert f"{own}.{name}" not in BY_NAME or node.module == f"{own}.{name}", f"{own}.{name} is a module"
+    hidden = [
+        name for path in MODULES if path.name == "__init__.py" for node in parsed(path).body
+        for alias in (node.names if isinstance(node, ast.ImportFrom) else ())
+        if (name := f"{label(path)}.{alias.asname or alias.name}") in BY_NAME and node.module != name
+    ]  # fmt: skip
+    assert hidden == [], "these are modules"
 
 
 def section(title: str) -> str:
@@ -214,8 +224,7 @@ def test_the_page_of_the_architecture_draws_the_tree_as_it_is():
 def test_the_page_of_the_architecture_has_the_layers_in_their_order():
     lines = re.findall(r"^\d+\. (`.*`)$", section("Layers"), flags=re.M)
     assert [set(re.findall(r"`(\w+)`", line)) for line in lines] == LAYERS
-    names = {p.stem for p in PACKAGE.iterdir()} | {"experiments"}
-    assert set.union(*LAYERS) <= names, "layers that are not there"
+    assert set.union(*LAYERS) <= PARTS | {"experiments"}, "layers that are not there"
 
 
 def test_the_page_of_the_architecture_names_files_that_are_there():
@@ -249,8 +258,11 @@ def test_no_file_names_this_machine_or_a_package_registry():
     hosts = [rf"//[\w.-]*{h}" for h in (r"pypi\.org", r"pythonhosted\.org", r"npmjs\.org", r"anaconda\.org")]
     places = {str(ROOT.parent), str(Path.home())} - {"/", "/tmp"}
     paths = [r"(?<![\w.~/-])" + re.escape(place) + r"/" for place in places]
-    pattern = re.compile("|".join([*hosts, *paths]))
-    found = {str(p.relative_to(ROOT)): m.group() for p, text in text_files().items() if (m := pattern.search(text))}
+    pattern, ends = re.compile("|".join([*hosts, *paths])), [".org", *(f"{place}/" for place in places)]  # few have one
+    found = {
+        str(p.relative_to(ROOT)): m.group() for p, text in text_files().items()
+        if any(end in text for end in ends) and (m := pattern.search(text))
+    }  # fmt: skip
     assert not found
 
 
@@ -273,10 +285,23 @@ def test_version_is_the_same_everywhere():
     assert f"\n## {hdev_jax.__version__}" in (ROOT / "CHANGELOG.md").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("ci", "there", "failed"), [("true", True, 3), ("true", False, 0)], ids=["data", "no data"])
-def test_ci_fails_where_a_test_of_measured_data_is_skipped(pytester, monkeypatch, ci, there, failed):
-    pytester.makeconftest((ROOT / "tests" / "conftest.py").read_text())
+def of_conftest(*names: str) -> str:
+    """These definitions of tests/conftest.py, and what they import: all of it would load JAX again."""
+    text = (ROOT / "tests" / "conftest.py").read_text(encoding="utf-8")
+    lines, found = text.splitlines(), {}
+    for node in ast.parse(text).body:
+        named = node.targets[0] if isinstance(node, ast.Assign) else node
+        name = getattr(named, "id", None) or getattr(named, "name", None)
+        first = min(n.lineno for n in (node, *getattr(node, "decorator_list", [])))
+        found[name] = "\n".join(lines[first - 1 : node.end_lineno])
+    return "\n".join(["import os", "from pathlib import Path", "import pytest", *(found[name] for name in names)])
+
+
+def test_ci_fails_where_a_test_of_measured_data_is_skipped(pytester, monkeypatch):
+    """With the data there, then without it."""
+    hooks = ("pytest_collection_modifyitems", "pytest_runtest_makereport")
+    pytester.makeconftest(of_conftest("DATA", "NO_DATA", "data_dir", *hooks))
+    pytester.makeini("[pytest]\nmarkers = data: reads measured data")
     pytester.makepyfile(
         """
         import pytest
@@ -295,13 +320,14 @@ def test_ci_fails_where_a_test_of_measured_data_is_skipped(pytester, monkeypatch
         """
     )
     folder = pytester.path / "measured"
-    if there:
-        folder.mkdir()
     monkeypatch.setenv("HDEV_DATA", str(folder))
-    monkeypatch.setenv("CI", ci)
-    outcomes = pytester.runpytest_subprocess("-p", "no:cacheprovider").parseoutcomes()
-    assert outcomes.get("failed", 0) + outcomes.get("errors", 0) == failed
-    assert outcomes["skipped"] == 4 - failed
+    monkeypatch.setenv("CI", "true")
+    folder.mkdir()
+    for failed in (3, 0):
+        outcomes = pytester.runpytest_inprocess("-p", "no:cacheprovider").parseoutcomes()
+        assert outcomes.get("failed", 0) + outcomes.get("errors", 0) == failed
+        assert outcomes["skipped"] == 4 - failed
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def test_shapes_in_annotations_are_checked():

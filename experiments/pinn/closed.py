@@ -10,7 +10,6 @@ from functools import cache
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.paper1.halves import MASS_SD, coefficient, fitted
@@ -246,7 +245,7 @@ class _Search:
         self.span = list(np.clip(value + reach * np.linspace(-1, 1, 9), self.p.lower, self.p.upper))
 
     def _at(self, car: Vehicle, value: float) -> Vehicle:
-        return eqx.tree_at(lambda c: getattr(c.effect(self.id), self.p.name), car, jnp.asarray(value))
+        return eqx.tree_at(lambda c: getattr(c.effect(self.id), self.p.name), car, np.asarray(float(value)))
 
 
 @cache

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import found_in_turn, opened, training
+from planted import FadingStart, found_in_turn, opened, training
 
 from hdev_jax.diagnosis.candidates.unnamed import Factor, Term
 from hdev_jax.diagnosis.competition.cycle import add_cycle
@@ -12,9 +12,16 @@ from hdev_jax.diagnosis.competition.needed import backward, needed
 from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.diagnosis.scores.passes import evidence_of
 from hdev_jax.diagnosis.training import Training
-from hdev_jax.physics import LIBRARY, unavailable
+from hdev_jax.physics import unavailable
 
 HUMIDITY = Term((Factor("humidity_pct"),), 1.0)
+
+
+def among_many(rows: Training) -> Training:
+    """The rows with so many effects tried as the library has: the others are a user's own, which no shared program
+    holds, so that none of them has to be compiled."""
+    others = {f"own_{k}": type(f"Own{k}", (FadingStart,), {"id": f"own_{k}"}) for k in range(50)}
+    return replace(rows, library={**rows.library, **others})
 
 
 def shows_something(rows: Training, state: State, id_: str) -> None:
@@ -23,6 +30,7 @@ def shows_something(rows: Training, state: State, id_: str) -> None:
     p = needed(evidence_of(rows.baseline(state.fit)), state.fit, found).p
     car, row = state.fit.vehicle, rows.facts.sample
     tried = [c for c in rows.library.values() if not unavailable(c, row, car.entry, car.stands_in)]
+    assert len(tried) > 50
     assert rows.settings.fdr / len(tried) < p < rows.settings.stays, f"p = {p:.2g} shows nothing"
 
 
@@ -34,7 +42,7 @@ def test_a_constant_load_stays_beside_a_term_without_a_name_and_others_do_not(id
     _, problem, _ = opened(tmp_path, seed=seed, **options)
     rows = training(problem, [id_])
     state = found_in_turn(rows, problem, [id_])
-    rows = replace(rows, library=LIBRARY)
+    rows = among_many(rows)
     shows_something(rows, state, id_)
     assert backward(rows, state, newest=True).ids == (id_,), "alone it is needed"
     assert backward(rows, replace(state, terms=(HUMIDITY,))).ids == ((id_,) if stays else ())
@@ -48,6 +56,6 @@ def test_a_constant_load_beside_a_cycle_has_to_be_as_sure_as_when_it_came(tmp_pa
     state = found_in_turn(rows, problem, ["auxiliary_power"])
     with_it, verdict = add_cycle(rows, state, np.random.default_rng(0))
     assert with_it is not None, verdict
-    rows = replace(rows, library=LIBRARY)
+    rows = among_many(rows)
     shows_something(rows, with_it, "auxiliary_power")
     assert backward(rows, with_it).ids == ("periodic_load",)

@@ -94,7 +94,7 @@ def test_columns_of_switches_are_differences(effect_id, problem, rows, gathered)
     """Of the vehicle with the switch at its place and without it; other limits of the effect are out."""
     base = predicted(problem, rows, problem.vehicle)
     every = of(gathered, effect_id)
-    for c in (every[0], every[len(every) // 2], every[-1]):
+    for c in (every[0], every[-1]):
         assert c.kind == "limit"
         with_ = problem.vehicle.plus(realised(c, np.ones(1)))
         np.testing.assert_allclose(
@@ -109,7 +109,8 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
     """Of one-row effects and across rows, beside found effects that lack a size or a switch; whatever was found, there
     is one kernel."""
     facts = facts_of(rows.segments, rows.rows)
-    effects = [LIBRARY[k] for k in (*SIZES, *LIMITS, "sampling_filter", "power_gain", "cornering")]
+    ids = ("auxiliary_power", "mass_scale", "tyre_warmup", "hvac_power", "gear_efficiency", "regen_limit", "grade_lag")
+    effects = [LIBRARY[k] for k in (*ids, "sampling_filter", "power_gain", "headwind")]
     found = [
         with_values(LIBRARY["auxiliary_power"], facts.gears, power_w=900.0),
         with_values(LIBRARY["hvac_power"], facts.gears, above_w_per_k=60.0, cool_c=20.0),
@@ -117,7 +118,7 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
     ]
     lag = LIBRARY["sampling_filter"](tap_1=np.asarray(0.1), tap_2=np.asarray(0.0), tau_s=None)
     programs, kernel = [], SharedKernel({c.id: c for c in effects}, facts, rows.segments)
-    for has in (found[:1], found, [*found, lag]):
+    for has in (found[:1], [*found, lag]):
         vehicle = problem.vehicle.plus(*has)
         apart = plan_of(vehicle, effects, facts, problem.target)
         shared = plan_of(vehicle, effects, facts, problem.target, kernel=kernel)
@@ -138,7 +139,7 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
             np.testing.assert_allclose(same, expected, atol=1e-9 * scale + rounding)
         kernels = [r.program.parts[1] for r in shared.recipes]
         programs.append({(p.structure, jax.tree.structure(p.car)) for p in kernels})
-    assert programs[0] == programs[1] == programs[2]
+    assert programs[0] == programs[1]
     assert len(programs[0]) == 1
 
 
@@ -155,7 +156,7 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows)
     effects = ["auxiliary_power", "hvac_power", "time_skew", "power_gain", "cornering", "headwind"]
     kernel, programs = SharedKernel({k: LIBRARY[k] for k in effects}, facts, rows.segments), set()
     instruments = set()
-    for has in (found[:1], found[:3], found):
+    for has in (found[:1], found):
         vehicle = problem.vehicle.plus(*has)
         own = [c for e in has for c in effect_coefficients(e, [p.name for p in e.parameters if p.has_column])]
         table = ParameterTable((*problem.table.rows, *own))
@@ -197,13 +198,15 @@ def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows)
         ]
         vehicle, sizes = problem.vehicle.plus(*has), ["power_w", "loss"]
         table = ParameterTable((*problem.table.rows, *(c for e in has for c in effect_coefficients(e, sizes))))
-        expected = linearised(vehicle, table, segments, problem.target)
         assert kernel._of_library(vehicle, problem.target)
+        programs.append(kernel._of_table(vehicle, table)[0])
+        if more:  # another program of the same kind
+            continue
+        expected = linearised(vehicle, table, segments, problem.target)
         got = kernel.linearised(vehicle, table, segments, problem.target)
         for a, b in zip(got, expected, strict=True):
             assert np.all(np.abs(a - b) <= 1e-9 * np.max(np.abs(b), axis=0))
         np.testing.assert_allclose(kernel.predict(vehicle, segments, problem.target), expected[0], rtol=1e-9)
-        programs.append(kernel._of_table(vehicle, table)[0])
     assert programs[0] is programs[1]
     assert programs[1] is not programs[2]
 
@@ -240,22 +243,23 @@ class Amplified(Effect):
         return column * (1.0 + self.gain)
 
 
-@pytest.mark.parametrize("target", ["energy_wh", "battery_power_kw", "motor_torque_nm", "traction_force_n"])
+@pytest.mark.parametrize("target", ["energy_wh", "motor_torque_nm"])
 def test_instruments_show_the_column_one_after_the_other(problem, rows, target):
     """Also where one of them acts in the kernel too; values and slopes as of the whole vehicle."""
     facts = facts_of(rows.segments, rows.rows)
-    known = [absent(LIBRARY[k], facts) for k in ("power_gain", "time_skew", "sampling_filter", "auxiliary_power")]
+    known = [absent(LIBRARY[k], facts) for k in ("power_gain", "time_skew", "auxiliary_power")]
     program = Program.of(problem.vehicle, [*known, absent(Amplified, facts)])
     values = program.null + 0.1 * np.arange(1, len(program.null) + 1)
     column, slopes = program.linearised(rows.segments, target, values, range(len(values)))
 
+    @jax.jit
     def whole(x):
         return insert(program.car, program.structure, x).predict(rows.segments, target)
 
     expected = np.asarray(whole(jnp.asarray(values)))
     np.testing.assert_allclose(column, expected, atol=1e-9 * np.max(np.abs(expected)))
     np.testing.assert_allclose(program.predicted(rows.segments, target, values), column, rtol=1e-12)
-    for got, slope in zip(slopes.T, np.asarray(jax.jacfwd(whole)(jnp.asarray(values))).T, strict=True):
+    for got, slope in zip(slopes.T, np.asarray(jax.jit(jax.jacfwd(whole))(jnp.asarray(values))).T, strict=True):
         np.testing.assert_allclose(got, slope, atol=1e-9 * np.max(np.abs(slope)))
 
 

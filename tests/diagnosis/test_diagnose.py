@@ -1,14 +1,14 @@
 """The whole method as one call: what it keeps and takes up again, what it refuses, odd logs, a user's effect."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import FadingStart, breaches, declared, diagnosed, named, opened, training
+from planted import FadingStart, breaches, declared, diagnosed, found_in_turn, named, opened
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.candidates.unnamed import TERM, Factor, Term, describing
-from hdev_jax.diagnosis.competition.compete import compete
 from hdev_jax.diagnosis.competition.state import Found, Verdict
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.result.checkpoint import from_plain, to_plain
@@ -18,10 +18,15 @@ from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.errors import InputError
 from hdev_jax.inference import effect_coefficients
 from hdev_jax.physics import LIBRARY
-from hdev_jax.problem import Problem, Split
+from hdev_jax.problem import Problem, Split, prepare
 from hdev_jax.rundir import open_run
 
-FEW = {k: LIBRARY[k] for k in ("driveline_drag", "headwind", "standstill_load", "tyre_warmup", "step_change")}
+FEW = {k: LIBRARY[k] for k in ("driveline_drag", "headwind", "standstill_load")}
+# one of each way in which a candidate is sought
+EACH = FEW | {
+    k: LIBRARY[k] for k in ("power_gain", "regen_limit", "tyre_warmup", "step_change", "periodic_load", "mode_change",
+                            "switching_load")
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -59,64 +64,58 @@ def whole(log):
     return diagnosed(*log, FEW)
 
 
-@pytest.mark.parametrize("at", ["step-2", "remainder"])
-def test_a_run_that_was_killed_goes_on_where_it_stood(at, log, whole, tmp_path):
+def test_a_run_that_is_killed_twice_goes_on_where_it_stood(log, whole, tmp_path):
     assert sorted(named(whole)) == ["driveline_drag", "standstill_load"]
-    with pytest.raises(KilledError), open_run(tmp_path / "out", {"verb": "test"}) as run:
-        diagnosed(*log, FEW, checkpoint=Kept(run, at))
-    with open_run(tmp_path / "out", {"verb": "test"}) as run:
-        again = Kept(run)
-        result = diagnosed(*log, FEW, checkpoint=again)
-    assert again.computed[0] == at
+    runs = []
+    for at in ("step-2", "remainder", ""):
+        with suppress(KilledError), open_run(tmp_path / "out", {"verb": "test"}) as run:
+            runs.append(Kept(run, at))
+            result = diagnosed(*log, FEW, checkpoint=runs[-1])
+    assert [r.computed[0] for r in runs] == ["step-0", "step-2", "remainder"]
     assert result.summary == whole.summary
     np.testing.assert_array_equal(result.predicted_after, whole.predicted_after)
 
 
-@pytest.fixture(scope="module")
-def competed(log):
-    """The whole log as training rows, and where the competition ends."""
-    rows = training(log[0], FEW)
-    return rows, compete(rows, log[0].vehicle, log[0].table, seed=0)
-
-
-@pytest.mark.parametrize("through", ["memory", "disk"])
-def test_a_state_is_kept_and_comes_back(through, log, competed, tmp_path):
-    """With sizes by gear, a shape, a term without a name, and what was turned down and taken out."""
-    problem, (rows, state) = log[0], competed
-    assert len(state.found) >= 2
+def test_a_state_is_kept_and_comes_back(log, whole, tmp_path):
+    """With sizes by gear, a shape, a term without a name, and what was turned down and taken out; in memory and on
+    disk."""
+    problem, rows = log[0], whole.training
+    state = found_in_turn(rows, problem, ["driveline_drag", "standstill_load"])
+    assert any(g is not None for f in state.found for g in f.score.candidate.groups)
     term = Term((Factor("humidity_pct", above=70.0), Factor("speed_mps", 2)), 41.5)
     rows = rows.with_channel(TERM, term.column(rows.rows.segments)[: rows.rows.rows])
     verdict = Verdict("wet_road", 2.0, 0.4, Rejection(Kind.UNSTABLE, {"percent": 3.0}), needed=20, between=True)
     state = replace(
-        state, terms=(term,), verdicts=(*state.verdicts, verdict), refused=("headwind",),
+        state, terms=(term,), verdicts=(verdict, Verdict("part_load", None, 1.0, Rejection(Kind.REFIT))),
+        refused=("headwind",), tested=("headwind,crosswind",), finished=True,
         removed={"step_change": Rejection(Kind.SUPERFLUOUS, {"beside": "headwind"})},
-        absorbs={"road.c_rr": ["grade_bias"]},
+        absorbs={"road.c_rr": ["grade_bias"]}, trail={",".join(state.ids): [float(x) for x in state.fit.values]},
         fit=replace(state.fit, vehicle=state.fit.vehicle.plus(describing(problem.target)(np.asarray(1.0)))),
     )  # fmt: skip
     plain = to_plain(state)
-    if through == "disk":
-        with open_run(tmp_path / "out", {"verb": "test"}) as run:
-            run.checkpoint("step-1", lambda: plain)
-            plain = run.checkpoint("step-1", lambda: pytest.fail("computed again"))
-    again = from_plain(plain, problem.vehicle, rows)
-    for name in ("terms", "verdicts", "removed", "refused", "absorbs", "finished", "ids"):
-        assert getattr(again, name) == getattr(state, name), name
-    assert {k: list(v) for k, v in again.trail.items()} == dict(state.trail)
-    assert again.fit.table == state.fit.table
-    np.testing.assert_array_equal(again.fit.values, state.fit.values)
-    segments = problem.segments.with_channels(**{TERM: term.column(problem.segments)})
-    np.testing.assert_array_equal(
-        problem.predict(again.fit.vehicle, segments), problem.predict(state.fit.vehicle, segments)
-    )
-    for one, other in zip(again.found, state.found, strict=True):
-        assert one.score.candidate == other.score.candidate
-        np.testing.assert_array_equal(one.score.beta, other.score.beta)
-        assert replace(one, score=other.score) == other
+    with open_run(tmp_path / "out", {"verb": "test"}) as run:
+        run.checkpoint("step-1", lambda: plain)
+        read = run.checkpoint("step-1", lambda: pytest.fail("computed again"))
+    for kept in (plain, read):
+        again = from_plain(kept, problem.vehicle, rows)
+        for name in ("terms", "verdicts", "removed", "refused", "tested", "absorbs", "finished", "ids"):
+            assert getattr(again, name) == getattr(state, name), name
+        assert {k: list(v) for k, v in again.trail.items()} == dict(state.trail)
+        assert again.fit.table == state.fit.table
+        np.testing.assert_array_equal(again.fit.values, state.fit.values)
+        segments = problem.segments.with_channels(**{TERM: term.column(problem.segments)})
+        np.testing.assert_array_equal(
+            problem.predict(again.fit.vehicle, segments), problem.predict(state.fit.vehicle, segments)
+        )
+        for one, other in zip(again.found, state.found, strict=True):
+            assert one.score.candidate == other.score.candidate
+            np.testing.assert_array_equal(one.score.beta, other.score.beta)
+            assert replace(one, score=other.score) == other
 
 
-def test_a_limit_that_is_held_away_from_where_it_was_found_comes_back(log):
+def test_a_limit_that_is_held_away_from_where_it_was_found_comes_back(log, whole):
     problem, _ = log
-    rows = training(problem, ["hvac_power"])
+    rows = replace(whole.training, library={"hvac_power": LIBRARY["hvac_power"]})
     state, hvac = declared(rows, problem), LIBRARY["hvac_power"]
     effect = hvac(below_w_per_k=500.0, above_w_per_k=0.0, heat_c=20.0, cool_c=26.0)
     table = [replace(c, free=False) for c in effect_coefficients(effect, ("below_w_per_k",))]
@@ -155,9 +154,7 @@ def test_the_summary_adds_up(log, whole):
 def test_an_effect_of_the_sheet_is_declared(log):
     problem, split = log
     car = problem.vehicle.plus(LIBRARY["standstill_load"](power_w=np.asarray(500.0), by_door=np.asarray(0.0)))
-    summary = diagnosed(
-        replace(problem, vehicle=car), split, {k: FEW[k] for k in ("standstill_load", "headwind")}
-    ).summary
+    summary = diagnosed(replace(problem, vehicle=car), split, {"standstill_load": FEW["standstill_load"]}).summary
     assert {c["id"]: c["kind"] for c in summary["candidates"]}["standstill_load"] == "declared"
     assert "standstill_load" not in [e["id"] for e in summary["effects"]]
 
@@ -200,7 +197,7 @@ def test_one_trip_is_cut_into_stretches_of_driving(tmp_path):
 
 def test_a_log_too_short_says_so_of_each_candidate(tmp_path):
     _, problem, split = opened(tmp_path, seed=73, trips=1, rows_per_trip=60)
-    result = diagnosed(problem, split)
+    result = diagnosed(problem, split, EACH)
     assert named(result) == []
     assert result.summary["verdict"] in ("nothing_missing", "unexplained_structure")
     kinds = {c["kind"] for c in result.summary["candidates"]}
@@ -225,7 +222,7 @@ def test_a_users_effect_competes_like_any_other(tmp_path):
     def fading(frame) -> None:
         frame["energy_wh"] += 6e4 * np.exp(-frame["time_s"] / 100.0) * frame["duration_s"] / 3600.0
 
-    _, problem, split = opened(tmp_path, seed=74, trips=10, change=fading)
+    _, problem, split = opened(tmp_path, seed=74, trips=12, change=fading)
     result = diagnosed(problem, split, {**FEW, FadingStart.id: FadingStart})
     assert named(result) == [FadingStart.id]
     told = result.summary["effects"][0]["parameters"]
@@ -238,17 +235,23 @@ def test_a_users_effect_competes_like_any_other(tmp_path):
 # --- two sides of a chain that is measured in between --------------------------------------------------------------
 
 
-def test_each_side_is_diagnosed_apart(tmp_path):
-    sides = {k: LIBRARY[k] for k in ("copper_loss", "iron_loss", "rolling_speed")}
+@pytest.fixture(scope="module")
+def sides(tmp_path_factory) -> tuple[Problem, Problem, Split]:
+    """A log with the force at the wheels, with a sheet of the machine's side alone and with one of both sides."""
     options = {"entry": "shaft", "mode": "samples", "effects": {"copper_loss": {}}, "ratio": 2.0}
-    opening = {"seed": 75, "trips": 9, "rows_per_trip": 200, "ar_coefficient": 0.9} | options
-    _, alone, split = opened(tmp_path / "a", **opening)
-    result = diagnosed(alone, split, sides)
-    add_stages(result, sides, settings=SETTINGS, seed=0)
+    opening = {"seed": 75, "trips": 9, "rows_per_trip": 110, "ar_coefficient": 0.9} | options
+    _, alone, _ = opened(tmp_path_factory.mktemp("alone"), **opening)
+    _, problem, split = opened(tmp_path_factory.mktemp("both"), road_side=True, **opening)
+    return alone, problem, split
+
+
+def test_each_side_is_diagnosed_apart(sides):
+    alone, problem, split = sides
+    library = {k: LIBRARY[k] for k in ("copper_loss", "iron_loss", "rolling_speed")}
+    result = diagnosed(problem, split, library)
+    add_stages(replace(result, problem=alone), library, settings=SETTINGS, seed=0)
     assert "stages" not in result.summary, "the sheet says nothing of the road"
-    _, problem, split = opened(tmp_path / "b", road_side=True, **opening)
-    result = diagnosed(problem, split, sides)
-    add_stages(result, sides, settings=SETTINGS, seed=0)
+    add_stages(result, library, settings=SETTINGS, seed=0)
     stages = result.summary["stages"]
     assert named(result) == stages["machine"]["effects"] == ["copper_loss"]
     assert stages["machine"]["after"] == result.summary["after"]["test"]
@@ -259,11 +262,11 @@ def test_each_side_is_diagnosed_apart(tmp_path):
     assert breaches(result) == []
 
 
-def test_what_lies_behind_a_force_is_excluded_with_a_reason(tmp_path):
-    options = {"entry": "shaft", "mode": "samples", "seed": 76, "trips": 9, "rows_per_trip": 120}
-    _, problem, split = opened(tmp_path, road_side=True, target="traction_force_n", **options)
+def test_what_lies_behind_a_force_is_excluded_with_a_reason(sides):
+    _, problem, split = sides
+    force = prepare(split.log, problem.sheet, "traction_force_n")
     library = {k: LIBRARY[k] for k in ("power_gain", "periodic_load", "mode_change", "rolling_speed")}
-    result = diagnosed(problem, split, library)
+    result = diagnosed(force, split, library)
     assert [e["id"] for e in result.summary["excluded"]] == ["power_gain"]
     kinds = {c["id"]: c["kind"] for c in result.summary["candidates"]}
     assert "power_gain" not in kinds

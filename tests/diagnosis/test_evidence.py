@@ -256,11 +256,11 @@ def test_sign_placebos_of_a_consistent_effect():
     assert np.max(gains) <= score.gain * (1 + 1e-9)
     assert np.quantile(gains, 0.9) < 0.6 * score.gain
     ranks = []
-    for seed in range(12):
+    for seed in range(8):
         nothing = Rows(effect=0.0, seed=seed).evidence()
         s = nothing.score(candidate(0))
         ranks.append(np.mean(nothing.sign_placebos(s, np.random.default_rng(seed), 30) < s.gain))
-    # uniform ranks of twelve logs: their mean has a standard error of 0.08
+    # uniform ranks of eight logs: their mean has a standard error of 0.1
     assert abs(np.mean(ranks) - 0.5) < 0.3
 
 
@@ -467,6 +467,12 @@ def test_ways_that_are_alike_are_one_test():
     assert effective_number(np.ones((1, 1))) == 1.0
 
 
+def correlations(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Of the rows of two matrices."""
+    x, y = (a - a.mean(axis=1, keepdims=True) for a in (x, y))
+    return np.sum(x * y, axis=1) / np.sqrt(np.sum(x**2, axis=1) * np.sum(y**2, axis=1))
+
+
 def test_enough_clusters_tell_half_of_what_they_differ_by():
     """By simulation: as many as are said find it in about half of the logs (the median F), far fewer do not."""
     n = clusters_to_tell(0.5, 1, 1e-3)
@@ -475,7 +481,7 @@ def test_enough_clusters_tell_half_of_what_they_differ_by():
 
     def found(count: int) -> float:
         x, e = rng.standard_normal((2, 4000, count))
-        r = np.array([np.corrcoef(a, a + b)[0, 1] for a, b in zip(x, e, strict=True)])
+        r = correlations(x, x + e)
         return float(np.mean(stats.f.sf(r**2 / (1 - r**2) * (count - 2), 1, count - 2) <= 1e-3))
 
     assert found(n) == pytest.approx(0.5, abs=0.1)
@@ -486,9 +492,9 @@ def test_enough_clusters_tell_half_of_what_they_differ_by():
 
 def test_what_would_show_by_now_is_ruled_out():
     """By simulation: of logs in which it holds half of what trips differ by, one in twenty says that it does not."""
-    rng, count, n = np.random.default_rng(1), 8, 2000
+    rng, count, n = np.random.default_rng(1), 8, 800
     x, e = rng.standard_normal((2, n, count))
-    r = np.array([np.corrcoef(a, a + b)[0, 1] for a, b in zip(x, e, strict=True)])
+    r = correlations(x, x + e)
     p = stats.f.sf(r**2 / (1 - r**2) * (count - 2), 1, count - 2)
     out = float(np.mean([ruled_out(0.5, float(v), 1, count) for v in p]))
     assert 0.02 < out < 0.09
@@ -497,11 +503,11 @@ def test_what_would_show_by_now_is_ruled_out():
     assert not ruled_out(0.5, 0.9, 2, 3)
 
 
-@pytest.mark.parametrize("k", [1, 2, 3])
+@pytest.mark.parametrize("k", [1, 3])
 def test_few_clusters_that_matter_make_as_few_false_finds(k):
     """Sizes that six of 24 clusters show are tested at 5 degrees of freedom: a level of 5 % is one."""
     rng, p = np.random.default_rng(k), []
-    for _ in range(4000):
+    for _ in range(2000):
         sizes = rng.normal(size=(6, k))
         mean = sizes.mean(axis=0)
         spread = np.linalg.cholesky(np.atleast_2d(np.cov(sizes.T)) / 6.0) * np.sqrt(24.0 / 23.0)

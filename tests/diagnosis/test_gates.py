@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from planted import declared, opened, training
 
-from hdev_jax.diagnosis.competition.compete import compete
-from hdev_jax.diagnosis.competition.forward import Round
+from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.state import Verdict
 from hdev_jax.diagnosis.competition.verdicts import verdicts_of
 from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class, stability
@@ -102,12 +101,13 @@ def test_a_gain_that_placebos_reach_is_none(plain, log, scores):
 )  # fmt: skip
 def test_the_settings_decide(setting, value, kind, log):
     """One number changed, and what is there is turned down by the gate that the number is of."""
-    problem, rows, _ = log
+    _, rows, state = log
     rows = replace(rows, settings=replace(SETTINGS, **{setting: value}))
-    state = compete(rows, problem.vehicle, problem.table, seed=0)
-    verdict = {v.id: v.rejection.kind for v in state.verdicts}
-    assert verdict.get("standstill_load") is kind
-    assert ("standstill_load" in state.ids) is (kind is None)
+    round_ = Round(rows, state, score_all(rows, state.fit), np.random.default_rng(0))
+    new = forward(round_, only={"standstill_load"})
+    verdict = {v.id: v.rejection.kind for v in verdicts_of(round_, [])}
+    assert (new is not None and new.ids == ("standstill_load",)) is (kind is None)
+    assert kind is None or verdict["standstill_load"] is kind
     assert verdict["drafting"] is Kind.UNAVAILABLE
 
 

@@ -59,7 +59,7 @@ def cycle_of(rows: Rows):
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.97])
-@pytest.mark.parametrize(("trips", "cycles", "size"), [(3, 5, 3.0), (3, 8.5, 3.0), (8, 4, 3.0), (12, 3, 3.0)])
+@pytest.mark.parametrize(("trips", "cycles", "size"), [(3, 5, 3.0), (3, 8.5, 3.0), (12, 3, 3.0)])
 def test_a_cycle_is_found_with_its_period_and_size(rho, trips, cycles, size):
     found = cycle_of(residual(np.random.default_rng(1), trips, 300, rho=rho, cycles=cycles, size=size))
     assert found is not None
@@ -73,16 +73,14 @@ def test_a_single_trip_is_its_own_repetition():
     assert found.period_s == pytest.approx(150.0, rel=0.02)
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.9, 0.97])
-@pytest.mark.parametrize("trips", [1, 3, 12])
-def test_noise_has_no_cycle(rho, trips):
+@pytest.mark.parametrize(("trips", "rho"), [(1, 0.97), (3, 0.9), (12, 0.0)])
+def test_noise_has_no_cycle(trips, rho):
     rng = np.random.default_rng(3)
-    assert sum(cycle_of(residual(rng, trips, 300, rho=rho)) is not None for _ in range(20)) <= 1
+    assert sum(cycle_of(residual(rng, trips, 200, rho=rho)) is not None for _ in range(20)) <= 1
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.9, 0.97])
-@pytest.mark.parametrize("trips", [9, 24])
-def test_slow_noise_has_no_levels_of_trips(rho, trips):
+@pytest.mark.parametrize(("trips", "rho"), [(9, 0.0), (9, 0.97), (24, 0.9)])
+def test_slow_noise_has_no_levels_of_trips(trips, rho):
     rng = np.random.default_rng(5)
     logs = [residual(rng, trips, 250, rho=rho) for _ in range(20)]
     seen = [levels for rows in logs if (levels := levels_of(rows, rows.residual, SETTINGS))]
@@ -118,7 +116,7 @@ def _uneven(rng, shortest: float, longest: float, period: float, load: float) ->
 
 @pytest.mark.parametrize(
     ("rows", "period", "load"),
-    [((5.0, 5.5), 6, 0.06), ((5.0, 5.5), 20, 0.2), ((4.0, 9.0), 6, 0.06), ((4.0, 9.0), 40, 0.15)],
+    [((5.0, 5.5), 6, 0.06), ((4.0, 9.0), 40, 0.15)],
 )
 def test_a_weak_load_is_seen_in_rows_of_unequal_length(rows, period, load):
     """It stands out of coloured noise by what a long row has more of it than a short one."""

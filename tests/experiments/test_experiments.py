@@ -4,6 +4,7 @@ import importlib
 import json
 import re
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planted import FEW, library_of
 
+from experiments.online import study as online
 from experiments.planted.study import Config, tasks
 from experiments.runner import store
 from experiments.runner.compute import Asked, Where, compute
@@ -20,16 +22,17 @@ from experiments.runner.engine import plan, run_config
 from experiments.runner.log import Log
 from experiments.runner.pages.site import MOST_ROWS, WIDTH, part, wrapped, write_docs
 from experiments.runner.tables import readable, wilson
+from hdev_jax import diagnose
 from hdev_jax.errors import InputError
+from hdev_jax.fleet.config import Truth
 from hdev_jax.physics import LIBRARY
 
 STUDIES = Path(__file__).parents[2] / "configs" / "studies"
 
 
 def write(folder: Path, name: str, text: str) -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
+    (folder / name).write_text(text)
+    return folder / name
 
 
 def test_a_delta_changes_the_keys_it_names_and_no_other(tmp_path):
@@ -51,11 +54,7 @@ def test_a_sweep_is_a_grid_whose_points_share_nothing(tmp_path):
     [
         ('experiment = "planted.study"\nsed = 1\n[cases]\n', [], ["key sed", "known keys", "seed"]),
         ('experiment = "planted.study"\nseed = "one"\n[cases]\n', [], ["key seed", "integer", "'one'"]),
-        (
-            'experiment = "planted.study"\n[cases.a]\nname = "x"\nnoises = ["pink"]\n',
-            [],
-            ["cases.a.noises.0", "'pink'"],
-        ),
+        ('experiment = "planted.study"\n[cases.a]\nname = ""\nnoises = ["pink"]\n', [], ["cases.a.noises.0", "'pink'"]),
         ('experiment = "unheard"\n', [], ["key experiment", "paper1.fig5", "planted.study", "'unheard'"]),
         ('experiment = "planted.none"\n', [], ["key experiment", "planted.none cannot be imported"]),
         ("experiment = planted\n", [], ["not a TOML file"]),
@@ -163,8 +162,11 @@ def needs_data(path: Path) -> bool:
     return path.parent.name == "paper2" or resolve(path).get("data") == "ztbus"
 
 
-def parameters(paths):
-    return [pytest.param(p, id=artefact(p), marks=[pytest.mark.data] if needs_data(p) else []) for p in paths]
+def parameters(paths, slow=()):
+    def marks(path):
+        return [pytest.mark.data] * needs_data(path) + [pytest.mark.slow] * (artefact(path) in slow)
+
+    return [pytest.param(p, id=artefact(p), marks=marks(p)) for p in paths]
 
 
 @pytest.mark.parametrize("path", parameters(every_config()))
@@ -187,28 +189,46 @@ RUN = (
     "studies/while_driving", "studies/instruments", "studies/watch_months", "studies/energy_study",
 )  # fmt: skip
 
+SLOW = (
+    "paper1/fig5", "paper1/table1", "studies/energy_study", "studies/instruments", "studies/maps", "studies/ranks",
+    "studies/while_driving",
+)  # fmt: skip
+
 
 def test_each_experiment_has_a_config_that_tests_run():
     run = {resolve(CONFIGS / f"{name}.toml")["experiment"] for name in RUN}
     assert run | {"planted.study"} == set(store.experiments_here())
 
 
-# Of these the diagnosis is most of the time, and has tests of its own: here it knows few effects. The fleet of
-# `while_driving` has more.
-OF_FLEET = ("cornering", "crosswind", "hvac_power", "regen_cutoff", "regen_limit", "road_surface", "rolling_speed",
-            "rolling_temperature", "time_skew", "tyre_warmup", "wet_road")  # fmt: skip
-INSTRUMENTS = ("grade_bias", "grade_noise", "grade_scale", "speed_scale", "time_skew")
-EFFECTS = {"instruments": FEW + INSTRUMENTS, "many": FEW, "switching": FEW, "while_driving": FEW + OF_FLEET}
+# Of these the diagnosis is most of the time, and has tests of its own: here it knows few effects; the fleet needs more.
+EFFECTS = {
+    "instruments": ("grade_noise", "mass_scale"), "many": ("air_density", "auxiliary_power"), "watch_months": FEW,
+    "switching": ("auxiliary_power", "switching_load"), "table8": ("copper_loss", "time_skew"),
+    "while_driving": ("time_skew", *vars(Truth())),
+}  # fmt: skip
+# Smaller still than `[tiny]`: a task of each kind. The networks have the same data, and what one has trained is kept.
+NETWORKS = ('variants=["A", "B"]', 'held_variants=["B"]', "shares=[0.5]")
+SMALLER = {
+    "paper1/fig5": ('variants=["D", "truck_8x4_37t", "bus_12m_3speed"]', "routes=12"),
+    "paper2/input_accelerator_pedal": ('model="linear_arx"',),
+    "studies/instruments": ("rows_per_trip={ segments = 60 }",), "studies/mass": ('buses=["B183"]', "rows=1000"),
+    "studies/ranks": ('worlds={ "closed form" = 1, "fleet on statistics" = 1, NUTS = 1 }', "warm_up=50", "vehicles=2"),
+    "paper2/selection": ('groups.orders.tried={ "1; 1, 1" = { outputs = 1, lags = [0], units = 2 }, '
+                         '"1 kW" = { outputs = 1, lags = [0], units = 2, huber_kw = 1.0 } }',),
+    "paper1/table1": ("repetitions=1",), "studies/pinn_weights": NETWORKS,
+    "paper1/table2": (*NETWORKS, "effects={ regen_cutoff = { speed_mps = 2.5 } }"),
+    "paper2/table8": ('order=["NARXS", "NARXP", "physics", "diagnosed", "persistence"]',),
+}  # fmt: skip
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("path", parameters(CONFIGS / f"{name}.toml" for name in RUN))
-def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept):
+@pytest.mark.parametrize("path", parameters((CONFIGS / f"{name}.toml" for name in RUN), SLOW))
+def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept, monkeypatch):
     if path.stem == "simulators":
         pytest.importorskip("fastsim", reason="fastsim is in the extra truth")
+    monkeypatch.setattr(online, "diagnose", partial(diagnose, only=("headwind",)))  # its fleet needs the others
     try:
         with library_of(EFFECTS.get(path.stem, LIBRARY)):
-            runs = run_config(path, out=tmp_path / "out", kept=kept, tiny=True)
+            runs = run_config(path, SMALLER.get(artefact(path), ()), out=tmp_path / "out", kept=kept, tiny=True)
     except MissingDataError as e:
         pytest.skip(str(e))
     assert all(r["rows"] for r in runs)
@@ -235,32 +255,26 @@ def test_intervals_of_shares():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-@pytest.mark.slow
 def test_many_tasks_on_two_workers_are_all_kept(tmp_path, monkeypatch):
     """More tasks than a worker keeps its compiled programs for; an error of a task is the run's, and says of which."""
-    write(
-        tmp_path,
-        "toy_experiment.py",
-        "SOURCES = ()\n\n\ndef run(task):\n    return {'square': task['n'] ** 2, 'by': 1 / task['by']}\n",
-    )
+    toy = "SOURCES = ()\n\n\ndef run(task):\n    return {'square': task['n'] ** 2, 'by': 1 / task['by']}\n"
+    write(tmp_path, "toy_experiment.py", toy)
     monkeypatch.syspath_prepend(tmp_path)
     toy = importlib.import_module("toy_experiment")
     todo, kept, log = [{"n": n, "by": 1} for n in range(90)], tmp_path / "kept", Log(None)
-    assert compute([Asked("toy", toy, todo)], Where(workers=2), kept, log) == {}
+    asked = [Asked("toy", toy, todo), Asked("bad", toy, [{"n": 1, "by": 0}])]
+    failed = compute(asked, Where(workers=2), kept, log, keep_going=True)
     assert [store.read(store.place(toy, t, kept))["result"]["square"] for t in todo] == [n * n for n in range(90)]
-    bad = [{"n": 1, "by": 0}, {"n": 2, "by": 0}]
-    failed = compute([Asked("toy", toy, bad)], Where(workers=2), kept, log)
-    assert isinstance(failed["toy"], ZeroDivisionError)
-    assert "in the task {" in failed["toy"].__notes__[-1]
+    assert {name: type(e) for name, e in failed.items()} == {"bad": ZeroDivisionError}
+    assert "in the task {" in failed["bad"].__notes__[-1]
 
 
-@pytest.mark.slow
 def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
-    def once(out: str) -> dict:
-        with library_of(FEW):  # the whole library is tried by tests of the diagnosis
-            (metrics,) = run_config(STUDIES / "planted_quick.toml", out=tmp_path / out, kept=tmp_path / "kept")
-        return metrics
+    def once(out: str, sets=(), **options) -> dict:
+        with library_of(("air_density", "auxiliary_power", "headwind", "mass_scale")):
+            return run_config(STUDIES / "planted_quick.toml", sets, out=tmp_path / out, kept=kept, **options)[0]
 
+    kept = tmp_path / "kept"
     first = once("a")
     assert first["logs"] == 2
     assert first["synthetic"] is True
@@ -268,24 +282,15 @@ def test_a_tiny_study_runs_is_kept_and_is_not_run_again(tmp_path, monkeypatch):
     rows = {r["name"]: r["ours"] for r in first["rows"]}
     assert rows["one effect, effect/noise 1, 12 trips, ar1"]["named_exactly"] == 1.0
     assert rows["nothing planted, 12 trips, ar1"]["false_name"] == 0.0
-    for name in (
-        "tables/planted.md",
-        "tables/planted.tex",
-        "figures/confusion.png",
-        "figures/confusion.pdf",
-        "report.html",
-    ):
-        assert (tmp_path / "a" / name).stat().st_size > 200
+    made = ("tables/planted.md", "tables/planted.tex", "figures/confusion.png", "figures/confusion.pdf", "report.html")
+    assert all((tmp_path / "a" / name).stat().st_size > 200 for name in made)
     assert not (tmp_path / "a/figures/power.png").exists(), "one size is no curve"
     monkeypatch.setattr("experiments.planted.study.run", lambda task: pytest.fail(f"run again: {task}"))
     again = once("b")
     assert again["rows"] == first["rows"]
     assert json.loads((tmp_path / "b" / "metrics.json").read_text())["rows"] == first["rows"]
     sets = ["cases.single.logs=3", "cases.null.logs=2"]
-    with library_of(FEW):
-        (part,) = run_config(
-            STUDIES / "planted_quick.toml", sets, out=tmp_path / "c", kept=tmp_path / "kept", fresh=False
-        )
+    part = once("c", sets, fresh=False)
     assert part["logs"] == 1, "the first log is the same one, whatever comes after it"
     assert part["tasks_left_out"] == 4
     write_docs(tmp_path / "docs", STUDIES / "planted.toml", [tmp_path / "c"], sets)
@@ -306,8 +311,6 @@ def test_a_long_table_of_a_page_of_many_runs_is_folded():
 
 
 WORDS = ("white", "noise,", "held-out", "+", "-", "=", "2.", "3)", ">5", ">=", "##", "<b>", "`a b`", "[x](y.md)")
-
-
 BEGINNINGS = ("A sentence ", "- an item ", "12. ")
 
 

@@ -16,8 +16,7 @@ from experiments.runner.engine import run_config
 ROOT = Path(__file__).parents[2]
 CONFIG = """
 experiment = "toy_studies.squares"
-count = 6
-wait_s = 0.1
+count = 4
 noise.scale = 0.5
 [sweep]
 seed = [1, 2]
@@ -60,27 +59,26 @@ def test_a_sweep_outlives_a_worker_and_its_numbers_are_those_of_one_process(tmp_
     with Processes(tmp_path) as processes:
         quiet = ("--no-dashboard", "--scheduler-file", address)
         processes.start("scheduler", "dask", "scheduler", "--host", "127.0.0.1", "--port", "0", *quiet)
-        until(address.exists, "the scheduler's file")
         alone = ("--nthreads", "1", "--no-nanny", "--local-directory", tmp_path / "local")
         workers = [processes.start(f"worker{k}", "dask", "worker", *quiet, *alone) for k in range(2)]
+        here = run_config(tmp_path / "c.toml", out=tmp_path / "here")  # while they start, and wait for its file
         until(lambda: processes.told("scheduler").count("Register worker") == 2, "two workers")
         sweep = processes.start(
-            "sweep", "experiments", tmp_path / "c.toml", "--set", f"diary={diary}", "--set", "wait_s=1.0",
+            "sweep", "experiments", tmp_path / "c.toml", "--set", f"diary={diary}", "--set", "wait_s=0.5",
             "--out", tmp_path / "cluster", "--scheduler", address,
         )  # fmt: skip
 
-        # a task takes a second there: a worker that starts later than the other finds some left
+        # a task takes a while there: a worker that starts later than the other finds some left
         def of(worker):
             return [p.name.partition("-")[0] for p in diary.glob(f"*-{worker.pid}")]
 
-        until(lambda: all(len(of(w)) >= 2 for w in workers), "tasks on both workers")
+        until(lambda: all(map(of, workers)), "tasks on both workers")
         kept = tmp_path / "cluster" / "tasks"
         until(lambda: list(kept.rglob("*.json")), "a result")
         workers[0].send_signal(signal.SIGKILL)
         assert sweep.poll() is None, "killed in the middle"
         assert sweep.wait(120) == 0, processes.told("sweep")
     found = json.loads((tmp_path / "cluster" / "sweep.json").read_text())
-    here = run_config(tmp_path / "c.toml", out=tmp_path / "here")
     assert [r["sweep"] for r in found] == [r["sweep"] for r in here]
     assert [r["rows"] for r in found] == [r["rows"] for r in here]
     assert all(r["rows"][0]["ours"]["x64"] for r in found)

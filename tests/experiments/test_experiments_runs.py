@@ -1,10 +1,12 @@
 """Runs of the engine: what their folders hold, done once, resumed, shared; sweeps as tables; lists on one page."""
 
+import ast
 import json
 import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -132,22 +134,22 @@ def test_what_measures_time_is_not_compiled_quickly(tmp_path, config):
 
 def test_two_sweeps_share_what_they_share_and_each_is_a_table(tmp_path, config):
     out, kept = tmp_path / "sweep", tmp_path / "kept"
-    found = run_config(config, ["sweep.by=[1.0, 2.0]", "sweep.seed={ first = 0, count = 3 }"], out=out, kept=kept)
+    found = run_config(config, ["sweep.by=[1.0, 2.0]", "sweep.seed={ first = 0, count = 2 }"], out=out, kept=kept)
     assert len(ran(tmp_path)) == 4, "one process leaves one file for each number"
-    assert len(list(kept.rglob("*.json"))) == 6 * 4
-    assert [r["sweep"] for r in found] == [{"by": b, "seed": s} for b in (1.0, 2.0) for s in (0, 1, 2)]
+    assert len(list(kept.rglob("*.json"))) == 4 * 4
+    assert [r["sweep"] for r in found] == [{"by": b, "seed": s} for b in (1.0, 2.0) for s in (0, 1)]
     assert json.loads((out / "sweep.json").read_text()) == found
     lines = (out / "sweep.md").read_text().splitlines()
     assert "| by | seed | name | total |" in lines
     assert "| 2 | 0 | sum | 7 |" in lines
-    assert "| 2 | sum | 3 | 7 ± 0 |" in lines, "over the seeds"
+    assert "| 2 | sum | 2 | 7 ± 0 |" in lines, "over the seeds"
     assert r"\pm" in (out / "sweep.tex").read_text()
     assert Path(found[0]["folder"]).name in (out / "report.html").read_text()
     (tmp_path / "diary" / "mark").touch()
     run_config(config, ["sweep.by=[2.0, 3.0]"], out=tmp_path / "other", kept=kept)
     assert ran(tmp_path) == ["0", "1", "2", "3", "mark"]
-    assert len(list(kept.rglob("*.json"))) == 7 * 4, "by = 2, seed = 0 was there"
-    assert run_config(config, ["sweep.by=[2.0]"], out=out)[0]["folder"] not in {r["folder"] for r in found[:3]}
+    assert len(list(kept.rglob("*.json"))) == 5 * 4, "by = 2, seed = 0 was there"
+    assert run_config(config, ["sweep.by=[2.0]"], out=out)[0]["folder"] not in {r["folder"] for r in found[:2]}
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()
     with pytest.raises(InputError, match="holds other files"):
@@ -162,17 +164,17 @@ def test_tasks_that_run_together_are_kept_alone(tmp_path, config):
     (more,) = run_config(config, ["together=true", "count=6"], out=tmp_path / "b", kept=tmp_path / "kept")
     assert more["rows"][0]["ours"]["total"] == 55.0
     assert len(list((tmp_path / "kept").rglob("*.json"))) == 6
-    (shared,) = run_config(config, ["together=true", "count=6"], out=tmp_path / "c", workers=2)
-    assert shared["rows"] == more["rows"]
-    assert (tmp_path / "c" / "log.txt").read_text().count("3 tasks in one program") == 2, "work for both"
 
 
-def test_tasks_that_measure_time_run_last_and_here(tmp_path, config):
-    (metrics,) = run_config(config, ["alone=[0, 2]"], out=tmp_path / "run", workers=2)
+def test_two_workers_share_what_runs_together_and_what_measures_time_runs_last_and_here(tmp_path, config, monkeypatch):
+    monkeypatch.setattr(squares, "together", lambda task: None if squares.alone(task) else "all")
+    (metrics,) = run_config(config, ["count=6", "alone=[0, 2]"], out=tmp_path / "run", workers=2)
     files = sorted((tmp_path / "diary").iterdir(), key=lambda p: p.stat().st_mtime_ns)
-    assert [p.name for p in files[2:]] == [f"0-{os.getpid()}", f"2-{os.getpid()}"]
-    assert not any(p.name.endswith(f"-{os.getpid()}") for p in files[:2])
-    assert metrics["rows"][0]["ours"]["total"] == 14.0
+    assert [p.name for p in files[4:]] == [f"0-{os.getpid()}", f"2-{os.getpid()}"]
+    assert not any(p.name.endswith(f"-{os.getpid()}") for p in files[:4])
+    assert metrics["rows"][0]["ours"]["total"] == 55.0
+    assert metrics["beside"] == 3, "of four that could be one program: no more than a worker's share of all"
+    assert (tmp_path / "run" / "log.txt").read_text().count("3 tasks in one program") == 1, "work for both"
 
 
 def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path, config, capsys, monkeypatch):
@@ -189,10 +191,8 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     assert ran(tmp_path) == ["0", "1", "2", "3"]
     told = capsys.readouterr()
     assert "2 of 5 configs" in told.out
-    assert [line.split()[:5] for line in told.out.splitlines() if " sum " in line] == [
-        ["toy", "sum", "total", "10", "14"],
-        ["toy2", "sum", "total", "10", "7"],
-    ]
+    lines = [line.split() for line in told.out.splitlines() if " sum " in line]
+    assert [x[:5] for x in lines] == [["toy", "sum", "total", "10", "14"], ["toy2", "sum", "total", "10", "7"]]
     why = [line for line in told.err.splitlines() if line.startswith("experiments:")]
     assert len(why) == 2, "one line for each reason"
     assert why[0].startswith("experiments: data, data2: no measured data in")
@@ -204,11 +204,7 @@ def test_a_list_of_configs_is_one_page_and_one_at_fault_stops_no_other(tmp_path,
     assert "by = 2.0 (not there)" in page
     assert "Not made: data, data2: no measured data" in page
     docs = (tmp_path / "docs" / f"{tmp_path.name}.md").read_text()
-    assert [line for line in docs.splitlines() if line.startswith("## ")] == [
-        "## Toy",
-        "## Toy2",
-        "## Paper against ours",
-    ]
+    assert re.findall("^## (.*)$", docs, re.MULTILINE) == ["Toy", "Toy2", "Paper against ours"]
     assert "| Toy | sum | total | 10 | 14 | 1.4 |" in docs
     figures = re.findall(r"\]\((figures/[^)]*)\)", docs)
     assert len(set(figures)) == 2, "of each config its own"
@@ -294,12 +290,7 @@ def test_metrics_are_checked():
 
 def test_only_code_counts_towards_what_is_kept(tmp_path):
     text = '"""What it is."""\n\n\nclass A:\n    """An A."""\n\n\ndef f(x):\n    """Twice."""\n    return 2 * x  # so\n'
-    edits = {
-        "none": ("", ""),
-        "docstring": ("Twice", "Two times"),
-        "comment": ("# so", "# why"),
-        "code": ("2 *", "3 *"),
-    }
+    edits = {"none": ("", ""), "docstring": ("Twice", "Two times"), "comment": ("# so", "# why"), "code": ("2 ", "3 ")}
     task, whole = {}, {}
     for edit, (old, new) in edits.items():
         file = tmp_path / edit / "made" / "module.py"
@@ -311,15 +302,13 @@ def test_only_code_counts_towards_what_is_kept(tmp_path):
 
 
 LOADS = """
-import json, os, sys
-from importlib.machinery import SourceFileLoader
-from pathlib import Path
-import jax, lightgbm, matplotlib, numpy, optax, optimistix, pandas, pydantic.main, tomli_w  # what they share
-import scipy.optimize, scipy.signal, scipy.stats, sklearn
-files = [p for tree in ("hdev_jax", "experiments") for p in (Path.cwd() / tree).rglob("*.py")]
-compiled, get = {str(p): compile(p.read_bytes(), p, "exec") for p in files}, SourceFileLoader.get_code
-SourceFileLoader.get_code = lambda self, name: compiled.get(self.path) or get(self, name)
-for name in sys.argv[1:]:
+import gc, json, os, sys
+import jax, matplotlib, numpy, optax, optimistix, pandas, pydantic.main, tomli_w  # what they share
+import scipy.optimize, scipy.signal, scipy.stats
+gc.disable()
+for name, shared in json.load(sys.stdin):
+    for module in shared:
+        __import__(module)
     print(flush=True)
     if not os.fork():
         __import__(name)
@@ -329,13 +318,31 @@ for name in sys.argv[1:]:
 """
 
 
+@cache
+def reached(name: str) -> frozenset[str]:
+    """The modules whose files are in an experiment's fingerprint."""
+    files = {Path(store._name(p)).with_suffix("") for p in store.reached(starts_of(name), experiments=True)}
+    return frozenset(".".join(f.parts).removesuffix(".__init__") for f in files)
+
+
+@cache
+def starts_of(name: str) -> tuple[Path, ...]:
+    """The experiment's file and its SOURCES, which are read: to import every experiment takes seconds."""
+    itself = store.HERE / f"{name.replace('.', '/')}.py"
+    sources = re.findall(r"^SOURCES = (\(.*?\))", itself.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    return itself, *((itself.parent / source).resolve() for source in ast.literal_eval(*sources))
+
+
 @pytest.fixture(scope="module")
 def modules_loaded() -> dict[str, set[str]]:
-    """What importing an experiment loads of the tree, by the experiment's name, each in a process of its own."""
-    names = [f"experiments.{name}" for name in store.experiments_here()]
+    """What importing an experiment loads of the tree, by the experiment's name, each in a process of its own. What that
+    one and all that are still to come reach is loaded before: it has to be in the fingerprint of each of them."""
+    names = sorted(store.experiments_here(), key=lambda name: len(reached(name)))
+    each = [(f"experiments.{name}", sorted(frozenset.intersection(*map(reached, names[k:]))))
+            for k, name in enumerate(names)]  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", LOADS, *names], cwd=ROOT, capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        [sys.executable, "-W", "ignore", "-c", LOADS], cwd=ROOT, capture_output=True, text=True, check=True,
+        input=json.dumps(each), env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     return {name: set(loaded) for name, loaded in (json.loads(x) for x in done.stdout.splitlines() if x)}
 
@@ -349,13 +356,8 @@ OWN_FINGERPRINT = {"experiments/paper2/diagnosed.py"}
 @pytest.mark.parametrize("name", store.experiments_here())
 def test_what_a_task_depends_on_is_what_its_modules_load(name, modules_loaded):
     """Every file of the package that importing the sources loads is in the fingerprint; none that they do not name."""
-    module = store.experiment(name, "a config")
-    itself = Path(str(module.__file__))
-    starts = [itself, *((itself.parent / source).resolve() for source in module.SOURCES)]
-    files = {store._name(p) for p in store.reached(starts, experiments=True)}
-    reached = {f.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for f in files}
-    own_package = {module.__name__.rpartition(".")[0]}
-    assert modules_loaded[module.__name__] - own_package <= reached
+    starts, own_package = starts_of(name), f"experiments.{name.rpartition('.')[0]}"
+    assert modules_loaded[f"experiments.{name}"] - {own_package} <= reached(name)
     beside = {p for start in starts for p in store._imports(start) if p.is_relative_to(store.HERE)} - {*starts}
     rest = {p for p in beside if p.parent.name != "runner" and p.stem not in {"__init__", *PAGES}}
     assert {store._name(p) for p in rest} <= OWN_FINGERPRINT

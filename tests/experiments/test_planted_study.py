@@ -1,25 +1,27 @@
 """The study of planted effects: how a log is scored, and that what it compares with is what it says."""
 
+from functools import cache
 from pathlib import Path
 
-import numpy as np
 import pytest
-from planted import opened
+from planted import library_of
 
-from experiments.planted import rivals
 from experiments.planted import scores as scores
-from experiments.planted.oracle import confusable, noise_rmse, oracle_rmse
 from experiments.planted.rivals import comparable
 from experiments.planted.rivals_table import LABELS, outcome, rival_rows
-from experiments.planted.study import Config, acts_in, run, tasks
+from experiments.planted.study import Config, run, tasks
 from experiments.planted.tables import collect
 from experiments.runner.config import resolve, typed
-from hdev_jax.inference import calibrate, cluster_rows, padded
 from hdev_jax.rundir import open_run
 
 STUDY = Path(__file__).parents[2] / "configs" / "studies" / "planted.toml"
 
 
+# A part of the library, for a test of the study around it: with few effects it compiles in a fraction of the time.
+SHAFT = ("auxiliary_power", "copper_loss", "iron_loss", "power_gain", "time_skew", "torque_offset")
+
+
+@cache
 def config() -> Config:
     return typed(Config, resolve(STUDY), STUDY)
 
@@ -73,8 +75,9 @@ def test_a_truth_in_another_form_is_called_by_what_comes_nearest():
 
 @pytest.mark.parametrize("planted", ["torque_offset", "power_gain"])
 def test_a_gain_that_an_efficiency_takes_up_is_said_though_an_offset_beside_it_could_be_found(planted):
-    task = next(t for t in tasks(config()) if t["case"] == "absorbed_shaft" and t["effects"] == [planted])
-    told = run(task)
+    task = {**every("absorbed_shaft", effects=[planted])[0], "rows_per_trip": 300}
+    with library_of(SHAFT):
+        told = run(task)
     assert told["named"] == []
     assert planted in told["baseline"]["machine.motoring_efficiency"]["absorbs"]
     assert scores.absorbed([planted], told)
@@ -142,20 +145,31 @@ def test_what_has_no_column_is_not_compared():
     assert rows[f"one: {LABELS['stlsq']}"]["test_over_oracle"] == 1.2
 
 
-def told(tmp_path, logs) -> dict[str, dict]:
-    with open_run(tmp_path / "run", {"a": 1}, seed=1) as run:
-        return {r["name"]: r["ours"] for r in collect(config(), logs, run)["rows"]}
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """One run's folder for the tables of many."""
+    with open_run(tmp_path_factory.mktemp("page") / "run", {"a": 1}, seed=1) as run:
+        yield run
+
+
+def told(page, logs) -> dict[str, dict]:
+    return {r["name"]: r["ours"] for r in collect(config(), logs, page)["rows"]}
+
+
+@cache
+def every_task() -> list[dict]:
+    return list(tasks(config()))
 
 
 def every(case: str, **which) -> list[dict]:
-    return [t for t in tasks(config()) if t["case"] == case and all(t[k] == v for k, v in which.items())]
+    return [t for t in every_task() if t["case"] == case and all(t[k] == v for k, v in which.items())]
 
 
-def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
+def test_finding_nothing_is_not_within_five_percent_of_an_oracle(page):
     """√(1 + ¼²) = 1.03: at a quarter of the noise's size nobody can tell; it is shown and does not count."""
     quarter = [(t, result(test_rmse={"before": 1.03, "after": 1.03})) for t in every("single_quarter")]
     half = [(t, result(test_rmse={"before": 1.12, "after": 1.12})) for t in every("single")[:20]]
-    rows = told(tmp_path, [*quarter, *half])
+    rows = told(page, [*quarter, *half])
     name = "test error within 5 % of that of a fit that knows the cause"
     assert rows[f"{name}, effect/noise 0.25"]["share"] == 1.0
     assert rows[f"{name}, effect/noise 0.25"]["met"] is None
@@ -165,12 +179,12 @@ def test_finding_nothing_is_not_within_five_percent_of_an_oracle(tmp_path):
     assert rows["one effect, effect/noise 0.25, 12 trips, ar1"]["after_over_noise"] == 1.03
 
 
-def test_classes_are_not_right_without_their_members(tmp_path):
+def test_classes_are_not_right_without_their_members(page):
     ten = every("single", effects=["headwind"])
     apart = {"headwind": []}
     logs = [(t, result(["headwind", "crosswind"] if k < 3 else ["headwind"], alike=apart)) for k, t in enumerate(ten)]
     setting = "one effect, effect/noise 0.5, 12 trips, ar1"
-    rows = told(tmp_path, logs)
+    rows = told(page, logs)
     assert (rows[setting]["named_exactly"], rows[setting]["named_first"]) == (1.0, 1.0)
     assert (rows[setting]["separable"], rows[setting]["no_class_of_separable"]) == (1.0, 0.7)
     row = rows[f"{setting}: no twin"]
@@ -178,26 +192,26 @@ def test_classes_are_not_right_without_their_members(tmp_path):
     assert row["met"] is False
     # where so few rows could not tell them apart the class is the answer, and all the same no name without one
     alike = [(t, {**r, "alike": {"headwind": ["crosswind"] if k < 3 else []}}) for k, (t, r) in enumerate(logs)]
-    rows = told(tmp_path / "a", alike)
+    rows = told(page, alike)
     assert (rows[setting]["separable"], rows[setting]["no_class_of_separable"]) == (0.7, 1.0)
     assert rows[f"{setting}: no twin"]["met"] is False
     nine = [(t, result(["headwind", "crosswind"] if k < 1 else ["headwind"])) for k, t in enumerate(ten)]
-    assert told(tmp_path / "c", nine)[f"{setting}: no twin"]["met"] is True
+    assert told(page, nine)[f"{setting}: no twin"]["met"] is True
     big = [(t, {**r, "named": [{**r["named"][0], "class_size": 8}]}) for t, r in logs]
-    row = told(tmp_path / "b", big)[setting]
+    row = told(page, big)[setting]
     assert (row["named_exactly"], row["mean_class"]) == (0.0, 8.0)
 
 
-def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
+def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(page):
     setting = "one effect, effect/noise 0.5, 12 trips, ar1"
     winds = [(t, result(["headwind"])) for t in every("single", effects=["headwind"])]
 
-    def parts(folder: str, *of_gain: str) -> dict[str, dict]:
+    def parts(*of_gain: str) -> dict[str, dict]:
         gains = [(t, result(list(of_gain))) for t in every("single", effects=["power_gain"])]
-        rows = told(tmp_path / folder, winds + gains)
+        rows = told(page, winds + gains)
         return {words: rows[f"{setting}: {words}"] for words in ("all", "no twin", "a twin")}
 
-    right = parts("class", "mass_scale", "power_gain")
+    right = parts("mass_scale", "power_gain")
     assert [right[k]["n"] for k in right] == [20, 10, 10]
     assert [right[k]["right"] for k in right] == [1.0, 1.0, 1.0]
     assert [right[k]["named_exactly_no_class"] for k in right] == [0.5, 1.0, None]
@@ -205,54 +219,53 @@ def test_of_a_twin_its_class_is_asked_and_a_name_by_itself_is_a_guess(tmp_path):
     assert [right[k]["no_class_wanted"] for k in right] == [0.85, 0.85, None]
     assert [right[k]["met"] for k in right] == [False, True, True], "of all logs one name is asked, twins or not"
     for guess in ("power_gain", "mass_scale"):
-        rows = parts(guess, guess)
+        rows = parts(guess)
         assert (rows["a twin"]["right"], rows["a twin"]["met"]) == (0.0, False)
         assert (rows["all"]["right"], rows["all"]["named_exactly_no_class"]) == (0.5, 0.5)
         assert rows["no twin"]["met"] is True
 
 
-def test_settings_that_ask_no_single_names_show_their_twins_and_those_that_ask_no_names_none(tmp_path):
+def test_settings_that_ask_no_single_names_show_their_twins_and_those_that_ask_no_names_none(page):
     quarter = [(t, result(["headwind"])) for t in every("single_quarter", effects=["headwind"])]
-    assert not any(": " in name for name in told(tmp_path / "none", quarter)), "nothing to tell apart"
+    assert not any(": " in name for name in told(page, quarter)), "nothing to tell apart"
     gains = [(t, result(["mass_scale", "power_gain"])) for t in every("single_quarter", effects=["power_gain"])]
-    rows = told(tmp_path / "some", quarter + gains)
+    rows = told(page, quarter + gains)
     row = rows["one effect, effect/noise 0.25, 12 trips, ar1: no twin"]
     assert (row["wanted"], row["no_class_wanted"], row["met"]) == (0.7, None, True)
     absorbed = [(t, result()) for t in every("absorbed_shaft")]
-    assert not any(": " in name for name in told(tmp_path / "absorbed", absorbed))
+    assert not any(": " in name for name in told(page, absorbed))
 
 
-def test_what_is_planted_as_it_is_has_no_place_on_the_axis_of_sizes(tmp_path):
+def test_what_is_planted_as_it_is_has_no_place_on_the_axis_of_sizes(page):
     sized = [
         (t, result(["headwind"])) for case in ("single", "single_quarter") for t in every(case, effects=["headwind"])
     ]
     same = [(t, result(["iron_loss", "driveline_drag"])) for t in every("same_drag")]
-    rows = told(tmp_path, sized + same)
+    rows = told(page, sized + same)
     assert rows["the same drag in all gears, a class with iron loss, 12 trips, ar1"]["right"] == 1.0
 
 
-def test_a_twin_is_never_separable_whatever_the_oracle_says(tmp_path):
+def test_a_twin_is_never_separable_whatever_the_oracle_says(page):
     gains = [
         (t, result(["mass_scale", "power_gain"], alike={"power_gain": []}))
         for t in every("single", effects=["power_gain"])
     ]
-    assert told(tmp_path, gains)["one effect, effect/noise 0.5, 12 trips, ar1"]["separable"] == 0.0
+    assert told(page, gains)["one effect, effect/noise 0.5, 12 trips, ar1"]["separable"] == 0.0
     other = [(t, result(["hvac_power"])) for t in every("approximated", effects=["squared_hvac_power"])]
-    row = told(tmp_path / "b", other)["a truth that the library holds in another form, effect/noise 1, 24 trips, ar1"]
+    row = told(page, other)["a truth that the library holds in another form, effect/noise 1, 24 trips, ar1"]
     assert row["separable"] is None, "the oracle was never asked"
 
 
-def test_a_page_explains_the_tables_that_it_has(tmp_path):
-    def notes(logs, folder) -> str:
-        with open_run(tmp_path / folder, {"a": 1}, seed=1) as run:
-            return " ".join(collect(config(), logs, run)["notes"])
+def test_a_page_explains_the_tables_that_it_has(page):
+    def notes(logs) -> str:
+        return " ".join(collect(config(), logs, page)["notes"])
 
-    single = notes([(t, result(["headwind"])) for t in every("single", effects=["headwind"])], "single")
+    single = notes([(t, result(["headwind"])) for t in every("single", effects=["headwind"])])
     assert "AR(1) with a coefficient of 0.97" in single
     assert "Top-ranked" in single
     twins = single[single.index("Twins:") :]
     assert all(k in twins for pair in scores.TWINS.items() for k in pair)
-    undecided = notes([(t, result()) for t in every("undecidable")], "undecided")
+    undecided = notes([(t, result()) for t in every("undecidable")])
     assert "Called unexplained" in undecided
     assert "Top-ranked" not in undecided, "what cannot be decided is not asked for its name"
     assert "Twins:" not in undecided
@@ -280,88 +293,12 @@ def test_a_page_says_how_many_answers_are_right_and_has_no_figure_of_zeros_or_of
     assert f"{quiet - 1} of {quiet} logs with nothing planted" in found[0]
 
 
-def test_each_setting_has_ten_logs_and_each_control_its_case(tmp_path):
+def test_each_setting_has_ten_logs_and_each_control_its_case(page):
     study = config()
     assert all(case.logs >= 10 for case in study.cases.values())
     done = [(t, result()) for t in [*every("absorbed"), *every("absorbed_control"), *every("undecidable")]]
-    rows = told(tmp_path, done)
+    rows = told(page, done)
     assert rows["absorbed by a declared coefficient, 12 trips, ar1"]["met"] is False, "nothing is far off"
     assert rows["nothing to absorb, 12 trips, ar1"]["met"] is True
     apart = "differs only between trips, random intercepts as large, effect/noise 0.7, 12 trips, trip_levels"
     assert rows[apart]["met"] is False
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "effect", ["friction_blending", "voltage_dependence", "step_change", "mode_change", "periodic_load"]
-)
-def test_the_oracle_has_the_true_shapes(effect, tmp_path):
-    """Without noise it meets the training trips, and the test trips where nothing about them has to be guessed."""
-    options = {"trip": 2} if effect == "step_change" else {}
-    parameters = {"auxiliary_w": 5000.0, **options} if options else {}
-    synthetic, problem, split = opened(tmp_path, seed=3, effects={effect: parameters}, noise_level=1e-6)
-    size = np.sqrt(np.mean(synthetic.truth[f"effect:{effect}"].to_numpy()[problem.rows(split.test)] ** 2))
-    error = oracle_rmse(synthetic, problem, split)
-    assert error < (0.9 if effect in ("mode_change", "periodic_load") else 0.01) * size
-
-
-@pytest.mark.slow
-def test_the_oracle_of_slow_noise_is_better_than_rows_of_equal_weight(tmp_path):
-    ratios = []
-    for seed in range(3):
-        synthetic, problem, split = opened(tmp_path / str(seed), seed=seed, effects={"hvac_power": {}}, noise_level=0.1)
-        train, test = problem.rows(split.train), problem.rows(split.test)
-        real = problem.segments.take(train)
-        rows = padded(real, problem.measured[train])
-        plain = calibrate(problem.vehicle, problem.table, rows, problem.target, cluster_rows(real))
-        before = np.sqrt(np.mean((problem.measured - problem.predict(plain.vehicle))[test] ** 2))
-        oracle, noise = oracle_rmse(synthetic, problem, split), noise_rmse(synthetic, problem, split)
-        assert oracle < before
-        ratios.append(oracle / noise)
-    assert np.mean(ratios) < 1.05
-
-
-@pytest.mark.slow
-def test_what_one_column_cannot_tell_apart_is_one_class(tmp_path):
-    effects = {"mass_scale": {"scale": 0.05}}
-    synthetic, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
-    assert "power_gain" in confusable(["mass_scale"], synthetic, problem, split)["mass_scale"]
-
-
-@pytest.mark.slow
-def test_trips_that_hold_an_effect_are_counted(tmp_path):
-    """An effect that no training trip meets acts in none."""
-    synthetic, problem, split = opened(tmp_path, seed=2, effects={"headwind": {}}, noise_level=0.02)
-    assert acts_in(synthetic, problem, split, "headwind") >= 2
-    for trips, expected in (((), 0), (split.train[:1], 1), (split.train[:3], 3)):
-        synthetic.truth["effect:headwind"] = 1.0 * np.isin(problem.log.trip, [*trips, *split.test])
-        assert acts_in(synthetic, problem, split, "headwind") == expected
-
-
-@pytest.mark.slow
-def test_what_nobody_could_tell_apart_depends_on_how_loud_the_noise_is(tmp_path):
-    some = []
-    for level in (0.02, 5.0):
-        effects = {"crosswind": {}}
-        opening = {"seed": 2, "effects": effects, "noise": "white", "noise_level": level}
-        synthetic, problem, split = opened(tmp_path / str(level), **opening)
-        some.append(confusable(["crosswind"], synthetic, problem, split)["crosswind"])
-    assert not some[0]
-    assert some[1]
-
-
-@pytest.mark.slow
-def test_rivals_are_given_every_size_and_nothing_that_is_absorbed(tmp_path, monkeypatch):
-    seen = []
-
-    def all_of_them(x, y, trip):
-        seen.append(x)
-        return np.arange(x.shape[1])
-
-    monkeypatch.setitem(rivals.SELECTORS, "forward_bic", all_of_them)
-    effects = {"hvac_power": {"below_w_per_k": 900.0, "above_w_per_k": 900.0}}
-    _, problem, split = opened(tmp_path, seed=2, effects=effects, noise="white", noise_level=0.02)
-    named = rivals.run_rivals(["forward_bic"], problem, split)["forward_bic"]["named"]
-    assert {"hvac_power", "headwind", "auxiliary_power", "power_gain"} <= set(named)
-    assert not {"grade_bias", "periodic_load", "mode_change"} & set(named)
-    assert seen[0].shape[1] > len(named), "heating and cooling are two columns of one effect"

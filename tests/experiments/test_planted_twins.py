@@ -64,15 +64,24 @@ def left_of(column: np.ndarray, by: np.ndarray) -> float:
     return float(np.sqrt(np.mean((column - by @ np.linalg.lstsq(by, column, rcond=None)[0]) ** 2)))
 
 
-@pytest.mark.parametrize("effect", ROAD)
-def test_a_twin_leaves_nothing_of_the_column_and_every_other_effect_some(effect, tmp_path):
-    """The generator's column without noise, beside what the declared coefficients take up, against the kernel's at the
-    shapes that the loop tries. What is left of a twin is where the vehicle is not quite as the sheet has it."""
-    synthetic, problem, _ = opened(tmp_path, seed=11, trips=8, effects={effect: {}}, ratio=0.5)
+@pytest.fixture(scope="module")
+def every_column(tmp_path_factory):
+    """One log, of whose truth each planted effect has a column of its own: that truth, the declared coefficients'
+    columns, and those that the loop tries."""
+    effects = {effect: {} for effect in ROAD}
+    synthetic, problem, _ = opened(tmp_path_factory.mktemp("twins"), seed=11, trips=8, effects=effects, ratio=0.5)
     declared = np.asarray(jacobian(problem.vehicle, problem.table, problem.segments, problem.target))
     every, rows = tuple(LIBRARY.values()), len(problem.measured)
     tried, made, _ = columns(problem.vehicle, every, problem.segments, rows, problem.target)
-    planted = synthetic.truth[f"effect:{effect}"].to_numpy()
+    return synthetic.truth, declared, tried, made
+
+
+@pytest.mark.parametrize("effect", ROAD)
+def test_a_twin_leaves_nothing_of_the_column_and_every_other_effect_some(effect, every_column):
+    """The generator's column without noise, beside what the declared coefficients take up, against the kernel's at the
+    shapes that the loop tries. What is left of a twin is where the vehicle is not quite as the sheet has it."""
+    truth, declared, tried, made = every_column
+    planted = truth[f"effect:{effect}"].to_numpy()
     left: dict[str, float] = {}
     for c in tried:
         share = left_of(planted, np.c_[declared, made[:, c.columns]]) / left_of(planted, declared)

@@ -82,8 +82,10 @@ def test_onnx_agrees_in_onnxruntime(kernel, drive):
         np.testing.assert_allclose(found, energy[some], rtol=1e-9, atol=1e-9)
 
 
-def test_lookup_is_the_kernel_at_its_points_and_errs_between_as_it_says(kernel, tmp_path):
-    said = export(with_effects(), "lookup", out=tmp_path / "t.csv")
+def test_lookup_is_the_kernel_at_its_points_and_errs_between_as_it_says(tmp_path):
+    sheet = Sheet(**PLAIN, effects={"hvac_power": EFFECTS["hvac_power"]})
+    kernel = kernel_of(sheet)
+    said = export(sheet, "lookup", out=tmp_path / "t.csv")
     table, about = pd.read_csv(tmp_path / "t.csv", comment="#"), beside(tmp_path / "t.csv")
     error = about["error_wh_per_km"]
     assert f"{error['rms']:.3g} Wh/km rms" in said

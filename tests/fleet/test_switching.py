@@ -1,6 +1,7 @@
 """Loads that switch in synthetic logs: the share of time on is the one asked for, the energy adds up."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ TRIPS, ROWS = 12, 1200
 MODES = [("samples", "shaft", "battery_power_kw"), ("segments", "road", "energy_wh")]
 
 
+@cache
 def made(mode: str = "samples", entry: str = "shaft", rows: int = ROWS, temp_c: float | None = 10.0) -> SyntheticLog:
     """A log whose outside temperature is the same throughout, or as it was drawn."""
-    log = synthetic_log(seed=5, trips=TRIPS, rows_per_trip=rows, mode=mode, entry=entry)
-    return log if temp_c is None else replace(log, frame=log.frame.assign(ambient_temp_c=temp_c))
+    if temp_c is None:
+        return synthetic_log(seed=5, trips=TRIPS, rows_per_trip=rows, mode=mode, entry=entry)
+    log = made(mode, entry, rows, None)
+    return replace(log, frame=log.frame.assign(ambient_temp_c=temp_c))
 
 
 def seconds(log: SyntheticLog) -> np.ndarray:

@@ -58,7 +58,6 @@ def test_equals_bayesian_linear_regression(scale, level):
     np.testing.assert_allclose(fit.predicted, columns @ fit.values + rest, rtol=1e-12)
 
 
-@pytest.mark.slow
 def test_planted_values_are_covered():
     """Truth drawn from the prior, white noise: z-scores have variance 1 whatever the log weighs against the prior.
 
@@ -171,7 +170,8 @@ def test_padded_shapes_are_few_and_their_rows_idle(n):
     np.testing.assert_array_equal(fit.segments.trip, np.arange(size) >= n)
     assert np.all(fit.segments.distance_m[n:] == 0)
     np.testing.assert_array_equal(fit.segments.distance_m[:n], s.distance_m)
-    assert np.all(np.isfinite(truck().predict(fit.segments, TARGET)))
+    if size == 1024:  # of one shape
+        assert np.all(np.isfinite(truck().predict(fit.segments, TARGET)))
 
 
 def test_nothing_free():

@@ -15,6 +15,8 @@ from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
 from hdev_jax.segments import Segments
 
+ONE = {"smooth": (1.0,)}  # where which strength is best is not what is asked
+
 SHEET = """
 mass_kg = 20000.0
 [road]
@@ -60,6 +62,13 @@ def unlearned(m: EfficiencyMap) -> EfficiencyMap:
     return eqx.tree_at(lambda m: m.values, m, jnp.asarray(np.full(m.values.shape, 0.85)))
 
 
+def across(middle: float) -> np.ndarray:
+    """Torques [Nm] as many as of the true map, one of them nearly or quite 0."""
+    torques = np.linspace(-2600.0, 2600.0, 13)[1:]
+    torques[5] = middle
+    return torques
+
+
 def write(folder, gears: tuple[int, ...], most_nm: float) -> None:
     lines = ["gear,motor_speed_radps,motor_torque_nm,efficiency"]
     lines += [f"{g},{s},{t},0.9" for g in gears for s in (0, 2000) for t in (-most_nm, most_nm)]
@@ -68,12 +77,12 @@ def write(folder, gears: tuple[int, ...], most_nm: float) -> None:
 
 
 def test_rows_beyond_the_map_are_reported(tmp_path):
-    rows = log(400)
-    write(tmp_path, (1, 2), 1000.0)
+    rows = log(600)
+    write(tmp_path, (1, 2), 500.0)
     built = build(read_sheet(tmp_path / "sheet.toml"), rows, "road", "energy_wh")
     (note,) = (n for n in built.notes if "beyond its edge" in n)
     ratio = np.where(rows.channels["gear"] == 1, 50.0, 20.0)
-    share = 100 * np.mean(np.abs(np.asarray(car(true_map()).force(rows)) / ratio) > 1000.0)
+    share = 100 * np.mean(np.abs(np.asarray(car(true_map()).force(rows)) / ratio) > 500.0)
     assert share > 0.2
     assert f"{share:.2g} % of the moving rows" in note
     write(tmp_path, (1, 2), 1e5)
@@ -128,17 +137,15 @@ def test_the_jacobian_by_colours_is_the_kernels():
     fit, start = padded(log(80), np.zeros(80)), true_map()
     rows, problem = fit.segments, map_fit._Problem(car(start), fit.segments, fit.measured, start)
     eta = np.asarray(start.values).ravel() + 0.01 * np.random.default_rng(0).normal(size=start.values.size)
-    whole = jax.jacobian(lambda x: map_fit._energy(car(start), start, rows, x))(jnp.asarray(eta))
-    np.testing.assert_allclose(problem.jacobian(eta).toarray(), whole[:80], atol=1e-10)
+    whole = jax.jacobian(lambda x: map_fit._energy(car(start), start, rows, x)[:80])(jnp.asarray(eta))
+    np.testing.assert_allclose(problem.jacobian(eta).toarray(), whole, atol=1e-10)
 
 
-@pytest.mark.parametrize("middle", [0.0, 5e-13])
-def test_a_grid_that_holds_a_torque_of_zero(middle):
+def test_a_grid_that_holds_a_torque_of_nearly_zero():
     rows, truth = log(600), true_map()
     energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(1).normal(size=len(rows))
-    torques = jnp.linspace(-2600.0, 2600.0, 13).at[6].set(middle)
-    start = EfficiencyMap(truth.gears, truth.speeds_radps, torques, jnp.asarray(np.full((2, 7, 13), 0.85)))
-    found = learn_map(car(start), rows, energy, start)
+    start = EfficiencyMap(truth.gears, truth.speeds_radps, jnp.asarray(across(5e-13)), unlearned(truth).values)
+    found = learn_map(car(start), rows, energy, start, **ONE)
     assert found.converged
     assert found.noise_wh < 1.0
     assert found.map.values.min() > 0.2
@@ -147,12 +154,12 @@ def test_a_grid_that_holds_a_torque_of_zero(middle):
 @pytest.mark.parametrize("floor", [0.05, 0.3])
 def test_what_a_table_says_of_no_torque_does_not_touch_its_neighbours(floor):
     rows, truth = log(600, 1), true_map()
-    torques = np.linspace(-2600.0, 2600.0, 13)
+    torques = across(0.0)
     w, t = np.meshgrid(np.asarray(truth.speeds_radps) + 20.0, np.abs(torques), indexing="ij")
     eta = np.maximum(t * w / (t * w + 3.0 * w + 0.004 * t**2 + 400.0), floor)
     truth = EfficiencyMap(truth.gears, truth.speeds_radps, jnp.asarray(torques), jnp.asarray([eta * 0.97, eta]))
     energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(2).normal(size=len(rows))
-    found = learn_map(car(truth), rows, energy, unlearned(truth))
+    found = learn_map(car(truth), rows, energy, unlearned(truth), **ONE)
     assert found.noise_wh < 0.65
     speed, torque = (np.asarray(x) for x in map_fit.operating_points(car(truth), rows))
     away = np.abs(torque) > 434.0  # beyond the nodes next to it
@@ -163,7 +170,7 @@ def test_what_a_table_says_of_no_torque_does_not_touch_its_neighbours(floor):
 
 
 def test_rows_that_stand_say_nothing_of_a_map():
-    rows, truth = log(450), true_map()
+    rows, truth = log(600), true_map()
     energy = np.asarray(car(truth).energy(rows)) + 0.5 * np.random.default_rng(1).normal(size=len(rows))
     still = np.zeros(len(rows), bool)
     still[::3] = True
@@ -173,8 +180,8 @@ def test_rows_that_stand_say_nothing_of_a_map():
         tuple(map(stand, (rows.distance_m, rows.speed_start_mps, rows.speed_end_mps))),
     )  # fmt: skip
     start = unlearned(truth)
-    with_them = learn_map(car(start), stopped, np.where(still, 20.0, energy), start)
-    without = learn_map(car(start), rows.take(~still), energy[~still], start)
+    with_them = learn_map(car(start), stopped, np.where(still, 20.0, energy), start, **ONE)
+    without = learn_map(car(start), rows.take(~still), energy[~still], start, **ONE)
     np.testing.assert_allclose(with_them.map.values, without.map.values, atol=1e-6)
     assert with_them.noise_wh == pytest.approx(without.noise_wh, rel=1e-6)
 
@@ -194,12 +201,13 @@ def test_a_hole_in_a_channel_is_named():
 
 def test_equal_rows_of_equal_energy():
     rows = log(60).take(np.zeros(100, int))
-    assert np.all(np.isfinite(learn_map(car(true_map()), rows, np.full(100, 30.0), true_map()).map.values))
+    found = learn_map(car(true_map()), rows, np.full(100, 30.0), true_map(), **ONE)
+    assert np.all(np.isfinite(found.map.values))
 
 
 def test_energies_without_noise_are_met():
     rows, truth = log(600), true_map()
-    found = learn_map(car(truth), rows, np.asarray(car(truth).energy(rows)), truth)
+    found = learn_map(car(truth), rows, np.asarray(car(truth).energy(rows)), truth, **ONE)
     assert found.noise_wh < 0.1
 
 
@@ -210,7 +218,7 @@ def test_axes_must_increase():
 
 
 def test_a_learned_map_is_the_true_one_where_the_log_has_been():
-    rows, truth = log(6000), true_map()
+    rows, truth = log(1000, 2), true_map()
     vehicle = car(truth)
     rng = np.random.default_rng(1)
     energy = np.asarray(vehicle.energy(rows)) + 0.5 * rng.normal(size=len(rows))
@@ -225,7 +233,7 @@ def test_a_learned_map_is_the_true_one_where_the_log_has_been():
     i = np.clip(np.searchsorted(truth.speeds_radps, speed) - 1, 0, 5)
     j = np.clip(np.searchsorted(truth.torques_nm, torque) - 1, 0, 10)
     cell = (rows.channels["gear"].astype(int) * 6 + i) * 11 + j
-    seen = [c for c in np.unique(cell) if np.sum(cell == c) >= 50 and c % 11 != 5]  # 5: torque changes sign, no power
+    seen = [c for c in np.unique(cell) if np.sum(cell == c) >= 25 and c % 11 != 5]  # 5: torque changes sign, no power
     errors = np.array([np.mean((eta[0] - eta[1])[cell == c]) for c in seen])
     sd = np.array([found.sd[c // 66 - 1, c // 11 % 6 : c // 11 % 6 + 2, c % 11 : c % 11 + 2].max() for c in seen])
     assert len(seen) > 8
@@ -243,7 +251,7 @@ def rms_of_cells(seen, rows, energy):
     points = rows.channels["gear"], *map_fit.operating_points(vehicle, rows)
     g, i, j = map_fit.cells_of(truth, *(np.asarray(x) for x in points))
     cell = (g * 6 + i) * 11 + j
-    found = learn_map(vehicle, seen, energy, truth, smooth=(1.0,))
+    found = learn_map(vehicle, seen, energy, truth, **ONE)
     error = np.asarray(jax.vmap(found.map)(*points)) - np.asarray(jax.vmap(truth)(*points))
     often = [c for c in np.unique(cell) if np.sum(cell == c) >= 50]
     return float(np.sqrt(np.mean([np.mean(error[cell == c]) ** 2 for c in often]))), found

@@ -52,7 +52,7 @@ def test_planted_instruments_are_found(sd):
 
 
 def test_a_slope_off_by_a_milliradian_is_the_climb_of_a_metre_in_a_kilometre():
-    rows = log(50)
+    rows = log(2000)
     climb = shapes(rows, energies(rows))[:, INSTRUMENTS.index("grade_rad")]
     np.testing.assert_allclose(
         1e-3 * climb * 3600.0, MASS * 9.80665 * 1e-3 * np.asarray(rows.distance_m) / ETA, rtol=1e-6
@@ -60,7 +60,7 @@ def test_a_slope_off_by_a_milliradian_is_the_climb_of_a_metre_in_a_kilometre():
 
 
 def test_a_change_of_speed_is_one_of_kinetic_energy():
-    rows = log(50)
+    rows = log(2000)
     kick = shapes(rows, energies(rows))[:, INSTRUMENTS.index("speed_mps")] * 3600.0
     v = np.asarray(rows.speed_mps)
     np.testing.assert_allclose(1e-3 * kick, 0.5 * MASS * ((v + 5e-4) ** 2 - (v - 5e-4) ** 2) / ETA, rtol=1e-6)
@@ -75,15 +75,15 @@ def test_one_row_that_is_far_off_does_not_make_the_others_noisy():
 
 
 def test_what_parameters_took_of_the_residuals_is_given_back():
-    rows = log(1000)
-    shape, noise = shapes(rows, energies(rows)), np.random.default_rng(6).normal(size=1000)
-    plain, given = (row_noise(noise, shape, used, 1e-9)[0] for used in (0.0, 500.0))
+    rows = log(2000)
+    shape, noise = shapes(rows, energies(rows)), np.random.default_rng(6).normal(size=2000)
+    plain, given = (row_noise(noise, shape, used, 1e-9)[0] for used in (0.0, 1000.0))
     np.testing.assert_allclose(given, np.sqrt(2.0) * plain, rtol=1e-6)
 
 
 def test_no_residuals_are_the_least_noise():
-    rows = log(50)
-    of_row, found = row_noise(np.zeros(50), shapes(rows, energies(rows)), 0.0, 1e-3)
+    rows = log(2000)
+    of_row, found = row_noise(np.zeros(2000), shapes(rows, energies(rows)), 0.0, 1e-3)
     np.testing.assert_array_equal(of_row, 1e-3)
     np.testing.assert_array_equal(found, 0.0)
 

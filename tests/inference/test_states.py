@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
@@ -24,20 +24,19 @@ from hdev_jax.inference.states import (
 from hdev_jax.physics.states import SwitchingLoad, expected_share
 from hdev_jax.segments import Segments
 
-TRIPS, SECONDS = 6, 1800
+TRIPS, SECONDS, MORE = 6, 1000, 1800  # of a trip; more of two loads, or of long rows
 
 
-def residual(powers, *, row_s=1.0, noise_w=1500.0, kept=0.5, base_w=-2000.0, seed=0, shares=(0.3, 0.45), dwell_s=90.0):
+def residual(powers, *, seconds=SECONDS, row_s=1.0, noise_w=1500.0, kept=0.5, base_w=-2000.0):
     """Rows with on/off loads: their residual, and the share of each row that each load is on."""
-    rng = np.random.default_rng(seed)
-    per = int(row_s)
-    on = np.zeros((TRIPS * SECONDS, len(powers)))
+    rng, per, shares, dwell_s = np.random.default_rng(0), int(row_s), (0.3, 0.45), 90.0
+    on = np.zeros((TRIPS * seconds, len(powers)))
     for trip in range(TRIPS):
         for k, share in zip(range(len(powers)), shares, strict=False):
             t, state = 0, rng.random() < share
-            while t < SECONDS:
+            while t < seconds:
                 length = max(1, round(rng.exponential(dwell_s if state else dwell_s * (1 - share) / share)))
-                on[trip * SECONDS + t : trip * SECONDS + min(t + length, SECONDS), k] = state
+                on[trip * seconds + t : trip * seconds + min(t + length, seconds), k] = state
                 t, state = t + length, not state
     on = on.reshape(-1, per, len(powers)).mean(axis=1)
     n = len(on)
@@ -55,9 +54,12 @@ def start(*powers, base_w=0.0):
     return Switching(np.array(powers), base_w, np.full(2, 2000.0), np.full((n, 4), 0.4), np.full(n, 60.0))
 
 
-@pytest.mark.parametrize(("powers", "row_s"), [((6000.0,), 1.0), ((8000.0, 20000.0), 1.0), ((8000.0,), 10.0)])
-def test_powers_shares_and_states_come_back(powers, row_s):
-    rows, on = residual(powers, row_s=row_s)
+@pytest.mark.parametrize(
+    ("powers", "row_s", "seconds"),
+    [((6000.0,), 1.0, SECONDS), ((8000.0, 20000.0), 1.0, MORE), ((8000.0,), 10.0, MORE)],
+)
+def test_powers_shares_and_states_come_back(powers, row_s, seconds):
+    rows, on = residual(powers, row_s=row_s, seconds=seconds)
     model, decoded = fit_switching(start(*(0.7 * p for p in powers)), rows, 12)
     np.testing.assert_allclose(model.power_w, powers, rtol=0.08)
     np.testing.assert_allclose(model.base_w, -2000.0, atol=300.0)
@@ -76,7 +78,7 @@ def test_expectation_maximisation_never_loses_likelihood():
 
 
 def test_a_long_row_holds_the_share_of_time_that_a_load_is_on():
-    rows, on = residual((20000.0,), row_s=10.0, noise_w=300.0, kept=0.0)
+    rows, on = residual((20000.0,), seconds=MORE, row_s=10.0, noise_w=300.0, kept=0.0)
     model, decoded = fit_switching(start(15000.0), rows, 8)
     partly = (on > 0.05) & (on < 0.95)
     assert partly.sum() > 50
@@ -90,10 +92,10 @@ def test_one_step_ahead_uses_the_rows_before_alone():
     model = start(6000.0, base_w=-2000.0)
     first = decode(model, rows)
     later = rows.residual_w.copy()
-    later[1000:SECONDS] += 9000.0
+    later[500:1000] += 9000.0
     again = decode(model, replace(rows, residual_w=later))
-    np.testing.assert_allclose(again.ahead[:1001], first.ahead[:1001], atol=1e-9)
-    np.testing.assert_allclose(again.error_w[:1001], first.error_w[:1001], atol=1e-6)
+    np.testing.assert_allclose(again.ahead[:501], first.ahead[:501], atol=1e-9)
+    np.testing.assert_allclose(again.error_w[:501], first.error_w[:501], atol=1e-6)
 
 
 def test_trips_are_sequences_of_their_own():
@@ -106,7 +108,7 @@ def test_trips_are_sequences_of_their_own():
 
 
 def test_energy_drawn_is_about_the_energy_decoded():
-    rows, _ = residual((6000.0, 15000.0))
+    rows, _ = residual((6000.0, 15000.0), seconds=MORE)
     model, decoded = fit_switching(start(6000.0, 15000.0), rows, 6)
     drawn = energy_draws(model, rows, seed=0, draws=30)
     mean = np.stack([(decoded.on[rows.trip == t] * model.power_w).sum(axis=0) / 3600.0 for t in range(TRIPS)], axis=1)
@@ -123,6 +125,7 @@ def test_the_share_on_falls_with_temperature_where_it_does():
     np.testing.assert_allclose(shares_of(rows, on), (0.8, 0.533, 0.267, 0.005), atol=0.05)
 
 
+@settings(max_examples=30)
 @given(seconds=st.floats(0.5, 60.0), seed=st.integers(0, 50))
 def test_means_over_rows_keep_time_and_energy(seconds, seed):
     rng = np.random.default_rng(seed)
@@ -150,10 +153,12 @@ def test_trips_of_one_row_give_numbers():
 def test_an_energy_has_the_same_error_in_a_row_of_any_length():
     """The same energies as powers of rows as short and as long: their errors are as wide, and decoded alike."""
     rng = np.random.default_rng(3)
-    n, seconds = 2000, rng.choice([4.0, 8.0, 16.0], 2000)
+    n, seconds = 3600, rng.choice([4.0, 8.0, 16.0], 3600)
     on = (np.cumsum(rng.random(n) < 0.1) % 2).astype(float)
     power = 8000.0 * on + rng.normal(0.0, 2000.0, n) * 10.0 / seconds
-    rows = StateRows(power, np.repeat(np.arange(4), n // 4), seconds, np.full(n, 15.0), np.zeros(n, int), energy=True)
+    rows = StateRows(
+        power, np.repeat(np.arange(TRIPS), n // TRIPS), seconds, np.full(n, 15.0), np.zeros(n, int), energy=True
+    )
     right = []
     for each in (rows, replace(rows, energy=False)):
         model, decoded = fit_switching(start(6000.0), each, 6)
@@ -166,7 +171,7 @@ def test_an_energy_has_the_same_error_in_a_row_of_any_length():
 
 @pytest.mark.parametrize("value", [0.0, 5000.0])
 def test_a_constant_residual_gives_numbers(value):
-    n = 500
+    n = 1000
     rows = StateRows(np.full(n, value), np.zeros(n, int), np.ones(n), np.full(n, 15.0), np.ones(n, int))
     model, decoded = fit_switching(start(1000.0), rows, 3)
     assert np.all(np.isfinite(decoded.on))
@@ -174,7 +179,7 @@ def test_a_constant_residual_gives_numbers(value):
     assert all(np.isfinite(errors_alone(rows)))
 
 
-def with_covariates(seed, by, trips=10, n=1500):
+def with_covariates(seed, by, trips=10, n=1000):
     """Rows with a load whose log-odds of being on depend on standstill, the trip's start and the state of charge."""
     rng = np.random.default_rng(seed)
     standing = (np.cumsum(rng.random((trips, n)) < 1 / 60, axis=1) % 2).astype(float)
@@ -200,8 +205,8 @@ def with_covariates(seed, by, trips=10, n=1500):
 )
 def test_what_the_chances_depend_on_is_found_and_nothing_else(by, error):
     rows = with_covariates(1, by)
-    model, decoded = fit_switching(start(5000.0), rows, 4)
-    model = what_it_depends_on(model, rows, decoded, rows.trip, cost=3.0, level=0.05)
+    bare, decoded = fit_switching(start(5000.0), rows, 4)
+    model = what_it_depends_on(bare, rows, decoded, rows.trip, cost=3.0, level=0.05)
     assert [bool(b) for b in model.by[0]] == [bool(b) for b in by]
     again, after = fit_switching(model, rows, 2)
     np.testing.assert_allclose(again.by[0], by, atol=3.0 * error)
@@ -209,18 +214,13 @@ def test_what_the_chances_depend_on_is_found_and_nothing_else(by, error):
     plain, before = fit_switching(replace(model, by=np.zeros_like(model.by)), rows, 2)
     said = contrasts(again, rows, 0)
     if any(by):
+        # as much at least as the moves said
+        assert decode(model, rows).log_likelihood > decoded.log_likelihood + 3.0
         assert after.log_likelihood > before.log_likelihood + 3.0
         assert said[0]["share_high"] > said[0]["share_low"] + 0.2
     else:
         assert said == []
     assert np.all(plain.by == 0)
-
-
-def test_the_chances_gain_no_less_than_their_moves_say():
-    rows = with_covariates(2, (2.0, 0, 0, 0))
-    model, decoded = fit_switching(start(5000.0), rows, 4)
-    named = what_it_depends_on(model, rows, decoded, rows.trip, cost=3.0, level=0.05)
-    assert decode(named, rows).log_likelihood > decoded.log_likelihood + 3.0
 
 
 def test_the_effect_expects_what_the_chain_expects():
@@ -234,7 +234,7 @@ def test_the_effect_expects_what_the_chain_expects():
     rows = rows_of(segments, np.zeros(n), samples=True)
     by = np.array([[1.5, 0.0, -2.0, 0.0]])
     model = replace(start(1.0), share=np.asarray(effect.shares())[None], by=by)
-    power = jax.vmap(lambda row: effect.power(row, None, None))(jax.tree.map(np.asarray, segments))
+    power = jax.jit(jax.vmap(lambda row: effect.power(row, None, None)))(jax.tree.map(np.asarray, segments))
     np.testing.assert_allclose(power, model.expected(rows)[:, 0], rtol=1e-6)
     np.testing.assert_allclose(
         replace(model, by=0.0 * by).expected(rows)[:, 0], expected_share(rows.temp_c, model.share[0])

@@ -12,32 +12,32 @@ def fits(values, sure=6.0):
 
 
 def test_trips_that_say_it_are_in_their_mode():
-    truth = np.r_[-np.ones(7), np.ones(5), -np.ones(3)]
-    p = probability_of_modes(fits(truth), np.zeros(15, int))
+    truth = np.r_[-np.ones(8), np.ones(5), -np.ones(3)]
+    p = probability_of_modes(fits(truth), np.zeros(16, int))
     np.testing.assert_array_equal(p > 0.5, truth > 0)
     assert np.all(np.abs(p - 0.5) > 0.45)
 
 
 def test_a_trip_that_says_nothing_is_in_the_mode_of_those_beside_it():
-    truth = np.r_[-np.ones(10), np.ones(10)]
+    truth = np.r_[-np.ones(8), np.ones(8)]
     silent = truth.copy()
-    silent[[3, 15]] = 0.0
-    p = probability_of_modes(fits(silent), np.zeros(20, int))
+    silent[[3, 12]] = 0.0
+    p = probability_of_modes(fits(silent), np.zeros(16, int))
     assert p[3] < 0.1
-    assert p[15] > 0.9
+    assert p[12] > 0.9
     doubtful = truth.copy()
-    doubtful[15] = -0.3
-    assert probability_of_modes(fits(doubtful), np.zeros(20, int))[15] > 0.5
+    doubtful[12] = -0.3
+    assert probability_of_modes(fits(doubtful), np.zeros(16, int))[12] > 0.5
 
 
 def test_vehicles_do_not_tell_each_other_their_mode():
-    both = np.r_[np.ones(6), 0.0, 0.0, -np.ones(6)]
-    one = probability_of_modes(fits(both), np.zeros(14, int))
-    two = probability_of_modes(fits(both), np.repeat([0, 1], 7))
-    assert one[6] < two[6]  # in one vehicle neighbours pull each other
-    assert one[7] > two[7]
-    assert two[6] > 0.8
-    assert two[7] < 0.2
+    both = np.r_[np.ones(7), 0.0, 0.0, -np.ones(7)]
+    one = probability_of_modes(fits(both), np.zeros(16, int))
+    two = probability_of_modes(fits(both), np.repeat([0, 1], 8))
+    assert one[7] < two[7]  # in one vehicle neighbours pull each other
+    assert one[8] > two[8]
+    assert two[7] > 0.8
+    assert two[8] < 0.2
 
 
 def test_modes_that_alternate_are_followed():

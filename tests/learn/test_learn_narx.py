@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from learn_rows import drive, narx_loop
 from scipy.optimize import least_squares
@@ -69,15 +69,16 @@ def test_equations_of_one_step_are_those_of_autodiff(name):
         size = jnp.abs(r)
         return 0.5 * jnp.sum(jnp.where(size <= corner, r**2, corner * (2 * size - corner)))
 
-    got = one_step(s.shape, theta, rows_of(x, y, chunk=128), jnp.asarray(corner))
-    np.testing.assert_allclose(got[0], loss(theta), rtol=1e-10)
-    np.testing.assert_allclose(got[1], jax.grad(loss)(theta), rtol=1e-8, atol=1e-8)
-    jac = jax.jacfwd(lambda t: output(s.shape, t, jnp.asarray(x)))(theta)
-    squares = one_step(s.shape, theta, rows_of(x, y, chunk=128), jnp.asarray(jnp.inf))
+    ours = jax.jit(lambda theta, corner: one_step(s.shape, theta, rows_of(x, y, chunk=128), corner))
+    got, squares = ours(theta, corner), ours(theta, jnp.inf)
+    jac_of = jax.jacfwd(lambda t: output(s.shape, t, jnp.asarray(x)))
+    (value, slope), jac = jax.jit(lambda theta: (jax.value_and_grad(loss)(theta), jac_of(theta)))(theta)
+    np.testing.assert_allclose(got[0], value, rtol=1e-10)
+    np.testing.assert_allclose(got[1], slope, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(squares[2], jac.T @ jac, rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["inputs", "all", "linear"])
+@pytest.mark.parametrize("name", ["inputs", "all"])
 def test_windows_in_parallel_are_the_plain_free_run(name):
     from hdev_jax.learn.narx.network import free_run
 
@@ -92,28 +93,29 @@ def test_windows_in_parallel_are_the_plain_free_run(name):
     windows = windows_of(x, y, back, length=64, burn_in=64, group=4)
     # the first window holds its start, which the trip has not; the others have forgotten theirs
     windows = eqx.tree_at(lambda w: w.weight, windows, windows.weight.at[0, :, 0].set(0.0))
-    got = simulated(s.shape, theta, windows, jnp.asarray(jnp.inf))
-    r, jac = (run(theta) - y)[64:], jax.jacfwd(run)(theta)[64:]
+    got = jax.jit(lambda theta: simulated(s.shape, theta, windows, jnp.asarray(jnp.inf)))(theta)
+    free, jac = jax.jit(lambda theta: (run(theta), jax.jacfwd(run)(theta)))(theta)
+    r, jac = np.asarray(free - y)[64:], np.asarray(jac)[64:]
     assert float(got[0]) == pytest.approx(0.5 * float(r @ r), rel=1e-12)
     for ours, expected in zip(got[1:], (jac.T @ r, jac.T @ jac), strict=True):
         np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-12 * float(jnp.abs(expected).max()))
 
 
-@pytest.mark.slow
 def test_fit_reaches_scipys_cost_from_the_same_start():
     s, trip = Structure(outputs=1, lags=(0, 1), units=1), drive(400)
     model = prepared(s, trip)
     begin = starts(model, trip, keys=jax.random.split(jax.random.key(0), 3), steps=20)
     fit = fit_prediction(model, trip, begin, max_steps=500, rtol=1e-10)
     x, y = model.regressors(trip)
+    said = jax.jit(lambda theta: output(s.shape, theta, jnp.asarray(x)))
+
+    def residual(theta):
+        return np.asarray(said(jnp.asarray(theta))) - y
+
     for k in range(3):
-        said = jax.jit(lambda theta: output(s.shape, theta, jnp.asarray(x)))
-
-        def residual(theta, said=said):
-            return np.asarray(said(jnp.asarray(theta))) - y
-
         theirs = least_squares(residual, np.asarray(begin[k]), method="lm", max_nfev=2000)
         assert float(fit.loss[k]) <= theirs.cost * 1.02
+    assert not bool(fit_prediction(model, trip, begin, max_steps=2, rtol=1e-12).converged.any()), "out of steps"
 
 
 def test_simulation_fit_lowers_the_error_of_the_free_run():
@@ -128,14 +130,6 @@ def test_simulation_fit_lowers_the_error_of_the_free_run():
         return np.mean((with_theta(model, theta).simulate(trip) - measured) ** 2)
 
     assert mse(after.theta[0]) < mse(fit.theta[0])
-
-
-def test_a_fit_that_runs_out_of_steps_says_so():
-    trip = drive(300)
-    model = prepared(Structure(units=3), trip)
-    begin = starts(model, trip, keys=jax.random.split(jax.random.key(1), 2), steps=5)
-    fit = fit_prediction(model, trip, begin, max_steps=2, rtol=1e-12)
-    assert not bool(fit.converged.any())
 
 
 def test_weights_leave_rows_out():
@@ -161,6 +155,7 @@ def test_kernel_terms_are_the_machine_stage():
     assert len(KernelTerms(2).names) == KernelTerms(2)(trip).shape[1]
 
 
+@settings(max_examples=30)
 @given(st.integers(1, 50), st.integers(1, 4), st.floats(0.1, 100.0))
 def test_scale_round_trip(rows, columns, spread):
     x = spread * np.random.default_rng(rows).normal(size=(rows, columns)) + 7
@@ -200,7 +195,6 @@ def test_folds_are_blocks_and_the_edge():
     assert left_out[3].sum() == edge(y).sum() == 20
 
 
-@pytest.mark.slow
 def test_validation_prefers_the_true_orders():
     trip = drive(900)
     common = {

@@ -3,9 +3,10 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from learn_rows import drive
 
@@ -21,7 +22,8 @@ def rows(n=200, columns=3, seed=0):
     return x, x @ np.arange(1.0, columns + 1) + 0.1 * rng.normal(size=n)
 
 
-@given(st.integers(0, 1000), st.integers(1, 5))
+@settings(max_examples=30)
+@given(st.integers(0, 1000), st.sampled_from((1, 4)))
 def test_recursive_without_forgetting_is_least_squares(seed, columns):
     x, y = rows(120, columns, seed)
     state, _ = follow(recursive(np.zeros(columns), prior=1e9), x, y, forgetting=1.0)
@@ -83,32 +85,35 @@ def test_forgetting_outside_its_range_is_one_line():
         follow(recursive(np.zeros(3)), *rows(), forgetting=1.5)
 
 
-@pytest.mark.parametrize("kind", ["lstm", "gru"])
-def test_recurrent_network_learns(kind):
-    trip = drive(600)
-    keys = jax.random.split(jax.random.key(0), 2)
-    settings = {"units": 4, "steps": 150, "batch": 16, "length": 32, "burn_in": 8}
-    models = train_recurrent(kind, trip, keys=keys, **settings)
+RECURRENT = {"units": 4, "steps": 150, "batch": 16, "length": 32, "burn_in": 8}
+
+
+def learnt(kind, trip, keys, **more):
+    """Two starts, which have learned the trip each in its own way."""
+    models = train_recurrent(kind, trip, keys=keys, **RECURRENT, **more)
     for model in models:
         error = model.predict(trip) - model.measured(trip)
         assert np.mean(error**2) < 0.3 * np.var(trip.target)
         assert model.parameters == sum(x.size for x in jax.tree.leaves(model.network) if hasattr(x, "size"))
     assert np.abs(models[0].predict(trip) - models[1].predict(trip)).max() > 1e-3
-    (alone,) = train_recurrent(kind, trip, keys=keys[1:], **settings)
-    np.testing.assert_allclose(alone.predict(trip), models[1].predict(trip), rtol=1e-3, atol=1e-2)
+    return models
 
 
-def test_recurrent_network_learns_nothing_of_rows_that_are_left_out():
-    trip = drive(600)
+def test_recurrent_network_learns():
+    learnt("lstm", drive(600), jax.random.split(jax.random.key(0), 2))
+
+
+def test_recurrent_network_learns_nothing_of_rows_that_are_left_out_nor_of_the_start_beside_it():
+    trip, keys = drive(600), jax.random.split(jax.random.key(0), 2)
     without = (np.arange(600) >= 200) & (np.arange(600) < 350)
-    keys = jax.random.split(jax.random.key(0), 1)
-    settings = {"units": 4, "steps": 20, "batch": 16, "length": 32, "burn_in": 8, "without": without}
+    options = {**RECURRENT, "without": without}
     changed = dataclasses.replace(trip, target=np.where(without, 77.0, trip.target))
-    (first,) = train_recurrent("gru", trip, keys=keys, **settings)
-    (again,) = train_recurrent("gru", changed, keys=keys, **settings)
-    np.testing.assert_array_equal(first.predict(trip), again.predict(trip))
+    first = learnt("gru", trip, keys, without=without)
+    others = jax.random.split(jax.random.key(1), 2)
+    again = train_recurrent("gru", changed, keys=jnp.stack([others[0], keys[0]]), **options)
+    np.testing.assert_array_equal(first[0].predict(trip), again[1].predict(trip))
     with pytest.raises(InputError, match="30 rows to train on"):
-        train_recurrent("gru", trip, keys=keys, **{**settings, "without": np.arange(600) >= 30})
+        train_recurrent("gru", trip, keys=keys, **{**options, "without": np.arange(600) >= 30})
 
 
 def test_recurrent_refuses_in_one_line():

@@ -58,20 +58,42 @@ def start(n: int = 40) -> tuple[Any, Any]:
     return jnp.zeros(3, jnp.float32), jnp.zeros(n, jnp.int32)
 
 
+UNIT = optax.sgd(1.0)
+
+
 def marched(plan: Plan, best: float | None = None, held: Any = 0, **kwargs: Any) -> Any:
     data = jnp.zeros((2, 1))
     held = data if held == 0 else held
-    return train(March(best), jnp.zeros(()), None, data, optax.sgd(1.0), plan, key=KEY, held=held, **kwargs)
+    return train(March(best), jnp.zeros(()), None, data, UNIT, plan, key=KEY, held=held, **kwargs)
 
 
 class KilledError(Exception):
     pass
 
 
+# the same objects, so that what is compiled of them is shared
+SGD = optax.sgd(0.05)
+NOISY = Line(noise=0.2)
+PLAN = Plan(epochs=8, batch=7, patience=2, stop_after=3)
+
+
+KEYS = jax.random.split(KEY, 4)
+STARTS = jax.random.normal(KEY, (4, 3), jnp.float32)
+
+
+def alone(member: int, setting: float) -> Any:
+    """One member by itself."""
+    return train(
+        NOISY, STARTS[member], start()[1], rows(), SGD, PLAN, key=KEYS[member], settings=jnp.float32(setting),
+        held=rows(9, 1),
+    )  # fmt: skip
+
+
 def test_a_run_that_is_resumed_gives_the_same_numbers_to_the_last_bit(tmp_path):
     plan = Plan(epochs=12, batch=7, patience=1, least=0.1)
+    adam = optax.adam(0.1)
     make = lambda **more: train(  # noqa: E731
-        Line(noise=0.5), *start(), rows(), optax.adam(0.1), plan, key=KEY, held=rows(9, 1), **more
+        Line(noise=0.5), *start(), rows(), adam, plan, key=KEY, held=rows(9, 1), **more
     )
     told = []
 
@@ -145,8 +167,8 @@ def test_the_rate_shrinks_after_so_many_epochs_and_never_below_the_least(patienc
     np.testing.assert_allclose(steps, expected[:-1], rtol=1e-5)
     if patience == 1:
         assert steps[-1] == pytest.approx(0.2, rel=1e-5)
-    # without a validation set nothing shrinks and nothing stops
-    np.testing.assert_allclose(np.diff(-marched(plan, held=None).losses), 1.0, rtol=1e-5)
+        # without a validation set nothing shrinks and nothing stops
+        np.testing.assert_allclose(np.diff(-marched(plan, held=None).losses), 1.0, rtol=1e-5)
 
 
 def test_training_stops_and_the_best_epoch_is_kept():
@@ -167,32 +189,30 @@ def test_training_stops_and_the_best_epoch_is_kept():
 
 @pytest.mark.parametrize("how", ["in turn", "side by side"])
 def test_members_are_each_as_alone_and_one_that_diverges_harms_no_other(how):
-    plan = Plan(epochs=8, batch=7, patience=2, stop_after=3)
-    keys = jax.random.split(KEY, 4)
-    settings = jnp.asarray([1.0, 3e38, 0.5, 20.0], jnp.float32)  # the second overflows, the last is not stable
-    weights, memory = jax.random.normal(KEY, (4, 3), jnp.float32), jnp.zeros((4, 40), jnp.int32)
-    make = lambda w, m, k, s, **more: train(  # noqa: E731
-        Line(noise=0.2), w, m, rows(), optax.sgd(0.05), plan, key=k, settings=s, held=rows(9, 1), **more
-    )
-    every = make(weights, memory, keys, settings, members=how)
+    settings = (1.0, 3e38, 0.5, 20.0)  # the second overflows, the last is not stable
+    every = train(
+        NOISY, STARTS, jnp.zeros((4, 40), jnp.int32), rows(), SGD, PLAN, key=KEYS,
+        settings=jnp.asarray(settings, jnp.float32), held=rows(9, 1), members=how,
+    )  # fmt: skip
     assert np.isfinite(every.weights).all()
-    np.testing.assert_array_equal(every.weights[1], weights[1])  # it has what it had
+    np.testing.assert_array_equal(every.weights[1], STARTS[1])  # it has what it had
     assert np.isnan(every.losses[1]).all()
     ends = set()
     for k in (0, 3):
-        alone = make(weights[k], memory[k], keys[k], settings[k])
-        ends.add(alone.epochs)
-        assert np.isfinite(every.scores[k]).sum() == alone.epochs
-        np.testing.assert_allclose(every.weights[k], alone.weights, rtol=1e-4)
-        np.testing.assert_array_equal(every.memory[k], alone.memory)
-        np.testing.assert_allclose(every.losses[k], alone.losses, rtol=1e-4)
-        np.testing.assert_allclose(every.scores[k], alone.scores, rtol=1e-4)
+        one = alone(k, settings[k])
+        ends.add(one.epochs)
+        assert np.isfinite(every.scores[k]).sum() == one.epochs
+        np.testing.assert_allclose(every.weights[k], one.weights, rtol=1e-4)
+        np.testing.assert_array_equal(every.memory[k], one.memory)
+        np.testing.assert_allclose(every.losses[k], one.losses, rtol=1e-4)
+        np.testing.assert_allclose(every.scores[k], one.scores, rtol=1e-4)
     assert len(ends) > 1  # they did not all stop at once
 
 
 def test_the_same_key_gives_the_same_numbers_and_another_others():
-    objective, optimiser = Line(noise=0.1), optax.sgd(0.05)
-    make = lambda key: train(objective, *start(), rows(), optimiser, Plan(2, 16), key=key)  # noqa: E731
+    make = lambda key: train(  # noqa: E731
+        NOISY, *start(), rows(), SGD, PLAN, key=key, settings=jnp.float32(1.0), held=rows(9, 1)
+    )
     first, same, other = make(KEY), make(KEY), make(jax.random.key(4))
     np.testing.assert_array_equal(first.weights, same.weights)
     np.testing.assert_array_equal(first.losses, same.losses)

@@ -34,8 +34,9 @@ def test_one_trip_of_the_niro(data_dir, trip, has):
 
 def test_ztbus(data_dir):
     files = sorted((data_dir / "ztbus").glob("B*.csv.gz"))  # companions too, as a shell would pass them
-    log = read_log(files, ADAPTERS / "ztbus.toml")
-    assert len(log.trip_names) == 24
+    assert len(files) == 48
+    log = read_log([f for k, f in enumerate(files) if k % 8 < 2], ADAPTERS / "ztbus.toml")  # one trip of four
+    assert len(log.trip_names) == 6
     assert log.vehicle_names == ("B183", "B208")
     assert log.default_target == "battery_power_kw"
     c = log.segments.channels

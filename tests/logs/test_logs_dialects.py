@@ -16,7 +16,7 @@ from logs_helpers import samples
 from hdev_jax.errors import InputError
 from hdev_jax.logs import Adapter, Log, read_log
 
-FIFTY = settings(max_examples=50)
+FIFTEEN = settings(max_examples=15)
 FRAME = (
     samples(120).drop(columns="trip_id").round(3).assign(battery_power_w=lambda f: 10.0 * f["battery_power_w"].round(1))
 )
@@ -67,7 +67,7 @@ def dialects(draw) -> tuple[bytes, int]:
     return data.encode(draw(st.sampled_from(["utf-8", "utf-8-sig", "cp1252"]))), extra
 
 
-@FIFTY
+@settings(max_examples=25)
 @given(dialects())
 def test_every_dialect_is_the_same_drive(made):
     data, extra = made
@@ -76,7 +76,7 @@ def test_every_dialect_is_the_same_drive(made):
     assert sum(e.count for e in log.ledger if "no values" in e.reason) == extra
 
 
-@FIFTY
+@FIFTEEN
 @given(st.integers(1, 118), st.sampled_from(";\t|"))
 def test_decimals_that_begin_late(first, separator):
     frame = FRAME.assign(speed_mps=FRAME["speed_mps"].where(FRAME.index >= first, 7.0))
@@ -86,7 +86,7 @@ def test_decimals_that_begin_late(first, separator):
     same(read("\n".join([separator.join(frame), *rows]).encode()), frame)
 
 
-@FIFTY
+@FIFTEEN
 @given(st.sampled_from([(".", ",", ";"), (",", ".", ";"), ("'", ".", ","), (",", ".", ",")]), st.booleans())
 def test_thousands_are_taken_out_where_they_are_certain_and_asked_about_where_not(marks, fraction):
     mark, decimal, separator = marks
@@ -105,7 +105,7 @@ def test_thousands_are_taken_out_where_they_are_certain_and_asked_about_where_no
     same(read(data, {"thousands": mark, "decimal": decimal}), frame)
 
 
-@FIFTY
+@FIFTEEN
 @given(st.integers(100, 900), st.integers(0, 2**16), st.sampled_from([",", ";"]))
 def test_decimals_of_one_length_are_no_groups_of_thousands(volts, seed, separator):
     """A voltage as `%.3f` has 380.000 beside 379.512."""
@@ -115,7 +115,7 @@ def test_decimals_of_one_length_are_no_groups_of_thousands(volts, seed, separato
     np.testing.assert_allclose(log.segments.channels["voltage_v"], voltage)
 
 
-@FIFTY
+@FIFTEEN
 @given(st.lists(st.integers(2, 119), min_size=1, max_size=30, unique=True), st.sampled_from(",;"))
 def test_lines_with_a_field_too_few_are_left_out_or_refused_and_never_shifted(lines, separator):
     rows = text(FRAME, sep=separator).splitlines()
@@ -145,10 +145,10 @@ STAMPS = {
 }
 
 
-@FIFTY
-@given(st.sampled_from(list(STAMPS)), st.datetimes(pd.Timestamp(2015, 1, 1), pd.Timestamp(2030, 1, 1)))
+@pytest.mark.parametrize("start", ["2016-11-05 23:59:03", "2023-07-27 09:30:17"])
+@pytest.mark.parametrize("form", STAMPS)
 def test_every_clock_is_the_same_drive_also_over_midnight(form, start):
-    stamp = pd.Timestamp(start).floor("s") + pd.to_timedelta(FRAME["time_s"], unit="s")
+    stamp = pd.Timestamp(start) + pd.to_timedelta(FRAME["time_s"], unit="s")
     frame = FRAME.drop(columns="time_s").assign(timestamp=stamp.dt.strftime(form))
     data = text(frame).encode()
     if line := said(data):
@@ -162,7 +162,7 @@ def test_every_clock_is_the_same_drive_also_over_midnight(form, start):
         same(read(text(two).encode()))
 
 
-@FIFTY
+@FIFTEEN
 @given(st.integers(1, 118), st.booleans())
 def test_local_time_over_the_end_of_summer_time(row, zone):
     """At `row` it is three in the morning, and two again."""
@@ -172,7 +172,7 @@ def test_local_time_over_the_end_of_summer_time(row, zone):
     same(read(text(frame).encode(), {"time_zone": "Europe/Zurich"} if zone else None))
 
 
-@FIFTY
+@FIFTEEN
 @given(st.integers(1, 118))
 def test_seconds_of_the_day_over_midnight(row):
     frame = FRAME.assign(time_s=(86400.0 - row + FRAME["time_s"]) % 86400.0)
@@ -181,7 +181,7 @@ def test_seconds_of_the_day_over_midnight(row):
     assert any("midnight" in e.reason and e.count == 120 - row for e in log.ledger)
 
 
-@FIFTY
+@FIFTEEN
 @given(
     st.sampled_from([1.0, 1e3, 1e6]), st.integers(1_100_000_000, 2_000_000_000), st.sampled_from(["time", "Timestamp"])
 )
@@ -192,7 +192,7 @@ def test_times_since_1970_by_their_size(scale, start, name):
     assert any("since 1970" in e.reason for e in log.ledger)
 
 
-@FIFTY
+@FIFTEEN
 @given(st.integers(2, 30), st.integers(0, 29))
 def test_stamps_of_a_coarse_clock_are_refused_or_spread(each, phase):
     frame = FRAME.assign(time_s=np.floor((np.arange(120) + phase) / each) * each)

@@ -90,18 +90,18 @@ def test_a_constant_slope_is_found_and_trips_do_not_mix():
 def test_the_smoother_is_the_gaussian_conditional():
     """Against a dense conditional whose covariances are sums over a fine grid."""
     rng = np.random.default_rng(4)
-    places = np.cumsum(rng.uniform(10.0, 40.0, 60))
+    places = np.cumsum(rng.uniform(10.0, 40.0, 30))
     course = Course(0.02, 150.0, 1.5)
     grid = np.arange(places[0], places[-1] + 0.5, 0.5)
     lag = np.abs(grid[:, None] - grid[None]) / course.length_m
     of_slopes = course.slope**2 * (1.0 + lag) * np.exp(-lag)
     whole = np.tril(np.full((len(grid), len(grid)), 0.5), -1)[np.searchsorted(grid, places)]  # heights above the first
-    of_heights = whole @ of_slopes @ whole.T + 1e6 + course.white**2 * np.eye(60)
+    of_heights = whole @ of_slopes @ whole.T + 1e6 + course.white**2 * np.eye(30)
     across = of_slopes[np.searchsorted(grid, places)] @ whole.T
-    z = rng.normal(0, 3.0, 60)
+    z = rng.normal(0, 3.0, 30)
     dense = across @ np.linalg.solve(of_heights, z - z[0])
     spread = course.slope**2 - np.sum(across * np.linalg.solve(of_heights, across.T).T, axis=1)
-    lanes = lanes_of(np.zeros(60, int), places, places, z, np.ones(60), kind=HEIGHT)
+    lanes = lanes_of(np.zeros(30, int), places, places, z, np.ones(30), kind=HEIGHT)
     mean, sd = smoothed(lanes, course, HEIGHT)
     np.testing.assert_allclose(mean, dense, atol=3e-4)
     np.testing.assert_allclose(sd, np.sqrt(spread), rtol=0.02)

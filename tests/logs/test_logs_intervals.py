@@ -100,6 +100,7 @@ def test_slope_from_altitude(tmp_path, dt):
     assert any(e.kind == "derived" and e.column == "grade_rad" for e in log.ledger)
 
 
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(0, 3), st.none() | st.integers(-5, 5)), min_size=1, max_size=40))
 def test_fills_against_a_plain_loop(cells):
     cells = sorted(cells, key=lambda c: c[0])

@@ -54,7 +54,6 @@ def found(frame: pd.DataFrame, vehicle: dict[str, float]) -> list[str]:
 VEHICLES = st.sampled_from([CAR, TRUCK])
 
 
-@pytest.mark.slow
 @settings(max_examples=50)
 @given(VEHICLES, st.integers(0, 10**6), st.booleans(), st.floats(0.7, 1.4), st.floats(-0.3, 0.3))
 def test_a_right_log_is_not_suspected_also_where_the_sheet_is_off(vehicle, seed, hills, laden, drag):
@@ -63,8 +62,7 @@ def test_a_right_log_is_not_suspected_also_where_the_sheet_is_off(vehicle, seed,
     assert found(drive(off, seed, hills=hills), vehicle) == []
 
 
-@pytest.mark.slow
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(VEHICLES, st.integers(0, 10**6), st.sampled_from(["mph as km/h", "km/h as mph"]), st.booleans())
 def test_a_wrong_unit_of_speed_is_suspected(vehicle, seed, wrong, hills):
     frame = drive(vehicle, seed, hills=hills)
@@ -84,8 +82,7 @@ SLOPES = {
 }
 
 
-@pytest.mark.slow
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(VEHICLES, st.integers(0, 10**6), st.sampled_from(sorted(SLOPES)))
 def test_a_wrong_unit_or_sign_of_slope_is_suspected(vehicle, seed, wrong):
     frame = drive(vehicle, seed)
@@ -94,7 +91,7 @@ def test_a_wrong_unit_or_sign_of_slope_is_suspected(vehicle, seed, wrong):
     assert found(frame, vehicle) == [f"{what} of grade_rad"]
 
 
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(VEHICLES, st.integers(0, 10**6), st.booleans(), st.booleans())
 def test_a_turned_sign_of_power_or_current_is_suspected_and_mended(vehicle, seed, hills, amperes):
     frame = drive(vehicle, seed, hills=hills)
@@ -137,7 +134,7 @@ def test_a_power_in_another_unit(factor):
     assert one.what == "unit of battery_power_w"
 
 
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6), st.integers(70, 600), st.floats(11.0, 150.0), st.booleans())
 def test_charging_at_standstill_is_cut_and_counted_wherever_it_stands(seed, seconds, kilowatts, keep):
     frame = drive(CAR, seed, minutes=10)

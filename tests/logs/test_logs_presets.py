@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from logs_helpers import samples, write
 
 from hdev_jax.errors import InputError
@@ -198,6 +198,7 @@ def test_of_alternatives_the_first_that_is_there():
     np.testing.assert_array_equal(log.segments.distance_m, V)
 
 
+@settings(max_examples=15)
 @given(st.integers(2, 9), st.integers(0, 2**16))
 def test_a_row_a_value_at_the_times_of_its_clock(every, seed):
     """Channels at rates of their own: what is not measured at the clock's times is linear between two values, never the

@@ -298,7 +298,7 @@ def disturbed(sender: int, lost: float, none: float, late: float, seed: int) -> 
 SHARE = st.sampled_from([0.0, 0.03])
 
 
-@settings(max_examples=50)
+@settings(max_examples=12)
 @given(st.sampled_from(["blf", "asc", "mf4"]), st.integers(0, 0xFD), SHARE, SHARE, SHARE, st.integers(0, 2**32 - 1))
 def test_no_disturbed_bus_is_another_drive(ending, sender, lost, none, late, seed):
     frames, usable = disturbed(sender, lost, none, late, seed)

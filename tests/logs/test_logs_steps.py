@@ -52,7 +52,7 @@ def read(data: bytes, name: str = "x.xml", adapter: str | None = None) -> Log:
         return read_log(Path(folder) / name, adapter)
 
 
-@settings(max_examples=50)
+@settings(max_examples=12)
 @given(
     st.integers(1, 4),
     st.sampled_from([0.1, 0.5, 1.0]),

@@ -50,7 +50,6 @@ def served(tmp_path):
     fleet.close()
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_the_page_shows_vehicles_as_they_drive(served, tmp_path):
     fleet, rows, url = served

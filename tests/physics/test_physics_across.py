@@ -16,6 +16,7 @@ from hdev_jax.physics.library import derived
 from hdev_jax.segments import Segments
 
 TRIPS = (7, 6, 1, 5)
+shifted, later_slope = jax.jit(across.shifted), jax.jit(across.later_slope)
 
 
 def even(column: np.ndarray, lengths: tuple[int, ...], dt: float = 0.5) -> tuple[np.ndarray, Segments]:
@@ -35,6 +36,11 @@ def by_trip(f: Any, column: Any, segments: Segments) -> np.ndarray:
     return np.concatenate([f(x) for x in parts])
 
 
+def both_modes(f: Any) -> Any:
+    """A function's value and its slope, in reverse and forward, as one program."""
+    return jax.jit(lambda t: (*jax.value_and_grad(f)(t), jax.jvp(f, (t,), (1.0,))[1]))
+
+
 def test_trip_bounds() -> None:
     """First and last row of the trip, in whatever order the ids come."""
     _, segments = even(noise((2, 1, 3)), (2, 1, 3))
@@ -46,7 +52,7 @@ def test_trip_bounds() -> None:
 
 def test_what_is_worked_out_before_changes_nothing() -> None:
     log = made.drives(*made.LENGTHS)
-    ids = ("grade_lag", "tyre_warmup", "brake_drag", "sampling_filter", "time_skew")
+    ids = ("tyre_warmup", "brake_drag", "time_skew")  # all that is worked out: distances, braking, bounds of trips
     car = made.baseline().plus(*(made.typical(i) for i in ids))
     once = derived(log)
     assert set(log.channels) < set(once.channels)
@@ -62,7 +68,7 @@ def test_a_shift_by_whole_rows_is_a_shifted_column(rows: int, cubic: float) -> N
     """The first value of a trip holds before it and the last one after it; no other trip is seen."""
     column, segments = even(noise(), TRIPS)
     expected = by_trip(lambda x: x[np.clip(np.arange(len(x)) - rows, 0, len(x) - 1)], column, segments)
-    np.testing.assert_allclose(across.shifted(column, segments, rows * 0.5, cubic), expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(shifted(column, segments, rows * 0.5, cubic), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_time_skew_shifts_the_power() -> None:
@@ -82,9 +88,9 @@ def test_a_fraction_of_a_row_on_a_sine(cubic: float, order: int, factor: float) 
         column, segments = even(np.sin(2.0 * dt * np.arange(200)), (200,), dt)
         error = 0.0
         for share in (0.1, 0.5, 0.8, 2.3, -1.4):
-            shifted = across.shifted(column, segments, share * dt, cubic)
+            seen = shifted(column, segments, share * dt, cubic)
             analytic = np.sin(2.0 * dt * (np.arange(200) - share))
-            error = max(error, float(np.max(np.abs(shifted - analytic)[5:-5])))
+            error = max(error, float(np.max(np.abs(seen - analytic)[5:-5])))
         assert error < 1.05 * factor * (2.0 * dt) ** order
         worst.append(error)
     np.testing.assert_allclose(np.divide(worst[:-1], worst[1:]), 2.0**order, rtol=0.1)
@@ -93,8 +99,7 @@ def test_a_fraction_of_a_row_on_a_sine(cubic: float, order: int, factor: float) 
 def test_slope_of_a_shift_from_both_sides() -> None:
     """At a whole row the slope is that of the later side: one row back for linear, the four points for the cubic."""
     column, segments = even(noise((9,)), (9,))
-    shift = lambda s, c: across.shifted(column, segments, s, c)[4]  # noqa: E731
-    slope = lambda s, c: jax.grad(shift)(jnp.asarray(s), c)  # noqa: E731
+    slope = jax.jit(jax.grad(lambda s, c: across.shifted(column, segments, s, c)[4]))
     x = column
     np.testing.assert_allclose(slope(0.0, 0.0), (x[3] - x[4]) / 0.5)
     np.testing.assert_allclose(slope(1e-6, 0.0), (x[3] - x[4]) / 0.5)
@@ -143,12 +148,14 @@ def test_low_pass_is_the_recursion_of_scipy(tau: float) -> None:
 def test_low_pass_at_zero_is_the_column_with_a_slope_of_zero() -> None:
     column, segments = even(noise(), TRIPS)
     np.testing.assert_array_equal(across.low_pass(column, segments, 0.0), column)
-    total = jax.jit(lambda t: jnp.sum(across.low_pass(column, segments, t) * noise(seed=1)))
-    assert jax.grad(total)(0.0) == jax.jvp(total, (0.0,), (1.0,))[1] == 0.0
+    weight = noise(seed=1)
+    told = both_modes(lambda t: jnp.sum(across.low_pass(column, segments, t) * weight))
+    _, reverse, forward = told(0.0)
+    assert reverse == forward == 0.0
     for tau in (1e-3, 0.7):
-        reverse, forward = jax.grad(total)(tau), jax.jvp(total, (tau,), (1.0,))[1]
+        _, reverse, forward = told(tau)
         np.testing.assert_allclose(reverse, forward, atol=1e-14)
-    np.testing.assert_allclose(reverse, (total(0.7 + 1e-5) - total(0.7 - 1e-5)) / 2e-5, rtol=1e-7)
+    np.testing.assert_allclose(reverse, (told(0.7 + 1e-5)[0] - told(0.7 - 1e-5)[0]) / 2e-5, rtol=1e-7)
 
 
 # --- times ---------------------------------------------------------------------------------------------------------
@@ -175,19 +182,18 @@ def test_a_later_slope_is_exact_where_the_road_bends_evenly(ahead: float) -> Non
     inside = (clock + ahead > (clock + span)[first]) & (clock + span + ahead < clock[last])
     expected = mean_slope(clock + ahead, clock + span + ahead)
     assert inside.sum() > 40
-    np.testing.assert_allclose(across.later_slope(log, ahead)[inside], expected[inside], rtol=1e-11)
-    assert ahead or np.allclose(across.later_slope(log, ahead), theta, rtol=1e-11)
+    np.testing.assert_allclose(later_slope(log, ahead)[inside], expected[inside], rtol=1e-11)
+    assert ahead or np.allclose(later_slope(log, ahead), theta, rtol=1e-11)
 
 
-@pytest.mark.parametrize("lag", [-2.1, 1e-3, 0.3, 1.9])
-def test_a_later_slope_has_the_slope_of_its_differences(lag: float) -> None:
-    log = made.drives(*TRIPS)
-    weight = noise(seed=1)
-    total = jax.jit(lambda t: jnp.sum(across.later_slope(log, t) * weight))
-    reverse, forward = jax.grad(total)(lag), jax.jvp(total, (lag,), (1.0,))[1]
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(reverse, (total(lag + 1e-6) - total(lag - 1e-6)) / 2e-6, rtol=1e-6)
-    assert jax.grad(total)(0.0) != 0.0
+def test_a_later_slope_has_the_slope_of_its_differences() -> None:
+    log, weight = made.drives(*TRIPS), noise(seed=1)
+    told = both_modes(lambda t: jnp.sum(across.later_slope(log, t) * weight))
+    for lag in (-2.1, 1e-3, 0.3, 1.9):
+        _, reverse, forward = told(lag)
+        np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+        np.testing.assert_allclose(reverse, (told(lag + 1e-6)[0] - told(lag - 1e-6)[0]) / 2e-6, rtol=1e-6)
+    assert told(0.0)[1] != 0.0
 
 
 def test_a_later_slope_on_a_clock_that_float32_can_just_hold() -> None:
@@ -196,15 +202,16 @@ def test_a_later_slope_on_a_clock_that_float32_can_just_hold() -> None:
     column, segments = even(0.02 * noise(lengths), lengths, 1.0)
     segments = segments.with_channels(grade_rad=column)
     single = jax.tree.map(lambda x: x.astype(np.float32) if made.is_real(x) else x, segments)
-    seen = np.asarray(across.later_slope(single, np.float32(0.25)))
-    np.testing.assert_allclose(seen, across.later_slope(segments, 0.25), atol=1e-5)
+    seen = np.asarray(later_slope(single, np.float32(0.25)))
+    np.testing.assert_allclose(seen, later_slope(segments, 0.25), atol=1e-5)
 
 
 def test_grade_lag_takes_the_slope_of_later() -> None:
     """A slope that comes 2 s late is found 2 s later in the log; a place where the vehicle stands has its own."""
     theta, segments = even(0.02 * noise(), TRIPS)
     segments = segments.with_channels(grade_rad=theta)
-    lagged = type(made.null("grade_lag"))(made.arr(1.0)).across(segments)
+    act = jax.jit(lambda s: type(made.null("grade_lag"))(made.arr(1.0)).across(s))
+    lagged = act(segments)
     expected = by_trip(lambda x: x[np.clip(np.arange(len(x)) + 2, None, len(x) - 1)], theta, segments)
     np.testing.assert_allclose(lagged.channels["grade_rad"], expected, rtol=1e-12)
     stands = eqx.tree_at(
@@ -212,7 +219,7 @@ def test_grade_lag_takes_the_slope_of_later() -> None:
         segments,
         tuple(x * (np.arange(len(theta)) != 3) for x in (np.ones(len(theta)),) * 3),
     )
-    assert type(made.null("grade_lag"))(made.arr(1.0)).across(stands).channels["grade_rad"][1] == theta[3]
+    assert act(stands).channels["grade_rad"][1] == theta[3]
 
 
 def test_distance_since_start() -> None:
@@ -252,7 +259,7 @@ def test_a_slope_less_its_noise_is_what_the_road_is_expected_to_be(length_m: flo
     speed = np.full(8000, 15.0)
     log = Segments.from_arrays(trip=np.repeat(np.arange(40), 200), duration_s=length_m / speed, speed_start_mps=speed,
                                speed_end_mps=speed)  # fmt: skip
-    corrected = np.asarray(less_noise(read, log, 0.008))
+    corrected = np.asarray(jax.jit(less_noise)(read, log, 0.008))
 
     def told_by(x: np.ndarray) -> float:
         x = x - np.mean(x)
@@ -263,14 +270,14 @@ def test_a_slope_less_its_noise_is_what_the_road_is_expected_to_be(length_m: flo
     assert np.std(corrected - truth) < np.std(read - truth)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 3, 30])
-def test_less_noise_has_finite_gradients_in_single_precision(rows: int) -> None:
-    rng = np.random.default_rng(4)
-    n = 20 * rows
-    speed = np.full(n, 10.0, np.float32)
-    log = Segments.from_arrays(trip=np.repeat(np.arange(20), rows), duration_s=np.ones(n, np.float32),
-                               speed_start_mps=speed, speed_end_mps=speed)  # fmt: skip
-    slope = jnp.asarray(rng.normal(0, 0.02, n), jnp.float32)
-    for sd in (0.0, 1e-4, 0.01):
-        gradient = jax.grad(lambda x, s: jnp.sum(less_noise(x, log, s) ** 2), argnums=(0, 1))(slope, jnp.float32(sd))
-        assert all(bool(jnp.all(jnp.isfinite(g))) for g in gradient)
+def test_less_noise_has_finite_gradients_in_single_precision() -> None:
+    """Of trips of one row to 30."""
+    slopes = jax.jit(jax.grad(lambda x, log, s: jnp.sum(less_noise(x, log, s) ** 2), argnums=(0, 2)))
+    slope = jnp.asarray(np.random.default_rng(4).normal(0, 0.02, 30), jnp.float32)
+    speed = np.full(30, 10.0, np.float32)
+    for rows in (1, 2, 3, 30):
+        trip = np.repeat(np.arange(30 // rows), rows)
+        log = Segments.from_arrays(trip=trip, duration_s=np.ones(30, np.float32), speed_start_mps=speed,
+                                   speed_end_mps=speed)  # fmt: skip
+        for sd in (0.0, 1e-4, 0.01):
+            assert all(bool(jnp.all(jnp.isfinite(g))) for g in slopes(slope, log, jnp.float32(sd)))

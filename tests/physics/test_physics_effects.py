@@ -2,16 +2,30 @@
 
 import dataclasses
 import re
-from functools import cache
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import physics_rows as made
 import pytest
+from each_effect import (
+    ABOVE,
+    BELOW,
+    NULL,
+    NULL_AT_ZERO,
+    OWN,
+    STEP,
+    TYPICAL,
+    WEIGHTS,
+    alone,
+    both_modes,
+    directions,
+    filled,
+    log_of,
+    terms,
+)
 
 from hdev_jax.physics import LIBRARY, Choice, Grouped, Parameter, Shape, Size, Switch, Vehicle, library
 from hdev_jax.physics.effect import STAGES, Effect
@@ -182,107 +196,59 @@ def test_a_users_effect_must_have_a_name_of_its_own(effect_id: str) -> None:
 # --- what it adds --------------------------------------------------------------------------------------------------
 
 
-def null_and_typical(car: Vehicle, *ids: str) -> Vehicle:
-    """The vehicle with these effects at their nulls and at typical sizes, stacked: one pass serves both."""
-    return stacked(*(car.plus(*(size(i) for i in ids)) for size in (made.null, made.typical)))
-
-
-def stacked(*trees: Any) -> Any:
-    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
-
-
-@cache
-def outcome(effect_id: str) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Energy without the effect; at its null and at its typical size, and the breakdown of these."""
-    log, car = made.log_for(effect_id), made.without_effect(effect_id)
-    logs = stacked(log, log)
-    energy, parts = jax.vmap(lambda c, s: (c.energy(s), c.breakdown(s)))(null_and_typical(car, effect_id), logs)
-    # stacked as well: how the last bit is rounded depends on the length of an array
-    bare = jax.vmap(lambda c, s: c.energy(s))(stacked(car, car), logs)[0]
-    return np.asarray(bare), np.asarray(energy), {k: np.asarray(v) for k, v in parts.items()}
-
-
 def test_null_adds_exactly_nothing(effect_id: str) -> None:
-    bare, (null, _), parts = outcome(effect_id)
-    np.testing.assert_array_equal(null, bare)
-    np.testing.assert_array_equal(parts[effect_id][0], np.zeros(len(bare)))
+    seen = alone(effect_id)
+    np.testing.assert_array_equal(seen.energy[NULL], seen.bare)
+    np.testing.assert_array_equal(seen.parts[effect_id][NULL], np.zeros(len(seen.bare)))
 
 
 def test_typical_adds_something(effect_id: str) -> None:
-    bare, (_, typical), _ = outcome(effect_id)
+    seen = alone(effect_id)
     if effect_id == "standstill_hold":  # a force that does no work
-        np.testing.assert_array_equal(typical, bare)
+        np.testing.assert_array_equal(seen.energy[TYPICAL], seen.bare)
         log, car = made.log_for(effect_id), made.without_effect(effect_id)
         held = np.asarray(log.speed_mps) < 0.1
         assert held.any()
         both = car.plus(made.typical(effect_id))
         np.testing.assert_allclose(both.force(log)[held], 0.1 * car.force(log)[held])
         return
-    assert np.max(np.abs(typical - bare)) > 0.1  # Wh in a second; the drive itself is at some 10² Wh
+    assert np.max(np.abs(seen.energy[TYPICAL] - seen.bare)) > 0.1  # Wh in a second; the drive itself is at some 10² Wh
 
 
-def assert_finite(both: Vehicle, log: Segments) -> None:
+def assert_finite(energy: np.ndarray, forward: np.ndarray, terms: np.ndarray) -> None:
     """Forward and reverse agree and are finite, in every number of each vehicle of a stack and of the log."""
-    numbers, rest = eqx.partition((both, stacked(log, log)), made.is_real)
-    weights = np.linspace(0.5, 1.5, len(log))
-    # each number on the scale of its own size, so that one direction sees them all
-    rng = np.random.default_rng(0)
-    # (what is not known, as a phase that nobody has fitted, has no size)
-    direction = jax.tree.map(
-        lambda x: (np.nan_to_num(np.abs(x)) + 1e-3) * rng.choice([-1.0, 1.0], np.shape(x)), numbers
-    )
-
-    def both_modes(numbers: Any, rest: Any, direction: Any) -> tuple[Any, Any, Any]:
-        def total(numbers: Any) -> Any:
-            vehicle, segments = eqx.combine(numbers, rest)
-            return jnp.sum(vehicle.energy(segments) * weights)
-
-        value, forward = jax.linearize(total, numbers)
-        (reverse,) = jax.linear_transpose(forward, numbers)(jnp.ones(()))
-        return value, forward(direction), reverse
-
-    value, along, reverse = jax.vmap(both_modes)(numbers, rest, direction)
-    assert np.all(np.isfinite(value))
-    pairs = zip(*map(jax.tree.leaves, (reverse, direction)), strict=True)
-    terms = np.concatenate([np.reshape(a * b, (2, -1)) for a, b in pairs], axis=1)
+    assert np.all(np.isfinite(energy))
     assert np.all(np.isfinite(terms))
-    for one, parts in zip(along, terms, strict=True):
-        np.testing.assert_allclose(one, np.sum(parts), atol=1e-9 * np.sum(np.abs(parts)))
+    for one, parts in zip(forward, terms, strict=True):
+        np.testing.assert_allclose(one @ WEIGHTS, np.sum(parts), atol=1e-9 * np.sum(np.abs(parts)))
 
 
 def test_finite_with_finite_gradients(effect_id: str) -> None:
-    """The log has standstill, distance 0 and negative power; zero force is below."""
-    assert_finite(null_and_typical(made.without_effect(effect_id), effect_id), made.log_for(effect_id))
+    """The log has standstill, distance 0 and negative power, and two of the vehicles a row of zero force."""
+    seen = alone(effect_id)
+    assert np.any((seen.energy[NULL_AT_ZERO] == 0) & (log_of(effect_id).distance_m > 0))
+    assert_finite(seen.energy, seen.along, seen.terms)
 
 
-@pytest.mark.parametrize("entry", ["road", "wheel", "shaft"])
+@pytest.mark.parametrize("entry", ["wheel", "shaft"])
 def test_finite_with_all_effects_at_zero_force(entry: str) -> None:
-    """Without resistances and loads the flat stretch at one speed has no force and no power at any entry."""
-    nothing = {"auxiliary_w": 0.0} | ({"c_rr": 0.0, "cda_m2": 0.0} if entry == "road" else {})
-    car, log = made.baseline(entry, **nothing), made.drives(*made.LENGTHS)
+    """Without loads the flat stretch at one speed has no power at any entry; from the road that is above."""
+    car, log = made.baseline(entry, auxiliary_w=0.0), made.drives(*made.LENGTHS)
     assert np.any((np.asarray(car.power(log)) == 0) & (log.distance_m > 0))
-    assert_finite(null_and_typical(car, *(i for i, e in LIBRARY.items() if entry in e.entries)), log)
+    ids = [i for i, e in LIBRARY.items() if entry in e.entries]
+    both = filled(*(car.plus(*(size(i) for i in ids)) for size in (made.null, made.typical)))
+    numbers, rest = eqx.partition((both, filled(log)), made.is_real)
+    direction = directions(numbers)
+    energy, along, reverse = jax.vmap(both_modes)(numbers, rest, direction)
+    assert_finite(energy[:2], along[:2], terms(reverse, direction)[:2])
 
 
 def test_gradient_against_differences(effect_id: str) -> None:
     """Away from switches: no row of this log lies on one at the typical size. (That reverse is forward is above.)"""
-    car, effect = made.without_effect(effect_id), made.typical(effect_id)
-    log = made.log_for(effect_id, seed=3)
-    held = {p.name for p in effect.parameters if isinstance(p, Choice)}
-    flat, back = jax.flatten_util.ravel_pytree({k: v for k, v in vars(effect).items() if k not in held})
-    scale = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
-    direction = np.random.default_rng(0).normal(size=flat.shape)
-    direction /= np.linalg.norm(direction)
-
-    def along(step: Any) -> Any:
-        changed = dataclasses.replace(effect, **back(flat + step * direction * scale))
-        return car.plus(changed).energy(log)
-
-    h = 1e-5
-    value, slope = jax.vmap(lambda at: jax.jvp(along, (at,), (jnp.ones(()),)))(jnp.array([-h, 0.0, h]))
-    largest = float(np.max(np.abs(value[1])))
-    difference = (value[2] - value[0]) / (2 * h)
-    np.testing.assert_allclose(slope[1] / largest, difference / largest, atol=1e-6, rtol=1e-6)
+    seen = alone(effect_id)
+    largest = float(np.max(np.abs(seen.energy[TYPICAL])))
+    difference = (seen.energy[ABOVE] - seen.energy[BELOW]) / (2 * STEP)
+    np.testing.assert_allclose(seen.along[OWN] / largest, difference / largest, atol=1e-6, rtol=1e-6)
 
 
 # --- the vehicle as a sum ------------------------------------------------------------------------------------------
@@ -310,19 +276,16 @@ def assert_adds_up(parts: dict[str, np.ndarray], total: np.ndarray) -> None:
 
 
 def test_breakdown_adds_up(effect_id: str) -> None:
-    first, *others = LIBRARY[effect_id].entries
-    _, energy, parts = outcome(effect_id)
-    assert {e.id for e in made.baseline(first).effects} | {effect_id} <= set(parts)
-    assert_adds_up(parts, energy)
-    for entry in others:
-        car, log = made.baseline(entry).plus(made.typical(effect_id)), made.log_for(effect_id)
-        assert_adds_up(car.breakdown(log), np.asarray(car.energy(log)))
+    seen = alone(effect_id)
+    assert {e.id for e in made.without_effect(effect_id).effects} | {effect_id} <= set(seen.parts)
+    assert_adds_up(seen.parts, seen.energy)
 
 
 @pytest.mark.parametrize("entry", ["road", "wheel", "shaft"])
 def test_breakdown_adds_up_with_all_effects_together(entry: str) -> None:
-    """With every stage, and of the sensors one of each kind: each of the others is a pass over all effects."""
-    acting = [i for i, e in LIBRARY.items() if entry in e.entries and (e.stage != "sensors" or i in SENSORS)]
+    """With every stage, and from the road of the sensors one of each kind: each is a pass over all effects."""
+    ids = SENSORS if entry == "road" else LIBRARY
+    acting = [i for i, e in LIBRARY.items() if entry in e.entries and (e.stage != "sensors" or i in ids)]
     car = made.baseline(entry, covers_machine=False).plus(*(made.typical(i) for i in acting))
     log = made.drives(*made.LENGTHS)
     parts = car.breakdown(log)
@@ -341,19 +304,16 @@ def all_together(entry: str, dtype: Any) -> tuple[Vehicle, Segments]:
 
 
 @pytest.mark.parametrize("entry", ["road", "shaft"])
-def test_single_precision_is_kept_under_strict_promotion(entry: str) -> None:
-    """All effects together: a vehicle and a log in float32 give float32, though float64 is switched on."""
+def test_precision_is_kept_under_strict_promotion(entry: str) -> None:
+    """All effects together: a vehicle and a log in float32 give float32, though float64 is switched on.
+
+    That jit gives the same numbers is asked of the kernel's loop (`test_physics_reference`).
+    """
     with jax.numpy_dtype_promotion("strict"):
         energy = eqx.filter_jit(lambda c, s: c.energy(s))(*all_together(entry, jnp.float32))
+        double = eqx.filter_eval_shape(lambda c, s: c.energy(s), *all_together(entry, jnp.float64))
     assert energy.dtype == jnp.float32
+    assert double.dtype == jnp.float64
     car, log = all_together(entry, jnp.float64)
     exact = np.asarray(car.energy(log))
     assert np.max(np.abs(energy - exact)) < 1e-4 * np.max(np.abs(exact))
-
-
-@pytest.mark.parametrize("entry", ["road", "shaft"])
-def test_nothing_is_promoted_in_double_precision(entry: str) -> None:
-    """That jit gives the same numbers is asked of the kernel's loop (`test_physics_reference`)."""
-    with jax.numpy_dtype_promotion("strict"):
-        energy = eqx.filter_eval_shape(lambda c, s: c.energy(s), *all_together(entry, jnp.float64))
-    assert energy.dtype == jnp.float64

@@ -1,6 +1,7 @@
 """An effect is one class: nothing of it is kept elsewhere in the package."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from hdev_jax.report import names
 
 PACKAGE = Path(__file__).parents[2] / "hdev_jax"
 IDS = {*LIBRARY, *(c.id for c in DECLARED)}
+ID = re.compile(rf"\b(?:{'|'.join(IDS)})\b")
 
 # Words that are also something else: channels of a log, features of a network, the kind of a quantity by its name.
 CHANNELS = {"wet_road", "road_surface"}
@@ -40,8 +42,11 @@ ELSEWHERE: dict[str, set[str]] = {
 
 
 def texts(path: Path) -> set[str]:
-    """Every text in a file's code, without its docstrings."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    """Every text in the code of a file that has the word of an effect, without its docstrings."""
+    text = path.read_text(encoding="utf-8")
+    if not ID.search(text):
+        return set()
+    tree = ast.parse(text)
     said = {
         id(n.body[0].value)
         for n in ast.walk(tree)

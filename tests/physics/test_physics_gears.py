@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import physics_rows as made
 import pytest
-from jax.test_util import check_grads
 
 from hdev_jax.physics import GEAR_PROBABILITY, EfficiencyMap, Vehicle
 from hdev_jax.segments import Segments
@@ -35,10 +34,10 @@ def one_hot(log: Segments) -> np.ndarray:
 
 def test_a_probability_of_one_is_the_gear_exactly(car: Vehicle) -> None:
     log = made.drives(*made.LENGTHS)
-    for f in (lambda c, s: c.energy(s), lambda c, s: c.torque(s), lambda c, s: jnp.stack([*c.breakdown(s).values()])):
-        compiled = eqx.filter_jit(f)
+    compiled = eqx.filter_jit(lambda c, s: (c.energy(s), c.torque(s), jnp.stack([*c.breakdown(s).values()])))
+    for one, other in zip(compiled(car, log), compiled(car, with_shares(log, one_hot(log))), strict=True):
         # to rounding: how a sum is ordered is the compiler's
-        np.testing.assert_allclose(compiled(car, log), compiled(car, with_shares(log, one_hot(log))), rtol=1e-14)
+        np.testing.assert_allclose(one, other, rtol=1e-14)
 
 
 def test_efficiency_is_the_mean_over_the_gears(car: Vehicle) -> None:
@@ -62,9 +61,21 @@ def test_gradients_by_vehicle_and_by_probability(car: Vehicle) -> None:
         changed = eqx.tree_at(where, car, (c_rr, values, ratios))
         return jnp.sum(changed.energy(with_shares(log, shares))) / len(log)
 
-    given = (car.effect("rolling").c_rr, car.driveline.efficiency.values, car.driveline.gear_ratios, shares)
-    check_grads(energy, tuple(map(jnp.asarray, given)), order=1, modes=("fwd", "rev"), eps=1e-6, rtol=2e-4, atol=1e-4)
-    by_share = jax.grad(energy, 3)(*given)
+    numbers = (car.effect("rolling").c_rr, car.driveline.efficiency.values, car.driveline.gear_ratios, shares)
+    given = tuple(map(jnp.asarray, numbers))
+    rng = np.random.default_rng(0)
+    direction = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in given)
+    reverse = jax.jit(jax.value_and_grad(lambda g: energy(*g)))
+    jvp = jax.jit(lambda g, d: jax.jvp(energy, g, d)[1])
+    _, gradient = reverse(given)
+    for k, along in enumerate(direction):
+        # by one kind of number at a time, as they are of different sizes
+        only = tuple(along if j == k else jnp.zeros_like(x) for j, x in enumerate(given))
+        forward = jvp(given, only)
+        np.testing.assert_allclose(jnp.sum(gradient[k] * along), forward, rtol=1e-9, atol=1e-9)
+        more, less = (reverse(jax.tree.map(lambda x, d, h=h: x + h * d, given, only))[0] for h in (1e-6, -1e-6))
+        np.testing.assert_allclose((more - less) / 2e-6, forward, rtol=2e-4, atol=1e-4)
+    by_share = gradient[3]
     assert np.all(np.isfinite(by_share))
     assert np.any(np.asarray(by_share) != 0)
 

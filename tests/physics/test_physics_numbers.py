@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import physics_rows as made
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdev_jax import physics
@@ -67,6 +67,7 @@ def energy(x: Any) -> Any:
 slopes = jax.jit(jax.jacfwd(energy))
 
 
+@settings(max_examples=25)
 @given(st.floats(0.003, 0.02), st.floats(1.0, 9.0), st.floats(0.7, 1.0), st.floats(5e3, 4e4), st.sampled_from(range(4)))
 def test_gradients_against_differences(c_rr: float, cda: float, efficiency: float, mass: float, which: int) -> None:
     """By each number, wherever the vehicle is: the sign of no row's force changes over so small a step."""
@@ -137,6 +138,7 @@ def test_a_class_derived_from_an_effect_gets_it_too() -> None:
     assert all(is_strong_float(x) for x in (OfAUserAgain(1).more, OfAUserAgain(1, more=2).more, OfAUserAgain(1).k))
 
 
+@settings(max_examples=40)
 @given(st.one_of(st.integers(-(10**6), 10**6), st.floats(-1e6, 1e6), st.lists(st.floats(-1e6, 1e6), min_size=1)))
 def test_numbers_keep_their_value(x: Any) -> None:
     for given_as in (x, np.asarray(x), jnp.asarray(x)):

@@ -1,6 +1,7 @@
 """The kernel against `reference.py`, and properties of the chain on made-up logs."""
 
 import dataclasses
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -37,7 +38,8 @@ REFERENCED = (
     "part_load",
 )  # fmt: skip
 SEEDS = st.integers(0, 10_000)
-evaluate = eqx.filter_jit(lambda car, log: car.energy(log))
+evaluate = eqx.filter_jit(lambda car, log: car.energy(log))  # of 18 rows in all tests: compiled once
+pull = eqx.filter_jit(lambda car, log: car.force(log))
 
 
 def as_rows(log: Segments) -> list[dict]:
@@ -54,12 +56,14 @@ def parameters(effect_id: str) -> dict[str, Any]:
     return {k: v.values.tolist() if isinstance(v, Grouped) else v.item() for k, v in values.items()}
 
 
-def everything(covers_machine: bool = True, **base: Any) -> Vehicle:
-    return made.baseline(covers_machine=covers_machine, **base).plus(*(made.typical(i) for i in REFERENCED))
+@cache
+def everything() -> Vehicle:
+    return made.baseline(covers_machine=False).plus(*(made.typical(i) for i in REFERENCED))
 
 
-@pytest.mark.parametrize("covers_machine", [True, False])
-@pytest.mark.parametrize("effect_id", [None, *REFERENCED, "all"])
+@pytest.mark.parametrize(
+    ("effect_id", "covers_machine"), [*((i, False) for i in (None, *REFERENCED, "all")), (None, True), ("all", True)]
+)
 def test_equals_the_loop(effect_id: str | None, covers_machine: bool) -> None:
     ids = REFERENCED if effect_id == "all" else [effect_id] if effect_id else []
     car = made.baseline(covers_machine=covers_machine).plus(*(made.typical(i) for i in ids))
@@ -70,7 +74,7 @@ def test_equals_the_loop(effect_id: str | None, covers_machine: bool) -> None:
     np.testing.assert_allclose(car.energy(log), expected, rtol=1e-11, atol=1e-11)
 
 
-@settings(max_examples=30)
+@settings(max_examples=10)
 @given(
     seed=SEEDS,
     dt=st.sampled_from([0.22, 1.0, 8.0]),
@@ -83,7 +87,7 @@ def test_equals_the_loop_on_random_segments(
     seed: int, dt: float, skew: float, lag: float, efficiency: float, mass_scale: float
 ) -> None:
     changed = {"time_skew": {"skew_s": skew}, "grade_lag": {"lag_s": lag}, "mass_scale": {"scale": mass_scale}}
-    car = everything(covers_machine=False, efficiency=efficiency)
+    car = eqx.tree_at(lambda c: c.driveline.efficiency, everything(), np.asarray(efficiency))
     effects = {i: parameters(i) | changed.get(i, {}) for i in REFERENCED}
     for i, values in changed.items():
         effect = dataclasses.replace(car.effect(i), **{k: np.asarray(v) for k, v in values.items()})
@@ -98,12 +102,12 @@ def test_equals_the_loop_on_random_segments(
 # --- properties ----------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(seed=SEEDS, share=st.floats(0.0, 1.0), ends=st.tuples(st.floats(0.002, 0.02), st.floats(0.002, 0.02)))
 def test_linear_in_c_rr_away_from_the_switch(seed: int, share: float, ends: tuple[float, float]) -> None:
     log = road_log(12, seed=seed)
     at = lambda c: np.asarray(evaluate(made.baseline(c_rr=c), log))  # noqa: E731
-    force = lambda c: np.asarray(made.baseline(c_rr=c).force(log))  # noqa: E731
+    force = lambda c: np.asarray(pull(made.baseline(c_rr=c), log))  # noqa: E731
     same_side = force(ends[0]) * force(ends[1]) > 0
     mixed = at((1 - share) * ends[0] + share * ends[1])
     expected = (1 - share) * at(ends[0]) + share * at(ends[1])
@@ -111,36 +115,37 @@ def test_linear_in_c_rr_away_from_the_switch(seed: int, share: float, ends: tupl
     assert np.sum(same_side) > 5
 
 
-@settings(max_examples=15)
+@settings(max_examples=5)
 @given(seed=SEEDS)
 def test_additive_over_trips(seed: int) -> None:
-    """A log of two trips has the energies of the trips by themselves: nothing leaks from one into the other."""
-    car, one, two = everything(), road_log(9, seed=seed), road_log(9, seed=seed + 1)
-    both = np.r_[evaluate(car, one), evaluate(car, two)]
-    np.testing.assert_allclose(evaluate(car, made.join(one, two)), both, rtol=1e-11, atol=1e-11)
+    """A trip has the same energies before one trip and after another: nothing leaks from one into the other."""
+    car, one, two, three = everything(), *(road_log(9, seed=seed + k) for k in range(3))
+    before, after = (np.asarray(evaluate(car, made.join(*logs))) for logs in ((one, two), (three, one)))
+    np.testing.assert_allclose(before[:9], after[9:], rtol=1e-11, atol=1e-11)
 
 
-@settings(max_examples=15)
-@given(seed=SEEDS, order=st.permutations(range(4)))
+@settings(max_examples=6)
+@given(seed=SEEDS, order=st.permutations(range(3)))
 def test_permuting_trips_permutes_energies(seed: int, order: list[int]) -> None:
     """Whole trips in another order, with the ids they had or with new ones."""
-    car, log = everything(), road_log(5, 5, 5, 5, seed=seed)
-    index = np.concatenate([np.arange(5 * k, 5 * k + 5) for k in order])
+    car, log = everything(), road_log(6, 6, 6, seed=seed)
+    index = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in order])
     moved = log.take(index)
     expected = np.asarray(evaluate(car, log))[index]
     np.testing.assert_allclose(evaluate(car, moved), expected, rtol=1e-11, atol=1e-11)
-    renamed = eqx.tree_at(lambda s: s.trip, moved, np.repeat(np.arange(4), 5))
+    renamed = eqx.tree_at(lambda s: s.trip, moved, np.repeat(np.arange(3), 6))
     np.testing.assert_allclose(evaluate(car, renamed), expected, rtol=1e-11, atol=1e-11)
 
 
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(seed=SEEDS, fill=st.floats(-1e3, 1e3))
 def test_padding_changes_no_other_row(seed: int, fill: float) -> None:
     """Rows past the log, in a trip of their own, with anything in their channels."""
-    car, log = everything(), road_log(9, 4, seed=seed)
-    padded = jax.tree.map(lambda x: np.r_[x, np.repeat(x[-1:], 5)], log)
-    padded = padded.with_channels(**{k: np.r_[v[:13], np.full(5, fill)] for k, v in padded.channels.items()})
+    car, log = everything(), road_log(6, 3, seed=seed)
+    padded = jax.tree.map(lambda x: np.r_[x, np.repeat(x[-1:], 9)], log)
+    padded = padded.with_channels(**{k: np.r_[v[:9], np.full(9, fill)] for k, v in padded.channels.items()})
     padded = eqx.tree_at(
-        lambda s: (s.trip, s.distance_m), padded, (np.r_[log.trip, np.full(5, 2)], np.r_[log.distance_m, np.zeros(5)])
+        lambda s: (s.trip, s.distance_m), padded, (np.r_[log.trip, np.full(9, 2)], np.r_[log.distance_m, np.zeros(9)])
     )
-    np.testing.assert_allclose(evaluate(car, padded)[:13], evaluate(car, log), rtol=1e-11, atol=1e-11)
+    followed = evaluate(car, made.join(log, road_log(9, seed=seed + 1)))
+    np.testing.assert_allclose(evaluate(car, padded)[:9], followed[:9], rtol=1e-11, atol=1e-11)

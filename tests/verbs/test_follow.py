@@ -4,13 +4,14 @@ import contextlib
 import gzip
 import io
 import json
-import subprocess
+import os
 import sys
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from hdev_jax import cli
 from hdev_jax.errors import InputError
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
@@ -291,13 +292,17 @@ def test_an_effect_that_the_sheet_lacks_is_told_once(monkeypatch, capsys):
     assert [a["alarm"]["effect"] for a in alarms] == ["standstill_load"]
 
 
-def test_from_a_pipe(frame, tmp_path):
+def test_from_a_pipe(frame, tmp_path, monkeypatch, capsys):
     sheet = tmp_path / "truck.toml"
     sheet.write_text(augmented_sheet(Sheet(**SHEET), {}, {}))
-    command = [sys.executable, "-m", "hdev_jax.cli", "follow", "--vehicle", str(sheet), "--no-watch"]
-    done = subprocess.run(command, input=text(frame), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert sum(line.startswith("T0") for line in done.stdout.splitlines()) == 120
-    assert "120 rows, 120 used, 2 trips" in done.stdout
+    read, write = os.pipe()
+    with open(read) as ours:
+        with open(write, "w") as theirs:
+            theirs.write(text(frame))  # it holds as much
+        monkeypatch.setattr(sys, "stdin", ours)
+        assert cli.main(["follow", "--vehicle", str(sheet), "--no-watch"]) == 0
+    said = capsys.readouterr().out
+    assert sum(line.startswith("T0") for line in said.splitlines()) == 120
+    assert "120 rows, 120 used, 2 trips" in said
     with pytest.raises(InputError, match="--target traction_force_n: the rows do not measure it; they have "):
         told(text(frame), target="traction_force_n")

@@ -15,7 +15,8 @@ from hdev_jax.verbs.init import init
 
 
 def log_of(folder, **options):
-    return synthetic_log(seed=3, **{"trips": 4, "rows_per_trip": 200} | options).write(folder, truth=False)["log"]
+    rows = 181 if options.get("mode") == "samples" else 180  # as many intervals: what is compiled is shared
+    return synthetic_log(seed=3, trips=4, rows_per_trip=rows, **options).write(folder, truth=False)["log"]
 
 
 def rare_gear(frame):
@@ -33,9 +34,9 @@ CHANGES = {
     "a rare gear": rare_gear,
     "no mass, no slope": lambda f: f.drop(columns=["mass_kg", "grade_rad", "altitude_m"]),
 }
-ROAD = [({}, "as it is"), ({"mode": "samples"}, "as it is"), ({"mode": "samples"}, "no mass, no slope")]
-WHEEL = [({"entry": "wheel", "mode": "samples"}, "as it is")]
-SHAFT = [({"entry": "shaft", "mode": "samples"}, change) for change in CHANGES]
+ROAD = [({}, "as it is"), ({"mode": "samples"}, "no mass, no slope")]
+WHEEL = [({"entry": "wheel", "mode": "samples"}, "no mass, no slope")]
+SHAFT = [({"entry": "shaft", "mode": "samples"}, change) for change in CHANGES if change != "no mass, no slope"]
 
 
 @pytest.mark.parametrize(("options", "change"), [*ROAD, *WHEEL, *SHAFT])

@@ -1,6 +1,7 @@
 """From Python: a frame and a sheet in, an answer with frames, figures and a report out; no folder is needed."""
 
 import pickle
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import matplotlib.figure
@@ -10,11 +11,16 @@ import pytest
 
 import hdev_jax
 from hdev_jax.errors import InputError
-from hdev_jax.fleet import demo_log
+from hdev_jax.fleet import synthetic_log
 from hdev_jax.physics import Aero, Driveline, Effect, Size
 from hdev_jax.verbs.demo import demo
 
 ONLY = ["headwind", "auxiliary_power"]
+# Columns that are enough: each one more is one more panel of a page and one more that what is left may depend on.
+COLUMNS = [
+    "vehicle_id", "trip_id", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "mass_kg",
+    "grade_rad", "altitude_m", "ambient_temp_c", "wind_speed_mps", "wind_from_rad", "heading_rad", "gear", "energy_wh",
+]  # fmt: skip
 
 
 class Nothing(Effect):
@@ -32,29 +38,15 @@ class Nothing(Effect):
 
 @pytest.fixture(scope="module")
 def log():
-    """The demo's log (synthetic) with its sheet's path."""
-    return demo_log(3, trips=8)
+    """A log (synthetic) of which the sheet lacks the wind."""
+    effects = {"headwind": {"scale": 0.98}}
+    log = synthetic_log(seed=3, trips=9, rows_per_trip=80, effects=effects, noise_level=0.02)
+    return replace(log, frame=log.frame[COLUMNS])
 
 
 @pytest.fixture(scope="module")
 def sheet(log, tmp_path_factory):
     return hdev_jax.read_sheet(log.write(tmp_path_factory.mktemp("log"), truth=False)["sheet"])
-
-
-@pytest.fixture(scope="module")
-def found(log, sheet):
-    return hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing])
-
-
-def test_a_frame_and_a_sheet_are_enough(found):
-    assert repr(found).startswith("Diagnosis(headwind; test RMSE ")
-    assert "headwind (scale" in str(found)
-    assert found.after["rmse"] < found.before["rmse"]
-    (row,) = found.effects.to_dict("records")
-    assert row["effect"] == "headwind"
-    assert row["low"] < row["value"] < row["high"]
-    assert found.unexplained["significant"] is False
-    assert {"id": "nothing_at_all", "why": "not in --only"} in found.summary["excluded"]
 
 
 class Box(Effect):
@@ -71,22 +63,43 @@ class Box(Effect):
         return self.share * car.drag(row) * row.speed_mps**2 * row.channels["roof_box"]
 
 
-def test_an_effect_of_ones_own_is_found_beside_a_sheet_that_was_read_before(log, sheet):
+@pytest.fixture(scope="module")
+def frame(log):
+    """The log's table, with a box on the roof in every other trip."""
     frame = log.frame.assign(roof_box=(log.frame["trip_id"].astype("category").cat.codes % 2).astype(float))
     segments = hdev_jax.Log.from_frame(frame).segments
     car = hdev_jax.Vehicle([Aero(5.6)], mass_kg=1.0, driveline=Driveline(0.91))
     frame["energy_wh"] += np.asarray(car.plus(Box(0.4)).energy(segments) - car.energy(segments))
-    found = hdev_jax.diagnose(frame, sheet, only=["box", *ONLY], effects=[Box])
-    assert {e["id"] for e in found.summary["effects"]} >= {"box"}
+    return frame
+
+
+OPTIONS: dict[str, Any] = {"only": ["box", *ONLY], "effects": [Nothing, Box]}
+
+
+@pytest.fixture(scope="module")
+def found(frame, sheet):
+    """An effect of one's own is sought beside a sheet that was read before."""
+    return hdev_jax.diagnose(frame, sheet, **OPTIONS)
+
+
+def test_a_frame_and_a_sheet_are_enough(found):
+    assert repr(found).startswith("Diagnosis(headwind, box; test RMSE ")
+    assert "headwind (scale" in str(found)
+    assert found.after["rmse"] < found.before["rmse"]
+    assert list(found.effects["effect"]) == ["headwind", "box"]
+    for row in found.effects.to_dict("records"):
+        assert row["low"] < row["value"] < row["high"]
+    assert found.unexplained["significant"] is False
+    assert {"id": "nothing_at_all", "why": "not in --only"} in found.summary["excluded"]
     assert "[effects.box]" in found.sheet
 
 
-def test_the_residual_is_a_frame_as_long_as_the_log(found, log):
-    frame = found.residual
-    assert len(frame) == len(log.frame)
-    assert list(frame["trip_id"]) == list(log.frame["trip_id"])
-    np.testing.assert_allclose(frame["measured"], log.frame["energy_wh"])
-    test = frame[frame["test"]]
+def test_the_residual_is_a_frame_as_long_as_the_log(found, frame):
+    residual = found.residual
+    assert len(residual) == len(frame)
+    assert list(residual["trip_id"]) == list(frame["trip_id"])
+    np.testing.assert_allclose(residual["measured"], frame["energy_wh"])
+    test = residual[residual["test"]]
     assert np.sqrt(np.mean(test["residual_after"] ** 2)) == pytest.approx(found.after["rmse"])
 
 
@@ -102,30 +115,26 @@ def test_the_report_is_one_page_or_a_folder(found, tmp_path):
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["page.html"]
 
 
-def test_a_folder_gives_the_same_result_again(found, log, sheet, tmp_path, monkeypatch):
-    first = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
+def test_a_folder_gives_the_same_result_again_and_predicts_as_the_result(found, frame, sheet, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    first = hdev_jax.diagnose(frame, sheet, **OPTIONS, out=out)
     monkeypatch.setattr("hdev_jax.verbs.diagnose.run_method", lambda *a, **k: pytest.fail("it ran again"))
-    again = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
-    assert str(again) == str(first) == f"{found}\n{tmp_path / 'out' / 'report.html'}"
+    again = hdev_jax.diagnose(frame, sheet, **OPTIONS, out=out)
+    assert str(again) == str(first) == f"{found}\n{out / 'report.html'}"
     pd.testing.assert_frame_equal(again.residual, found.residual)
     assert again.effects.equals(found.effects)
     assert again.sheet == found.sheet
-    (tmp_path / "out" / "data.npz").write_bytes(b"nothing")
-    broken = hdev_jax.diagnose(log.frame, sheet, only=ONLY, effects=[Nothing], out=tmp_path / "out")
-    with pytest.raises(InputError, match=r"data\.npz: cannot be read"):
-        _ = broken.residual
-
-
-def test_a_result_predicts_as_its_folder_does(found, log, sheet, tmp_path):
-    out = tmp_path / "out"
-    hdev_jax.diagnose(log.frame, sheet, only=ONLY, out=out)
-    here = hdev_jax.predict(log.frame, found)
-    there = hdev_jax.predict(log.frame, out / "augmented_vehicle.toml")
+    here = hdev_jax.predict(frame, found, effects=[Box])
+    there = hdev_jax.predict(frame, out / "augmented_vehicle.toml", effects=[Box])
     pd.testing.assert_frame_equal(here.rows, there.rows)
     assert str(here) == str(there)
-    inside = (here.rows["lower"] < log.frame["energy_wh"]) & (log.frame["energy_wh"] < here.rows["upper"])
+    inside = (here.rows["lower"] < frame["energy_wh"]) & (frame["energy_wh"] < here.rows["upper"])
     assert 0.85 < inside.mean() < 0.97
     assert "cross-validation over the fit's training trips" in str(here)
+    (out / "data.npz").write_bytes(b"nothing")
+    broken = hdev_jax.diagnose(frame, sheet, **OPTIONS, out=out)
+    with pytest.raises(InputError, match=r"data\.npz: cannot be read"):
+        _ = broken.residual
 
 
 def test_a_result_is_pickled_with_its_rows(found):
@@ -134,12 +143,12 @@ def test_a_result_is_pickled_with_its_rows(found):
     pd.testing.assert_frame_equal(again.residual, found.residual)
 
 
-def test_a_class_that_stands_in_no_file_is_tried_but_kept_in_no_folder(log, sheet, tmp_path):
-    made = type("Typed", (Nothing,), {"__module__": "nowhere", "id": "typed"})
-    options = {"only": ["auxiliary_power"], "effects": [made]}
-    assert hdev_jax.diagnose(log.frame, sheet, **options).summary["excluded"]
+TYPED: Any = type("Typed", (Nothing,), {"__module__": "nowhere", "id": "typed"})
+
+
+def test_a_class_that_stands_in_no_file_is_kept_in_no_folder(log, sheet, tmp_path):
     with pytest.raises(InputError, match="put the class in a file"):
-        hdev_jax.diagnose(log.frame, sheet, **options, out=tmp_path / "out")
+        hdev_jax.diagnose(log.frame, sheet, only=["auxiliary_power"], effects=[TYPED], out=tmp_path / "out")
 
 
 def test_another_efficiency_map_is_another_run(log, tmp_path):
@@ -193,16 +202,18 @@ def test_what_is_no_log_or_effect_is_said(sheet, log):
         hdev_jax.diagnose(log.frame.drop(columns="speed_start_mps"), sheet)
 
 
-def test_arguments_are_taken_as_people_write_them(found, log):
-    """A sheet's sections as a mapping, one name as text, trips by number."""
+def test_arguments_are_taken_as_people_write_them(log):
+    """A sheet's sections as a mapping, one name as text, trips by number, a class that stands in no file."""
     frame = log.frame.assign(trip_id=log.frame["trip_id"].astype("category").cat.codes + 1)
     sheet = {
         "mass_kg": 24e3,
         "road": {"c_rr": (0.006, 0.0008), "cda_m2": (5.6, 0.5)},
         "driveline": {"efficiency": 0.91},
     }
-    result = hdev_jax.diagnose(frame, sheet, only="headwind, auxiliary_power", test_trips=[3, 6])
-    assert result.summary["split"]["test_trips"] == ["3", "6"]
+    options: dict[str, Any] = {"only": "headwind, auxiliary_power", "test_trips": [3, 6, 9], "effects": [TYPED]}
+    result = hdev_jax.diagnose(frame, sheet, **options)
+    assert result.summary["split"]["test_trips"] == ["3", "6", "9"]
+    assert {"id": "typed", "why": "not in --only"} in result.summary["excluded"]
     assert [e["id"] for e in result.summary["effects"]] == ["headwind"]
 
 
@@ -232,13 +243,12 @@ def test_a_list_of_frames_is_refused_in_one_line(log, sheet):
         hdev_jax.diagnose([log.frame, log.frame], sheet)
 
 
-def test_a_fleet_in_memory_is_diagnosed_by_its_frame(tmp_path):
-    fleet = hdev_jax.simulate({"seed": 1, "routes": 8, "variants": ["A"], "segments_per_route": 40})
+def test_a_fleet_in_memory_is_read_by_its_frame(tmp_path):
+    fleet = hdev_jax.simulate({"seed": 1, "routes": 2, "variants": ["A"], "segments_per_route": 40})
     frame, sheet = fleet["A"].frame, fleet.write_sheets(tmp_path)["A"]
     log = hdev_jax.Log.from_frame(frame)
-    assert len(log.trip_names) == 8
+    assert len(log.trip_names) == 2
     np.testing.assert_allclose(log.segments.distance_m, fleet["A"].segments.distance_m)
-    result = hdev_jax.diagnose(frame, sheet, only=["headwind"])
-    assert result.summary["before"]["train"]["n"] > 0
+    assert len(hdev_jax.predict(frame, sheet).rows) == len(frame)
     with pytest.raises(InputError, match="path of a TOML file"):
         hdev_jax.simulate({"seed": 1}, out=tmp_path / "out")  # pyright: ignore

@@ -14,15 +14,27 @@ SHEET = {
 }
 
 
+def coasting() -> list[float]:
+    """Speed of a car in each second in which the drive does nothing."""
+    v = [40.0]
+    while v[-1] > 8.0:
+        force = 1500.0 * 9.80665 * 0.012 + 0.5 * 1.225 * 0.65 * v[-1] ** 2
+        v.append(v[-1] - force / 1500.0)
+    return v
+
+
+ROWS = len(coasting())  # of each trip: what is compiled is shared
+
+
 def trips(sign: float = 1.0) -> pd.DataFrame:
     """Three trips of a car by the equation of motion."""
     rng = np.random.default_rng(5)
     parts = []
     for name in ("a", "b", "c"):
-        v = np.abs(14.0 + np.cumsum(rng.normal(0.0, 0.5, 600)))
+        v = np.abs(14.0 + np.cumsum(rng.normal(0.0, 0.5, ROWS)))
         force = 1800.0 * np.gradient(v) + 1800.0 * 9.80665 * 0.011 + 0.5 * 1.225 * 0.62 * v**2
-        power = np.where(force > 0, force * v / 0.88, force * v * 0.88) + 600.0 + rng.normal(0.0, 100.0, 600)
-        frame = {"trip_id": name, "time_s": np.arange(600.0), "speed_mps": v, "battery_power_w": sign * power}
+        power = np.where(force > 0, force * v / 0.88, force * v * 0.88) + 600.0 + rng.normal(0.0, 100.0, ROWS)
+        frame = {"trip_id": name, "time_s": np.arange(float(ROWS)), "speed_mps": v, "battery_power_w": sign * power}
         parts.append(pd.DataFrame(frame))
     return pd.concat(parts, ignore_index=True)
 
@@ -54,10 +66,7 @@ def test_a_calibration_says_what_is_suspected():
 
 def test_a_coast_down_is_calibrated_and_not_searched():
     """The drive does nothing: its road load is what there is to find."""
-    v = [40.0]
-    while v[-1] > 8.0:
-        force = 1500.0 * 9.80665 * 0.012 + 0.5 * 1.225 * 0.65 * v[-1] ** 2
-        v.append(v[-1] - force / 1500.0)
+    v = coasting()
     one = {"time_s": np.arange(float(len(v))), "speed_mps": v, "traction_force_n": 0.0}
     log = pd.concat([pd.DataFrame({"trip_id": name, **one}) for name in ("a", "b", "c")], ignore_index=True)
     sheet = {"mass_kg": 1500.0, "road": {"c_rr": (0.02, 0.008), "cda_m2": (0.9, 0.3)}}
