@@ -172,12 +172,21 @@ def train(
 def _resumed(checkpoint: Path, state: Any) -> Any:
     try:
         with checkpoint.open("rb") as file:  # of a path Equinox would add an ending to a name that has none
-            return eqx.tree_deserialise_leaves(file, state)
+            return jax.tree.map(_as_weak, eqx.tree_deserialise_leaves(file, state), state)
     except (RuntimeError, ValueError, EOFError, OSError) as e:
         why = str(e).strip().partition("\n")[0]
         raise InputError(
             f"{checkpoint}: not a checkpoint of this training ({why}); delete it, or train as it was begun"
         ) from e
+
+
+def _as_weak(read: Any, began: Any) -> Any:
+    """What was read, weakly typed if it began so, as Python's numbers are: a file does not say it, and a counter that
+    has a type of its own makes float64 of the float32 that it meets."""
+    if not getattr(began, "weak_type", False):
+        return read
+    each = [jnp.asarray(x) for x in np.ravel(read).tolist()]
+    return jnp.stack(each).reshape(np.shape(read))
 
 
 def _finite(of: Callable[[np.ndarray], Any], x: np.ndarray) -> float:

@@ -162,11 +162,8 @@ def needs_data(path: Path) -> bool:
     return path.parent.name == "paper2" or resolve(path).get("data") == "ztbus"
 
 
-def parameters(paths, slow=()):
-    def marks(path):
-        return [pytest.mark.data] * needs_data(path) + [pytest.mark.slow] * (artefact(path) in slow)
-
-    return [pytest.param(p, id=artefact(p), marks=marks(p)) for p in paths]
+def parameters(paths):
+    return [pytest.param(p, id=artefact(p), marks=[pytest.mark.data] if needs_data(p) else []) for p in paths]
 
 
 @pytest.mark.parametrize("path", parameters(every_config()))
@@ -187,11 +184,6 @@ RUN = (
     "paper2/input_accelerator_pedal", "paper2/online", "studies/coverage", "studies/linearity", "studies/many",
     "studies/maps", "studies/mass", "studies/ranks", "studies/switching", "studies/simulators",
     "studies/while_driving", "studies/instruments", "studies/watch_months", "studies/energy_study",
-)  # fmt: skip
-
-SLOW = (
-    "paper1/fig5", "paper1/table1", "studies/energy_study", "studies/instruments", "studies/maps", "studies/ranks",
-    "studies/while_driving",
 )  # fmt: skip
 
 
@@ -221,7 +213,8 @@ SMALLER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("path", parameters((CONFIGS / f"{name}.toml" for name in RUN), SLOW))
+@pytest.mark.slow
+@pytest.mark.parametrize("path", parameters(CONFIGS / f"{name}.toml" for name in RUN))
 def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept, monkeypatch):
     if path.stem == "simulators":
         pytest.importorskip("fastsim", reason="fastsim is in the extra truth")

@@ -257,6 +257,7 @@ def rms_of_cells(seen, rows, energy):
     return float(np.sqrt(np.mean([np.mean(error[cell == c]) ** 2 for c in often]))), found
 
 
+@pytest.mark.slow
 def test_readings_are_not_taken_for_exact(monkeypatch):
     rows = jax.tree.map(jnp.asarray, log(6000))
     energy, errors = np.asarray(car(true_map()).energy(rows)), 8e-3 * np.random.default_rng(1).normal(size=len(rows))

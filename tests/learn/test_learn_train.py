@@ -71,6 +71,14 @@ class KilledError(Exception):
     pass
 
 
+def kill_at(last: int) -> Any:
+    def tell(epoch: int, loss: float, score: float) -> None:
+        if epoch == last:
+            raise KilledError
+
+    return tell
+
+
 # the same objects, so that what is compiled of them is shared
 SGD = optax.sgd(0.05)
 NOISY = Line(noise=0.2)
@@ -117,6 +125,29 @@ def test_a_run_that_is_resumed_gives_the_same_numbers_to_the_last_bit(tmp_path):
     with pytest.raises(InputError, match=r"run\.eqx") as e:
         train(Line(), *start(), rows(), optax.adam(0.1), Plan(epochs=5), key=KEY, checkpoint=tmp_path / "run.eqx")
     assert "\n" not in str(e.value)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Least squares that counts its batches from Python's 0, as the means of a normalised network do."""
+
+    def loss(self, weights: Any, memory: Any, batch: Any, key: Any, settings: Any) -> Any:
+        share = 1.0 - 0.9 ** (memory + 1)
+        return jnp.mean((share * (batch["x"] @ weights) - batch["y"]) ** 2), memory + 1
+
+
+def test_a_counter_without_a_type_of_its_own_is_resumed_without_one(tmp_path):
+    make = lambda epochs, **more: train(  # noqa: E731
+        Counted(), start()[0], jnp.asarray(0), rows(), SGD, Plan(epochs=epochs, batch=7), key=KEY, **more
+    )
+    whole = make(6)
+    stopped = {"checkpoint": tmp_path / "run.eqx", "every": 3}
+    with pytest.raises(KilledError):
+        make(6, **stopped, tell=kill_at(3))
+    again = make(6, **stopped)
+    np.testing.assert_array_equal(whole.weights, again.weights)
+    assert again.memory == whole.memory == 30
+    assert again.memory.weak_type
 
 
 def test_a_loss_that_is_not_finite_names_epoch_batch_and_rows():
