@@ -23,7 +23,7 @@ paper: $(READY)
 	@$(PY) -m experiments configs/paper.toml --out out/paper --workers 0 $(ARGS)
 
 # One thread for each of the processes that run tests side by side: threads that wait for each other's cores take longer
-# than the sums they share. NPROC is XLA's pool.
+# than the sums they share. NPROC is XLA's pool. What takes long is left out: make test ARGS="-m slow".
 test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
 test: export NPROC := 1

@@ -141,7 +141,7 @@ def _plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def _save_noise(self: matplotlib.figure.Figure, to: Any, **options: Any) -> None:
-    kind = options.get("format") or Path(to).suffix.removeprefix(".")
+    kind = options.get("format") or (Path(to).suffix.removeprefix(".") if isinstance(to, str | Path) else "")
     if kind not in _UNDRAWN:
         _savefig(self, to, **options)
     elif isinstance(to, str | Path):

@@ -3,7 +3,6 @@
 import contextlib
 import importlib.util
 import os
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +37,6 @@ __all__ = [
     "library_of",
     "named",
     "opened",
-    "run",
     "training",
 ]
 
@@ -82,13 +80,6 @@ def library_of(ids: Iterable[str]) -> Iterator[None]:
     finally:
         LIBRARY.clear()
         LIBRARY.update(whole)
-
-
-def run(seed: int, **options) -> tuple[SyntheticLog, Outcome]:
-    """Write a short log and its sheet, read them back, and run the whole loop on the default split."""
-    with tempfile.TemporaryDirectory() as folder:
-        synthetic, problem, split = opened(Path(folder), seed=seed, **SHORT | options)
-    return synthetic, diagnosed(problem, split)
 
 
 def diagnosed(problem: Problem, split: Split, library: Mapping[str, type[Effect]] = LIBRARY, **options) -> Outcome:

@@ -203,12 +203,14 @@ def test_a_slope_that_the_log_lacks_is_the_first_suspect(tmp_path):
     def change(frame):
         del frame["grade_rad"], frame["altitude_m"]
 
-    _, problem, split = opened(tmp_path, seed=7302, change=change, mode="samples", rows_per_trip=200, trips=9)
+    options = {"seed": 7302, "mode": "samples", "rows_per_trip": 200, "trips": 9}
+    _, problem, split = opened(tmp_path, change=change, **options)
     summary = diagnosed(problem, split, {}).summary
     assert summary["missing_channels"] == ["grade_rad"]
     assert "slope" in summary["unexplained"]["signature"]
     assert summary["verdict"] == "unexplained_structure"
-    summary = diagnosed(*nothing(), {}).summary
+    (tmp_path / "whole").mkdir()
+    summary = diagnosed(*opened(tmp_path / "whole", **options)[1:], {}).summary
     assert summary["missing_channels"] == []
     assert "slope" not in summary["unexplained"]["signature"]
     assert summary["verdict"] == "nothing_missing"

@@ -149,6 +149,16 @@ def test_what_another_column_takes_over_is_what_a_fit_beside_it_gives_up(own, le
     assert np.all(np.abs(per_unit) > 1e-3)
 
 
+@pytest.mark.parametrize("level", [0.0, 0.8])
+@pytest.mark.parametrize("at", [(0,), (0, 2)])
+def test_draws_of_clusters_are_scored_as_each_alone(level, at):
+    evidence = Rows(level=level).evidence()
+    weights = np.random.default_rng(1).multinomial(9, np.full(9, 1 / 9), size=5).astype(float)
+    alone = [evidence.gain(evidence.totals(w), at)[0] for w in weights]
+    assert np.ptp(alone) > 0.1
+    np.testing.assert_allclose(evidence.gains_of_draws(weights, at), alone, rtol=1e-9)
+
+
 def test_what_is_left_of_a_column():
     """1 − R² of a column on the Jacobian; nothing where it lies in it, all where there is no Jacobian."""
     rows = Rows(level=0.0)

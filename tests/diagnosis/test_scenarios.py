@@ -28,6 +28,7 @@ DRIVE = (
 )  # fmt: skip
 MACHINE = ("copper_loss", "iron_loss", "part_load", "time_skew", "sampling_filter", "power_gain")
 BY_TRIP = ("periodic_load", "mode_change", "auxiliary_power", "standstill_load", "efficiency_scale", "part_load")
+CYCLE = (*BY_TRIP, "switching_load", "second_switching_load")
 LOADS = ("hvac_power", "auxiliary_power", "cabin_warmup", "standstill_load", "battery_resistance", "power_gain")
 HUMID = (*LOADS, "air_density", "wet_road", "passenger_heat", "headwind", "rolling_temperature")
 SHAFT = {"entry": "shaft", "mode": "samples"}
@@ -64,7 +65,7 @@ SCENARIOS = {
     "battery": one(7102, "battery_resistance", "part_load"),
     "machine": one(7101, "copper_loss", library=MACHINE, **SHAFT),
     "sensor": one(7102, "time_skew", "sampling_filter", library=MACHINE, **SHAFT),
-    "cycle": one(7102, "periodic_load", library=BY_TRIP, ratio=0.7),
+    "cycle": one(7102, "periodic_load", library=CYCLE, ratio=0.7),
     "mode": one(7101, "mode_change", library=BY_TRIP, ratio=0.7),
     # one of them on the road, which stands for that stage as well
     "two": Scenario(
@@ -76,6 +77,7 @@ SCENARIOS = {
         ("power_gain",),
         {"ratio": 1.0},
         ("power_gain", "mass_scale", "speed_scale"),
+        library=WHOLE,
     ),
     "outside the library": Scenario(7102, OUTSIDE, (), {"ratio": 1.0}, depends_on="humidity_pct", library=HUMID),
     "levels of trips": Scenario(

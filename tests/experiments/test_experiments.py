@@ -214,6 +214,7 @@ SMALLER = {
 
 
 @pytest.mark.slow
+@pytest.mark.drawn
 @pytest.mark.parametrize("path", parameters(CONFIGS / f"{name}.toml" for name in RUN))
 def test_a_config_runs_at_a_tiny_size(path, tmp_path, kept, monkeypatch):
     if path.stem == "simulators":

@@ -5,7 +5,6 @@ import pytest
 from planted import library_of, opened
 
 from experiments.planted import rivals
-from experiments.planted import scores as scores
 from experiments.planted.oracle import confusable, noise_rmse, oracle_rmse
 from experiments.planted.study import acts_in
 from hdev_jax.inference import calibrate, cluster_rows, padded

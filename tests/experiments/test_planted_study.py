@@ -1,4 +1,4 @@
-"""The study of planted effects: how a log is scored, and that what it compares with is what it says."""
+"""The study of planted effects: how a log is scored."""
 
 from functools import cache
 from pathlib import Path

@@ -26,9 +26,10 @@ from hdev_jax.fleet import (
 )
 
 WAYS = [(entry, mode) for entry in ("road", "shaft", "wheel") for mode in ("segments", "samples")]
-# each effect in the first of the ways that can carry it, and two of them in every way
-_FIRST = {effect: (*way, effect) for way in WAYS[::-1] for effect in plantable(*way)}
-CASES = sorted({*_FIRST.values(), *((*way, effect) for way in WAYS for effect in ("auxiliary_power", "regen_limit"))})
+# each effect in one of the ways that can carry it, in turn, and two of them in every way
+_ABLE = {effect: [way for way in WAYS if effect in plantable(*way)] for way in WAYS for effect in plantable(*way)}
+_ONE = [(*ways[k % len(ways)], effect) for k, (effect, ways) in enumerate(sorted(_ABLE.items()))]
+CASES = sorted({*_ONE, *((*way, effect) for way in WAYS for effect in ("auxiliary_power", "regen_limit"))})
 SMALL = {"seed": 16, "trips": 6, "rows_per_trip": 120}
 
 

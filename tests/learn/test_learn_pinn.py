@@ -1,4 +1,4 @@
-"""The physics-informed network: equation 7 and the likelihood by hand, bounds, vehicles, what is planted is found."""
+"""The physics-informed network: equation 7 and the likelihood by hand, bounds, vehicles."""
 
 from typing import Any
 

@@ -32,6 +32,13 @@ def test_one_trip_of_the_niro(data_dir, trip, has):
     assert log.segments.has("accelerator_pct") == has
 
 
+@pytest.mark.slow
+def test_every_file_of_the_buses_and_the_cars_folder_are_read(data_dir):
+    files = sorted((data_dir / "ztbus").glob("B*.csv.gz"))
+    assert len(read_log(files, ADAPTERS / "ztbus.toml").trip_names) == 24
+    assert read_log(data_dir / "kia_niro", ADAPTERS / "kia_niro.toml").trip_names == ("1", "2", "3", "4")
+
+
 def test_ztbus(data_dir):
     files = sorted((data_dir / "ztbus").glob("B*.csv.gz"))  # companions too, as a shell would pass them
     assert len(files) == 48

@@ -121,14 +121,16 @@ def test_a_process_does_not_keep_the_programs_of_every_vehicle(monkeypatch, maps
     assert [r["programs"] for _, r in done] == programs
 
 
-def test_a_run_that_was_killed_goes_on_and_gives_the_same(logs, whole, monkeypatch):
-    """Each vehicle's record is that of the whole run: here it is what is kept and read again that counts."""
+def test_a_run_that_was_killed_goes_on_with_what_is_left(logs, whole, monkeypatch):
+    """Each vehicle's record is that of the whole run: here it is what is asked, kept and read again that counts."""
     out = logs / "resumed"
-    seen, again = [], []
+    seen, again, asked = [], [], {}
 
     def done(names):
         def computed(_, tasks, __):
+            asked.update({t["name"]: t for t in tasks if t["name"] not in asked})
             for i, task in enumerate(tasks):
+                assert str(asked[task["name"]]) == str(task), "what is resumed is the same task"
                 names.append(task["name"])
                 yield i, json.loads((whole / "vehicles" / f"{task['name']}.json").read_text())
 

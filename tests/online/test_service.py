@@ -344,11 +344,11 @@ def test_where_another_program_listens_the_database_stays_as_it_is(tmp_path, she
     assert fleet.put("a", checked(named(rows[:3], "T1")))["accepted"] == 3
 
 
-def test_killed_while_rows_come_it_loses_and_repeats_none(fleet, rows, sheets, tmp_path, opened):
+def test_killed_while_rows_come_it_loses_and_repeats_none(fleet, rows, sheets, journals, opened):
     """The next start, here in this process, has what the one that was killed had acknowledged."""
     import httpx2 as httpx
 
-    port, place = free_port(), str(tmp_path / "killed.sqlite")
+    port, place = free_port(), str(journals("killed"))
     command = [sys.executable, "-m", "hdev_jax.cli", "serve", "--sheets", str(sheets), "--state", place, "--port",
                str(port), "--no-watch"]  # fmt: skip
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)

@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 import os
+import subprocess
 import sys
 
 import numpy as np
@@ -290,6 +291,16 @@ def test_an_effect_that_the_sheet_lacks_is_told_once(monkeypatch, capsys):
     follow(SHEET, made.to_dict("records"), json=True)
     alarms = [json.loads(line) for line in capsys.readouterr().out.splitlines() if line.startswith('{"alarm"')]
     assert [a["alarm"]["effect"] for a in alarms] == ["standstill_load"]
+
+
+@pytest.mark.slow
+def test_a_process_of_its_own_follows_as_this_one(frame, tmp_path):
+    sheet = tmp_path / "truck.toml"
+    sheet.write_text(augmented_sheet(Sheet(**SHEET), {}, {}))
+    command = [sys.executable, "-m", "hdev_jax.cli", "follow", "--vehicle", str(sheet), "--no-watch"]
+    done = subprocess.run(command, input=text(frame.head(5)), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "5 rows, 5 used, 1 trip" in done.stdout
 
 
 def test_from_a_pipe(frame, tmp_path, monkeypatch, capsys):

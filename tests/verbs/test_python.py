@@ -108,6 +108,7 @@ def test_each_figure_is_drawn(name, found):
     assert isinstance(getattr(found, f"plot_{name}")(), matplotlib.figure.Figure)
 
 
+@pytest.mark.drawn
 def test_the_report_is_one_page_or_a_folder(found, tmp_path):
     page = found.report(tmp_path / "deep" / "page.html")
     assert page.read_text() == found.report(tmp_path / "folder").read_text()

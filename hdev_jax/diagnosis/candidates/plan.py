@@ -81,7 +81,7 @@ def plan_of(
     """Every candidate that a log of these facts allows beside what the vehicle has.
 
     `grids` replaces the grids of parameters by name; `searched` takes effects with a search of their own too. With the
-    `kernel` of a search, its vehicles share the programs, whichever effects were found.
+    `kernel` of a search, which is of the same facts, its vehicles share the programs, whichever effects were found.
     """
     left_out: dict[str, str] = {}
     nulls: list[Effect] = []

@@ -126,9 +126,9 @@ class NormalEquations:
     ) -> Float[np.ndarray, " draw"]:
         """Gain of candidate columns over the base, as `gain`, in each draw, which counts each cluster so many times."""
         plain = np.tensordot(weights, self.grams, axes=1)
-        by_trip = np.swapaxes(weights[:, self.home][..., None] * self.levels, 1, 2)
+        outer, by_trip = self.levels[:, :, None] * self.levels[:, None, :], weights[:, self.home]
         every = range(len(self.variances))
-        grams = np.stack([plain - (by_trip * self._shrink(v)) @ self.levels for v in every], axis=1)
+        grams = np.stack([plain - np.tensordot(by_trip * self._shrink(v), outer, axes=1) for v in every], axis=1)
         with_it, without = (
             np.max(self._fit(grams, x)[0], axis=1)
             for x in (self.base + np.asarray(at, dtype=int), np.empty(0, dtype=int))
