@@ -23,15 +23,16 @@ NOTES = (
     "efficiency, losses by load), or the sheet already declares two efficiencies, or the diagnosis reports "
     "unexplained structure. Right, with one change: an entry or a class of at most three contains it, or the "
     "declared coefficient that absorbs it moves the right way, with a 90 % interval that excludes the sheet's "
-    "value. Right, with no slope in the log: no false name, and the diagnosis reports unexplained structure or that "
+    "value. (Of a class at most three names are printed; a class of more than three counts as its first name alone.) "
+    "Right, with no slope in the log: no false name, and the diagnosis reports unexplained structure or that "
     "the slope is missing",
     "False name: an entry that is neither the change nor the form of the efficiency. (The sheet declares one "
-    "efficiency; FASTSim's depends on load and direction, SUMO's on direction.) In logs whose samples are means of "
-    "the past second, a late slope, a time skew or a filter is not false either. Impossible size: a size or a "
-    "coefficient that no vehicle has",
+    "efficiency, or two where force or torque is measured; FASTSim's depends on load and direction, SUMO's on "
+    "direction.) In logs whose samples are means of the past second, a late slope, a time skew or a filter is not "
+    "false either. Impossible size: a size or a coefficient that no vehicle has",
     "A fit that knows the cause: the kernel with the simulator's true parameters, the change and the form of the "
     "efficiency, calibrated on the same training trips. The ratio of test RMSEs is the median over logs with a slope, "
-    "because that fit knows the slope. Covered: share of 90 % intervals "
+    "because that fit knows the slope (in the table of rivals: over all logs). Covered: share of 90 % intervals "
     "that contain the true size. Coefficients covered: the same for rolling resistance and drag area, whatever was "
     "changed. Segments of 100 m average over what happens within them, for both fits",
     "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
@@ -62,7 +63,10 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     if against:
         write_tables(run, "table_rivals", against, "Rivals on the same logs")
     write_tables(
-        run, "table_said", said_rows(results), "The diagnosis of each log: names with sizes, held-out error [kW]"
+        run,
+        "table_said",
+        said_rows(results),
+        "The diagnosis of each log: names with sizes, held-out error [kW; logs of 100 m: Wh per row]",
     )
     _figure(run, *confusion(results))
     missed = [f"{r['name']} ({r['short_of']})" for r in rows if r["name"] in ("nothing", ANY) and r["short_of"]]
@@ -105,6 +109,7 @@ def _findings(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 LABELS = {"ours": "hdev_jax", "stlsq": "STLSQ (PySINDy)", "lasso_cv": "LassoCV", "lightgbm": "LightGBM"}
 ANY = "any change"
+KNOWS = "a fit that knows the cause"
 UNSHOWN = ("interval_95", "met", "short_of")
 
 
@@ -216,7 +221,7 @@ def said_rows(results: Group) -> list[dict[str, Any]]:
             "log": f"{t['line']}, {t['vehicle']}, seed {t['seed']}", "changed": PLANTS[t["plant"]].words,
             "said": "; ".join([*entries, *told]) or "nothing", "right": scores.right(t, r),
             "unexplained": r["unexplained"],
-            "before": r["test_rmse"]["before"], "after": r["test_rmse"]["after"], "refit": r["refit_rmse"],
+            "before": r["test_rmse"]["before"], "after": r["test_rmse"]["after"], KNOWS: r["refit_rmse"],
         })  # fmt: skip
     return rows
 
