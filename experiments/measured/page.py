@@ -125,7 +125,8 @@ def _short(niro: Runs, folds: Runs, held: Results) -> list[str]:
             out.append(
                 f"- **{what}**: test RMSE {b:.2f} → {a:.2f} kW{within}, pooled over {len(runs)} {each}. {found} "
                 f"In {open_} of {len(runs)} the diagnosis reports structure that no effect explains. In {slow} of "
-                f"{len(runs)} the residual drifts within trips."
+                f"{len(runs)} the residual drifts within trips, which is reported, but does not count as such "
+                "structure."
             )
     for name, r in held.items():
         fold, what = fold_and_what(name)

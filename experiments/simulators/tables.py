@@ -27,9 +27,10 @@ NOTES = (
     "Right, with no slope in the log: no false name, and the diagnosis reports unexplained structure or that "
     "the slope is missing",
     "False name: an entry that is neither the change nor the form of the efficiency. (The sheet declares one "
-    "efficiency, or two where force or torque is measured; FASTSim's depends on load and direction, SUMO's on "
-    "direction.) In logs whose samples are means of the past second, a late slope, a time skew or a filter is not "
-    "false either. Impossible size: a size or a coefficient that no vehicle has",
+    "efficiency, or two where force or torque is measured; of the simulated vehicles, FASTSim's depends on the load "
+    "while driving and is constant while braking, SUMO's is one number for each direction.) In logs whose "
+    "samples are means of the past second, a late slope, a time skew or a filter is not false either. Impossible "
+    "size: a size or a coefficient that no vehicle has",
     "A fit that knows the cause: the kernel with the simulator's true parameters, the change and the form of the "
     "efficiency, calibrated on the same training trips. The ratio of test RMSEs is the median over logs with a slope, "
     "because that fit knows the slope (in the table of rivals: over all logs). Covered: share of 90 % intervals "
