@@ -147,6 +147,7 @@ def test_what_is_on_once_at_the_start_of_each_trip_is_no_load_that_switches():
     assert said[1] is None
 
 
+@pytest.mark.slow
 def test_a_warm_up_beside_a_load_is_no_second_load(tmp_path):
     bare = synthetic_log(
         seed=525001, trips=12, rows_per_trip=190, mode="segments", entry="road", effects={"cabin_warmup": {}},

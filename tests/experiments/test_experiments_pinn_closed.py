@@ -28,6 +28,7 @@ from hdev_jax.physics.road import Headwind
 from hdev_jax.physics.sensors import GradeLag, MassScale, TimeSkew
 from hdev_jax.physics.tyres import RoadSurface, RollingSpeed
 
+pytestmark = pytest.mark.slow
 THRESHOLDS = {"mass_scale": {"scale": 0.0}, "regen_limit": {}, "time_skew": {}}
 
 

@@ -10,6 +10,7 @@ from experiments.planted.study import acts_in
 from hdev_jax.inference import calibrate, cluster_rows, padded
 
 # A part of the library: with few effects it compiles in a fraction of the time.
+pytestmark = pytest.mark.slow
 ROAD = (
     "air_density", "auxiliary_power", "constant_headwind", "cornering", "crosswind", "grade_bias", "headwind",
     "hvac_power", "mass_scale", "mode_change", "periodic_load", "power_gain", "rolling_speed",

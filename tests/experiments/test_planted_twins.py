@@ -17,6 +17,7 @@ from hdev_jax.fleet.truth import power_w
 from hdev_jax.inference import jacobian
 from hdev_jax.physics import LIBRARY, Grouped
 
+pytestmark = pytest.mark.slow
 STUDY = Path(__file__).parents[2] / "configs" / "studies" / "planted.toml"
 ROAD = [effect for (effect,) in typed(Config, resolve(STUDY), STUDY).sets["road"]]
 
