@@ -22,6 +22,9 @@ import PIL.Image
 import pytest
 from jax._src import lru_cache
 from jax._src.interpreters import mlir
+from measured_data import data_dir, pytest_collection_modifyitems, pytest_runtest_makereport
+
+__all__ = ["data_dir", "pytest_collection_modifyitems", "pytest_runtest_makereport"]
 
 # One cache of compiled programs for all test processes and those that they start: the tests compile the same few
 # programs for log after log.
@@ -117,10 +120,6 @@ gc.set_threshold(50_000, 10, 10)
 hypothesis.settings.register_profile("hdev", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("hdev")
 
-DATA = Path(os.environ.get("HDEV_DATA") or Path(__file__).parents[2] / "shared" / "data")
-NO_DATA = f"no measured data in {DATA} (HDEV_DATA)"
-
-
 _savefig = matplotlib.figure.Figure.savefig
 
 
@@ -140,6 +139,13 @@ def _plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
         monkeypatch.setattr(matplotlib.figure.Figure, "savefig", _save_noise)
 
 
+_UNDRAWN: dict[str, Callable[[], bytes]] = {
+    "png": _picture,
+    "svg": lambda: b'<svg xmlns="http://www.w3.org/2000/svg" width="900" height="300"/>',
+    "pdf": lambda: b"%PDF-1.4" + bytes(1000),
+}
+
+
 def _save_noise(self: matplotlib.figure.Figure, to: Any, **options: Any) -> None:
     kind = options.get("format") or (Path(to).suffix.removeprefix(".") if isinstance(to, str | Path) else "")
     if kind not in _UNDRAWN:
@@ -148,35 +154,3 @@ def _save_noise(self: matplotlib.figure.Figure, to: Any, **options: Any) -> None
         Path(to).write_bytes(_UNDRAWN[kind]())
     else:
         to.write(_UNDRAWN[kind]())
-
-
-_UNDRAWN: dict[str, Callable[[], bytes]] = {
-    "png": _picture,
-    "svg": lambda: b'<svg xmlns="http://www.w3.org/2000/svg" width="900" height="300"/>',
-    "pdf": lambda: b"%PDF-1.4" + bytes(1000),
-}
-
-
-@pytest.fixture(scope="session")
-def data_dir() -> Path:
-    """The folder of measured data; the test is skipped where there is none."""
-    if not DATA.is_dir():
-        pytest.skip(NO_DATA)
-    return DATA
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if "data_dir" in getattr(item, "fixturenames", ()):
-            item.add_marker("data")
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item):
-    """In CI, with the measured data there, a test that reads it must run: its skip is a failure."""
-    report = yield
-    skipped = report.skipped and not hasattr(report, "wasxfail")
-    if skipped and "data" in item.keywords and os.environ.get("CI", "").lower() == "true" and DATA.is_dir():
-        report.outcome = "failed"
-        report.longrepr = f"skipped although the measured data is in {DATA}: {report.longrepr}"
-    return report

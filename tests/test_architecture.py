@@ -286,22 +286,9 @@ def test_version_is_the_same_everywhere():
     assert f"\n## {hdev_jax.__version__}" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def of_conftest(*names: str) -> str:
-    """These definitions of tests/conftest.py, and what they import: all of it would load JAX again."""
-    text = (ROOT / "tests" / "conftest.py").read_text(encoding="utf-8")
-    lines, found = text.splitlines(), {}
-    for node in ast.parse(text).body:
-        named = node.targets[0] if isinstance(node, ast.Assign) else node
-        name = getattr(named, "id", None) or getattr(named, "name", None)
-        first = min(n.lineno for n in (node, *getattr(node, "decorator_list", [])))
-        found[name] = "\n".join(lines[first - 1 : node.end_lineno])
-    return "\n".join(["import os", "from pathlib import Path", "import pytest", *(found[name] for name in names)])
-
-
 def test_ci_fails_where_a_test_of_measured_data_is_skipped(pytester, monkeypatch):
     """With the data there, then without it."""
-    hooks = ("pytest_collection_modifyitems", "pytest_runtest_makereport")
-    pytester.makeconftest(of_conftest("DATA", "NO_DATA", "data_dir", *hooks))
+    pytester.makeconftest((ROOT / "tests" / "measured_data.py").read_text(encoding="utf-8"))
     pytester.makeini("[pytest]\nmarkers = data: reads measured data")
     pytester.makepyfile(
         """

@@ -60,7 +60,7 @@ def leaf_of(vehicle: Vehicle, path: str) -> Any:
         return getattr(getattr(vehicle, head), rest)
     if head == "effects":
         effect_id, _, field = rest.partition(".")
-        return getattr(Vehicle.effect(vehicle, effect_id), field)  # not bound: Equinox makes a module of each access
+        return getattr(vehicle.effect(effect_id), field)
     raise KeyError(path)
 
 

@@ -186,8 +186,8 @@ def test_a_network_has_what_vehicles_that_resemble_say_in_closed_form():
 
 
 def test_vehicles_of_few_trips_are_alike_where_their_rows_say_nothing():
-    """One or three training trips each and all effects of the fleet but thresholds: alone a vehicle is told as
-    anything, together rows that were not trained on are told better than by the tables. One without a row is told, too.
+    """One or three training trips each and all effects of the fleet but thresholds: alone a vehicle could have any;
+    together they predict rows that were not trained on better than the tables do, as does one without a row.
     """
     effects = {k: v for k, v in config("paper1/table2").effects.items() if k in trainable([k])}
     data = load("fleet", 3, 45, (), 1.0, None, 0, ("B", "tractor_4x2_40t_2speed", "bus_12m_2speed"))

@@ -10,7 +10,7 @@ from hdev_jax.inference import calibrate, cluster_rows, clusters_of, left_out, p
 from hdev_jax.inference.predictive import errors_left_out
 
 TRIPS, ROWS = 6, 80
-WORLDS, NEW = 75, 30  # a noise is told once in a world, and held against many new trips of it
+WORLDS, NEW = 75, 30  # the noise is estimated once in a world, and many new trips of it are compared
 
 
 def trips(count: int, rows: int = ROWS):

@@ -21,14 +21,14 @@ from hdev_jax.many import Workers, computed, vehicle_record
 from hdev_jax.many import workers as workers_module
 from hdev_jax.verbs.many import fleet as verb_module
 
-FEW = ("auxiliary_power", "headwind")
+SEARCHED = ("auxiliary_power", "headwind")
 needs_dask = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs the extra fleet")
 
 
 def hdev(*argv: object) -> tuple[int, str, str]:
     """The command, with few effects to search."""
     out, err = io.StringIO(), io.StringIO()
-    with library_of(FEW), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with library_of(SEARCHED), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = cli.main([str(a) for a in argv])
     assert status != 1, err.getvalue()
     said = [line for line in err.getvalue().splitlines() if line.startswith("hdev: ")]
@@ -161,7 +161,7 @@ def dies_once(mark, known, task):
         os._exit(9)
     if task["name"] == "V1":
         return json.loads((known / "V1.json").read_text())
-    with library_of(FEW):
+    with library_of(SEARCHED):
         return vehicle_record(task)
 
 

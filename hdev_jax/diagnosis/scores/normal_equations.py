@@ -125,10 +125,7 @@ class NormalEquations:
         self, weights: Float[np.ndarray, "draw cluster"], at: Sequence[int]
     ) -> Float[np.ndarray, " draw"]:
         """Gain of candidate columns over the base, as `gain`, in each draw, which counts each cluster so many times."""
-        plain = np.tensordot(weights, self.grams, axes=1)
-        outer, by_trip = self.levels[:, :, None] * self.levels[:, None, :], weights[:, self.home]
-        every = range(len(self.variances))
-        grams = np.stack([plain - np.tensordot(by_trip * self._shrink(v), outer, axes=1) for v in every], axis=1)
+        grams = np.stack([self.totals(w) for w in weights])
         with_it, without = (
             np.max(self._fit(grams, x)[0], axis=1)
             for x in (self.base + np.asarray(at, dtype=int), np.empty(0, dtype=int))
