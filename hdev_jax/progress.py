@@ -11,7 +11,7 @@ with progress.shown():
 import contextlib
 import contextvars
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["busy", "shown", "step", "track"]
 
 T = TypeVar("T")
+EVERY_S = 60.0  # between the lines of a long loop, where there is no terminal
 
 _console: contextvars.ContextVar["tuple[Console, float] | None"] = contextvars.ContextVar("progress", default=None)
 
@@ -58,7 +59,7 @@ def busy(message: str) -> Iterator[None]:
 
 
 def track(items: Iterable[T], message: str, total: int | None = None) -> Iterator[T]:
-    """The items, with a bar on a terminal that goes when they end; elsewhere one line.
+    """The items, with a bar on a terminal that goes when they end; elsewhere a line, and one more a minute at most.
 
     **Arguments:** `total` is the number of items where `len(items)` does not give it.
     """
@@ -71,4 +72,10 @@ def track(items: Iterable[T], message: str, total: int | None = None) -> Iterato
         yield from bar(items, message, total=total, console=state[0], transient=True)
     else:
         step(message)
-        yield from items
+        said = time.monotonic()
+        of = total if total is not None else len(items) if isinstance(items, Sized) else None
+        for done, item in enumerate(items, 1):
+            yield item
+            if time.monotonic() - said > EVERY_S and done != of:
+                said = time.monotonic()
+                step(f"{message}: {done}" + (f" of {of}" if of is not None else ""))

@@ -54,7 +54,7 @@ LEGEND = {  # of each table that is there; the first of every page
         "the RMS of the noise. Noise: white; AR(1) with a coefficient of {ar:g}; AR(1) + white, a fifth of the "
         "variance is white; random intercepts of trips, half of the variance; Student's t, AR(1) with innovations of "
         "3 degrees of freedom; variance by trip, AR(1) whose variance differs by trip. Logs hold energy by road "
-        "segment; logs called shaft hold samples of electric power with the motor's torque and speed",
+        "segment{shaft}",
     ),
     "planted": (
         "Right: the share of logs with the right answer, with Wilson's 95 % interval. If effects of the library were "
@@ -126,14 +126,15 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
     false_figure(run, [(t, r) for t, r in able if not t["effects"]], config.rivals)
     confusion_figure(run, [(t, r) for t, r in able if t["effects"]])
     missed = [f"{worded(r['name'])} ({_short_of(r)})" for r in (*rows, *apart, *sized) if r["met"] is False]
+    wanted = _unexplained_wanted(config, done)
+    said = {"ar": config.ar_coefficient, "unexplained": wanted, "shaft": _shaft(config, done)}
     return {
         "artefact": "studies/planted", "data": "synthetic_log", "synthetic": True, "logs": len(done),
         "rows": [{"name": r["name"], "paper": None, "ours": {k: v for k, v in r.items() if k not in ("name", "paper")}}
                  for r in (*rows, *apart, *sized, *against)],
         "better_than_paper": 0, "of": 0,
         "skipped": skipped, "missed": missed, "findings": _findings(config, done),
-        "notes": [line.format(ar=config.ar_coefficient, unexplained=_unexplained_wanted(config, done))
-                  for table in shown for line in LEGEND.get(table, ())],
+        "notes": [line.format(**said) for table in shown for line in LEGEND.get(table, ())],
     }  # fmt: skip
 
 
@@ -153,6 +154,12 @@ def _unexplained_wanted(config: Config, done: Group) -> str:
     """The further targets of logs with a cause outside the library; empty where there are none."""
     wanted = [w for t, _ in done if (w := config.cases[t["case"]].wanted_unexplained) is not None]
     return f" and, with a cause outside the library, {max(wanted):g} of logs are called unexplained" if wanted else ""
+
+
+def _shaft(config: Config, done: Group) -> str:
+    """What logs called shaft hold, where there are some."""
+    what = "; logs called shaft hold samples of electric power with the motor's torque and speed"
+    return what if any(config.cases[t["case"]].entry == "shaft" for t, _ in done) else ""
 
 
 def _not_compared(groups: Sequence[tuple[str, Group]]) -> str:

@@ -39,8 +39,9 @@ NOTES = (
     "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
     "split braking between motor and friction brakes, so regeneration that is lost is taken from the electric power",
     "Some of these logs were looked at while the method was changed",
-    "Rivals get the declared model's residual and every effect's column. A name is right if it is the change, and "
-    "false if it is neither the change nor the form of the efficiency. LightGBM names nothing",
+    "Rivals get the declared model's residual and every effect's column. *Named* is over the logs whose change is an "
+    "effect of the library, *nothing changed* over the logs without a change, all else over all n. A name is right if "
+    "it is the change, and false if it is neither the change nor the form of the efficiency. LightGBM names nothing",
 )
 
 

@@ -20,7 +20,7 @@ def live_parsers(verbs: Any) -> None:
         description="Read rows from standard input, CSV with a header or JSON lines, in the columns of a log. Each row "
         "is predicted from the rows before it, and then updates the sheet's coefficients.",
         epilog="examples:\n  hdev follow trip.csv --vehicle truck.toml\n"
-        "  tail -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
+        "  tail -n +1 -f trip.csv | hdev follow --vehicle truck.toml --state truck.state\n"
         "  logger | hdev follow --vehicle truck.toml --json > estimates.jsonl\n"
         "  hdev follow --mqtt mqtt://broker.example/trucks/17 --vehicle truck.toml --state truck.state\n\n"
         "The password of a broker is read from HDEV_MQTT_PASSWORD, its user from the address: mqtt://USER@HOST/TOPIC.",

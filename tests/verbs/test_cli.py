@@ -246,6 +246,15 @@ def test_progress_is_silent_in_the_library_and_a_line_a_step_in_a_command(capsys
     assert [line.split("s  ")[1] for line in captured.err.splitlines()] == ["reading [a.csv]", "resampling"]
 
 
+def test_a_long_loop_says_in_a_pipe_how_far_it_is(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY_S", -1.0)
+    with progress.shown():
+        assert list(progress.track("abc", "resampling")) == ["a", "b", "c"]
+        assert list(progress.track(iter("ab"), "reading")) == ["a", "b"]
+    lines = [line.split("s  ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert lines == ["resampling", "resampling: 1 of 3", "resampling: 2 of 3", "reading", "reading: 1", "reading: 2"]
+
+
 def test_the_size_of_a_log_decides_how_it_is_compiled_and_the_users_flags_have_the_last_word(
     api, monkeypatch, tmp_path
 ):

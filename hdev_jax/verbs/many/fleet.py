@@ -136,8 +136,6 @@ def _records(run: Run, each: Sequence[Source], common: Mapping[str, Any], where:
         with atomic_file(at[todo[i].name]) as temporary:
             temporary.write_text(json.dumps(record, allow_nan=False), encoding="utf-8")
         found[todo[i].name] = record
-        if len(found) % 50 == 0:
-            progress.step(f"{len(found)} of {len(each)} vehicles")
     return [found[s.name] for s in each]
 
 
