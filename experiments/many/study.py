@@ -133,7 +133,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             "changed vehicles found": f"{total['found']} of {total['planted']}" if total["planted"] else None,
             "date within a week": total["in_a_week"] if total["planted"] else None,
             "fleets that show the effect": mine["effect_shown"] if kind == "small" else None,
-            "vehicles that name it alone": total["named_alone"] if kind == "small" else None,
+            "vehicles that show it alone": total["named_alone"] if kind == "small" else None,
             "fleets with anything false": mine["fleets_with_anything_false"],
             "others called changed": total["others"], "called different": total["unlike"],
             "fleets with a false effect of a type": mine["fleets_with_a_false_effect"],
@@ -154,8 +154,8 @@ def _findings(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
             yield (f"Of {o['planted']} changed vehicles among {o['vehicles']}, {o['found']} are found, "
                    f"{o['in_a_week']} with the date within a week, and {o['others']} others are named")  # fmt: skip
         elif row["name"] == "small":
-            alone = f"of their {o['vehicles']} vehicles, each diagnosed alone, {o['named_alone']} name it"
+            alone = f"in {o['named_alone']} of their {o['vehicles']} vehicles the vehicle's own diagnosis shows it"
             yield (f"An effect of a tenth of the noise in all vehicles is found in {o['effect_shown']} of {n} fleets; "
-                   f"{alone}; {false}")  # fmt: skip
+                   f"{alone} (adjusted over the fleet); {false}")  # fmt: skip
         else:
             yield f"With nothing planted, {false}"

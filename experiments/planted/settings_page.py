@@ -24,13 +24,16 @@ Counts = tuple[int, int, int]  # logs named as they should be, logs with a false
 _INTRO = """\
 # Settings
 
-Every number that decides what a diagnosis names is a field of `hdev_jax.diagnosis.settings.Settings`. `hdev diagnose`
-sets `--fdr`; from Python, `diagnose(…, settings=Settings(close=0.9))` sets any of them.
+Nearly every number that decides what a diagnosis names is a field of `hdev_jax.diagnosis.settings.Settings`; what a
+cluster is, and a few numbers inside a test, are constants beside the code with their reason. `hdev diagnose --fdr` and
+`hdev_jax.diagnose(…, fdr=…)` set the first. The function behind them takes them all:
+`hdev_jax.diagnosis.diagnose.diagnose(problem, split, library, settings=Settings(close=0.9))`.
 
 Made by `{command}`.
 
 Columns *half* and *double*: the values with which the study of planted effects (synthetic logs) is run again, one
-setting changed at a time. {result} Whole numbers are rounded up; a share or probability is not doubled beyond 1.
+setting changed at a time. {result} Whole numbers are rounded up; a share or probability whose
+double would reach 1 is not doubled.
 
 The study runs all of them, or one:
 

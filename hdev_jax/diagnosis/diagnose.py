@@ -66,7 +66,7 @@ def diagnose(
     """What the declared vehicle lacks. Test trips are held out: nothing is chosen by them, but at the end they may
     contradict the model.
 
-    **Arguments:** `library`, the candidates by id; `settings`, every number that decides; `seed` of placebos,
+    **Arguments:** `library`, the candidates by id; `settings`, the numbers that decide; `seed` of placebos,
     resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
 
     **Returns:** an `Outcome`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.

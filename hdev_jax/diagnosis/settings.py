@@ -1,8 +1,9 @@
-"""Every number that decides what is named: its meaning, its unit, where it comes from.
+"""The numbers that decide what is named: meaning, unit, where they come from.
 
 What half and double of each do to the study of planted effects is in docs/settings.md, which
 `python -m experiments configs/studies/settings.toml` measures. Numbers of computation (rows in a chunk, points of a
-grid, rounds of a search, draws, tolerances of a solver) are not among them.
+grid, rounds of a search, draws, tolerances of a solver), what a cluster is (`hdev_jax/inference/clusters.py`) and which
+rivals a resampled set has (`gates/gates.py`) are not among them.
 """
 
 from dataclasses import dataclass, field, fields

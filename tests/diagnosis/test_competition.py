@@ -200,6 +200,24 @@ def test_the_competition_ends_with_what_is_there(two):
     assert [f.alike for f in classes(score_all(rows, state.fit), state)] == [f.alike for f in state.found]
 
 
+# --- a joint refit ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("power_w", "joins"), [(60.0, False), (400.0, True)])
+def test_a_size_that_is_sure_but_too_small_to_name_does_not_join(tmp_path, power_w, joins):
+    """A load of less than 100 W at standstill is not worth a name, however little noise there is."""
+    options = {"effects": {"standstill_load": {"power_w": power_w}}, "noise_level": 1e-5, "ar_coefficient": 0.0}
+    _, problem, _ = opened(tmp_path, seed=1, trips=8, rows_per_trip=80, **options)
+    rows = training(problem, ["standstill_load"])
+    state = declared(rows, problem)
+    scores = score_all(rows, state.fit)
+    every = next(c for c in scores.source.candidates if c.id == "standstill_load")
+    score = scores.white.score(every)
+    assert score.p < 1e-6
+    assert score.beta[0] == pytest.approx(power_w, rel=0.1)
+    assert (refit(rows, state, score, scores).fit is not None) == joins
+
+
 # --- gears -----------------------------------------------------------------------------------------------------------
 
 
