@@ -82,6 +82,6 @@ def test_shares_of_logs_by_other_simulators_are_those_of_the_page():
         [f"{100 * cell(SIMULATORS, name, column):.1f}" for column in ("false name", "named")]
         for name in ("hdev_jax", "LassoCV", "STLSQ (PySINDy)")
     )
-    said = f"{ours[1]} %, with a false name in {ours[0]} % of all {n + none:.0f} logs, {none:.0f} of them unchanged"
+    said = f"{ours[1]} %; a false name in {ours[0]} % of all {n + none:.0f} logs ({n:.0f} changed, {none:.0f} not)"
     assert f"{said} | LassoCV {lasso[1]} and {lasso[0]} %, STLSQ {stlsq[1]} and {stlsq[0]} % |" in TEXT
     assert f"a false name is given in {false} % of the logs in which one thing was changed" in " ".join(WRONG.split())
