@@ -196,7 +196,7 @@ class FleetSettings:
         "Benjamini and Hochberg, JRSS B 57 (1995)",
     )  # fmt: skip
     least_vehicles: int = _number(
-        4, "least number of vehicles of a type that are compared or pooled", "vehicles",
+        4, "least number of vehicles of a type that are compared, or whose effects are pooled", "vehicles",
         "a variance between vehicles of three degrees of freedom",
     )  # fmt: skip
     least_trips: int = _number(

@@ -8,6 +8,7 @@ import pytest
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
 from hdev_jax.learn.gears.classifiers import Classifier
+from hdev_jax.learn.gears.gears import PLACE
 from hdev_jax.learn.gears.saved import read_gear_model, save_gear_model
 from hdev_jax.online import packed, scan, start
 from hdev_jax.online.live import Live
@@ -97,6 +98,14 @@ def test_a_saved_model_is_the_classifier(folder):
     told = jax.jit(lambda rows: trees.probabilities(rows))(jnp.asarray(x, jnp.float32))
     np.testing.assert_allclose(told, own, rtol=1e-5)
     assert GEAR_PROBABILITY not in trees.features
+
+
+def test_a_file_of_distances_from_a_reference_gear_is_refused_where_it_does_not_say_which(folder, tmp_path):
+    names = (folder / "gears.txt").read_text()
+    learned = next(line for line in names.splitlines() if line.startswith("feature_names="))
+    (tmp_path / "far.txt").write_text(names.replace(learned, f"feature_names={PLACE} a b"))
+    with pytest.raises(InputError, match=f"has the feature '{PLACE}'.*save_gear_model"):
+        read_gear_model(tmp_path / "far.txt")
 
 
 def test_the_fitted_sheet_keeps_its_gear_model(folder, tmp_path):

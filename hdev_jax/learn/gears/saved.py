@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hdev_jax.errors import InputError
 from hdev_jax.learn.gears.classifiers import Classifier
+from hdev_jax.learn.gears.gears import PLACE
 from hdev_jax.learn.trees.files import read_trees
 from hdev_jax.learn.trees.trees import Trees
 
@@ -33,7 +34,8 @@ def save_gear_model(path: str | Path, classifier: Classifier) -> None:
 def read_gear_model(path: str | Path) -> Trees:
     """The trees in a file that `save_gear_model` wrote, or in a model file of LightGBM, XGBoost or CatBoost (JSON).
 
-    The classes of such a model must be the gears from the first up, and its features must have the names of `FEATURES`.
+    The classes of such a model must be the gears from the first up, and its features must have the names of `FEATURES`
+    (not `PLACE`, which makes distances of the classes).
 
     **Raises:** `InputError`, one line, for a file that cannot be read or is neither.
     """
@@ -48,6 +50,11 @@ def read_gear_model(path: str | Path) -> Trees:
         found = read_trees(path)
         if found.link == "identity":
             raise InputError(f"gear model {path}: a regression; a classifier whose classes are gears is expected")
+        if PLACE in found.features:
+            raise InputError(
+                f"gear model {path}: has the feature '{PLACE}', so its classes are distances from the reference gear, "
+                "and this file does not say which; it has to be written with save_gear_model"
+            )
         gears = tuple(float(g + 1) for g in range(len(found.classes)))
         return _named(found, gears, found.features)
     try:
