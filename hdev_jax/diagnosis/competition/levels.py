@@ -11,7 +11,7 @@ from hdev_jax.inference.states import Decoded, StateRows, Switching, errors_alon
 from hdev_jax.physics.states import KNOTS_C
 from hdev_jax.segments import trip_slices
 
-__all__ = ["FIRST_ROUNDS", "LOAD_NUMBERS", "Tested", "besides", "level_test"]
+__all__ = ["FIRST_ROUNDS", "LOAD_NUMBERS", "Tested", "besides", "level_test", "some_rows"]
 
 COARSE_S = (5.0, 15.0, 45.0)  # means over so many seconds have less noise, and blur the switching
 FIRST_ROUNDS = 3  # of expectation-maximisation
@@ -35,7 +35,7 @@ class Tested:
 
 def level_test(rows: StateRows, training: Training, rng: np.random.Generator) -> Tested | None:
     """The load that explains most of these rows, and whether noise of their colour would give as good a one."""
-    rows = _some_rows(rows)
+    rows = some_rows(rows)
     if len(rows.trip) < LEAST_ROWS or np.ptp(rows.residual_w) <= 0 or not np.all(np.isfinite(rows.residual_w)):
         return None
     model, gain = _best(rows)
@@ -50,8 +50,8 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
     return Tested(model, gain, p)
 
 
-def _some_rows(rows: StateRows) -> StateRows:
-    """At most about `MOST_ROWS` rows: the middle of every trip, or of trips evenly spread over the log."""
+def some_rows(rows: StateRows) -> StateRows:
+    """At most about `MOST_ROWS` rows of a log: the middle of every trip, or of trips evenly spread over the log."""
     if len(rows.trip) <= MOST_ROWS:
         return rows
     slices = [s for _, s in trip_slices(rows.trip)]

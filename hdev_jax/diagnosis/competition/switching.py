@@ -15,7 +15,7 @@ from jaxtyping import Float
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.cycle import barred
 from hdev_jax.diagnosis.competition.grid import LEADERS
-from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, LOAD_NUMBERS, Tested, besides, level_test
+from hdev_jax.diagnosis.competition.levels import FIRST_ROUNDS, LOAD_NUMBERS, Tested, besides, level_test, some_rows
 from hdev_jax.diagnosis.competition.refit import fitted, joined, without
 from hdev_jax.diagnosis.competition.state import Found, Hidden, State, Verdict
 from hdev_jax.diagnosis.gates.gates import RESAMPLES
@@ -174,7 +174,7 @@ def _sought(
         if model is not None and held is None and len(tests) == 1:
             starts += besides(model)
         tests.append(last)
-        tried = [fit_switching(m, rows, FIRST_ROUNDS) for m in starts]
+        tried = [fit_switching(m, some_rows(rows), FIRST_ROUNDS) for m in starts]  # as many as the test looks at
         model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
         left = replace(rows, residual_w=rows.residual_w - model.predicted_w(decoded.on))
     if model is None or held is not None:
