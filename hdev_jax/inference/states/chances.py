@@ -31,11 +31,16 @@ PULL = np.pad(SHRINK * (np.eye(KNOTS) - 1.0 / KNOTS), ((1, 0), (1, 0)))  # of me
 
 
 class _Chance(NamedTuple):
-    """Of each row: chance of being on after it by the state before it; and its derivatives, by the logarithm of the
-    memory, the log-odds of the knots and the coefficients."""
+    """Of each row: chance of being on after it by the state before it; its derivatives by the logarithm of the memory
+    and by the log-odds, which are the same from either state; and those of the log-odds by the log-odds of the knots,
+    and by the coefficients."""
 
     on: Float[np.ndarray, "row before"]
-    slopes: Float[np.ndarray, "row before k"]
+    by_memory: Float[np.ndarray, "row before"]
+    by_odds: Float[np.ndarray, " row"]
+    by_share: Float[np.ndarray, " row"]
+    by_knot: Float[np.ndarray, " knot"]
+    columns: Float[np.ndarray, "row covariate"]
 
 
 class _Fitted(NamedTuple):
@@ -63,16 +68,27 @@ class _Moves:
         share = self.hats @ own
         odds = share * np.exp(np.clip(x @ theta[FIRST:], -30.0, 30.0))
         p = (odds / (odds + 1.0 - share))[:, None]
-        by_odds = np.hstack([self.hats * (own * (1.0 - own)) / (share * (1.0 - share))[:, None], x])
         longer = np.where(np.isfinite(over), over, 0.0)[:, None] * keep * (np.array([0.0, 1.0]) - p)
-        slopes = ((1.0 - keep) * p * (1.0 - p) * by_odds)[:, None, :].repeat(2, axis=1)
         on = np.clip((1.0 - keep) * p + keep * np.array([0.0, 1.0]), 1e-9, 1.0 - 1e-9)
-        return _Chance(on, np.concatenate([longer[:, :, None], slopes], axis=2))
+        by_odds = ((1.0 - keep) * p * (1.0 - p))[:, 0]
+        return _Chance(on, longer, by_odds, 1.0 / (share * (1.0 - share)), own * (1.0 - own), x)
 
-    def _scores(self, chance: _Chance) -> Float[np.ndarray, "row k"]:
-        """Derivatives of each row's log-likelihood."""
-        each = self.moved[:, :, 1] / chance.on - self.moved[:, :, 0] / (1.0 - chance.on)
-        return np.einsum("rb,rbk->rk", each, chance.slopes)
+    def _each(self, chance: _Chance) -> Float[np.ndarray, "row before"]:
+        """Derivatives of each row's log-likelihood by its chances of being on."""
+        return self.moved[:, :, 1] / chance.on - self.moved[:, :, 0] / (1.0 - chance.on)
+
+    def _slopes(self, chance: _Chance) -> Float[np.ndarray, "row before k"]:
+        """Derivatives of the chances by all that is fitted."""
+        knots = self.hats * chance.by_share[:, None] * chance.by_knot
+        same = chance.by_odds[:, None] * np.hstack([knots, chance.columns])
+        return np.concatenate([chance.by_memory[:, :, None], same[:, None, :].repeat(2, axis=1)], axis=2)
+
+    def _slope(self, chance: _Chance) -> Float[np.ndarray, " k"]:
+        """Derivatives of the log-likelihood of all rows."""
+        each = self._each(chance)
+        weight = np.sum(each, axis=1) * chance.by_odds
+        knots = (weight * chance.by_share) @ self.hats * chance.by_knot
+        return np.r_[np.sum(each * chance.by_memory), knots, weight @ chance.columns]
 
     def fitted(self, columns: Sequence[int], steps: int = 100) -> _Fitted:
         """The values that suit the moves best, or better than the present ones after so many `steps`."""
@@ -80,7 +96,7 @@ class _Moves:
         def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
             chance, pull = self._chance(theta, columns), PULL @ theta[:FIRST]
             total = np.sum(self.moved[:, :, 1] * np.log(chance.on) + self.moved[:, :, 0] * np.log1p(-chance.on))
-            slope = self._scores(chance).sum(axis=0)
+            slope = self._slope(chance)
             slope[:FIRST] -= pull
             return 0.5 * float(theta[:FIRST] @ pull) - float(total), -slope
 
@@ -95,16 +111,17 @@ class _Moves:
     def p_last(self, fitted: _Fitted, columns: Sequence[int], clusters: Int[np.ndarray, " row"]) -> float:
         """p of the last coefficient, with errors of whole clusters: the jackknife in one step, Student's t."""
         chance = self._chance(fitted.theta, columns)
+        slopes = self._slopes(chance)
         weight = self.moved.sum(axis=2) / (chance.on * (1.0 - chance.on))
         at = np.flatnonzero(np.r_[True, np.diff(clusters) != 0])
         if (n := len(at)) < 3:
             return 1.0
-        grams = np.stack([np.einsum("rb,rbj,rbk->jk", weight[a:b], chance.slopes[a:b], chance.slopes[a:b])
+        grams = np.stack([np.einsum("rb,rbj,rbk->jk", weight[a:b], slopes[a:b], slopes[a:b])
                           for a, b in pairwise([*at, len(clusters)])])  # fmt: skip
         total = grams.sum(axis=0)
         total += 1e-9 * np.trace(total) * np.eye(len(total))
         total[:FIRST, :FIRST] += PULL
-        scores = np.add.reduceat(self._scores(chance), at)
+        scores = np.add.reduceat(np.einsum("rb,rbk->rk", self._each(chance), slopes), at)
         moves = np.linalg.solve(total - (1.0 - 1e-6) * grams, scores[:, :, None])[:, -1, 0]
         error = float(np.sqrt((n - 1) / n * np.sum((moves - moves.mean()) ** 2)))
         naive = float(np.sqrt(np.linalg.inv(total)[-1, -1]))
