@@ -96,12 +96,9 @@ def _jacobian_of(structure: Any, start: np.ndarray, scale: np.ndarray, z: np.nda
 def _linearised(
     vehicle: Vehicle, structure: Any, target: TargetName, segments: Segments, theta: Any
 ) -> tuple[Array, Array]:
-    def column(x: Array) -> tuple[Array, Array]:
-        y = insert(vehicle, structure, x).predict(segments, target)
-        return y, y
-
-    slope, value = jax.jacfwd(column, has_aux=True)(theta)
-    return value, slope
+    """The prediction, and a line of slopes for each of `theta`: without a transposition, as `jax.jacfwd` has one."""
+    value, push = jax.linearize(lambda x: insert(vehicle, structure, x).predict(segments, target), theta)
+    return value, jax.vmap(push)(jnp.eye(len(theta)))
 
 
 def linearised(
@@ -115,10 +112,8 @@ def linearised(
     places = [(c.path, c.group) for c in table.free]
     order = np.array(sorted(range(len(places)), key=lambda k: (places[k][0], places[k][1] or 0)))
     structure = tuple((*places[k], -np.inf, np.inf) for k in order)
-    value, slope = _linearised(vehicle, structure, target, segments, jnp.asarray(at[order]))
-    out = np.empty(slope.shape, slope.dtype)
-    out[:, order] = slope
-    return np.asarray(value), out
+    value, slopes = _linearised(vehicle, structure, target, segments, jnp.asarray(at[order]))
+    return np.asarray(value), np.asarray(slopes)[np.argsort(order)].T
 
 
 Linearise = Callable[..., tuple[np.ndarray, np.ndarray]]  # `linearised`, or what takes and gives the same

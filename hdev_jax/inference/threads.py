@@ -3,7 +3,8 @@
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import cache
 from typing import TypeVar
 
 __all__ = ["side_by_side"]
@@ -17,14 +18,23 @@ Result = TypeVar("Result")
 def side_by_side(work: Callable[[Part], Result], parts: Iterable[Part]) -> Iterator[tuple[Part, Result]]:
     """Each part with what `work` makes of it, in their order; no more than `THREADS` at a time.
 
-    `work` may write nothing that another part's does. What it raises is raised at its part.
+    `work` may write nothing that another part's does, nor call this function. What it raises is raised at its part.
     """
-    with ThreadPoolExecutor(THREADS) as pool:
-        ahead: deque[tuple[Part, Future[Result]]] = deque()
+    pool, ahead = _pool(), deque[tuple[Part, Future[Result]]]()
+    try:
         for part in parts:
             ahead.append((part, pool.submit(work, part)))
             if len(ahead) == THREADS:
                 first, result = ahead.popleft()
                 yield first, result.result()
-        for part, result in ahead:
-            yield part, result.result()
+        while ahead:
+            last, result = ahead.popleft()
+            yield last, result.result()
+    finally:
+        wait([result for _, result in ahead])
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """One for all: the heap that a thread has used is used again by the next part."""
+    return ThreadPoolExecutor(THREADS, "hdev")
