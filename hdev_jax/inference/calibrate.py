@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from hdev_jax.inference.clusters import Clusters, clustered
 from hdev_jax.inference.parameters import ParameterTable, insert
-from hdev_jax.inference.rows import Chunk, Fit, Shapes, by_chunk, chunks_of_fit, padded, padded_rows
+from hdev_jax.inference.rows import Chunk, Fit, Shapes, chunks_of_fit, padded, padded_rows
 from hdev_jax.physics import Vehicle
 from hdev_jax.segments import Segments, trip_slices
 from hdev_jax.targets import TargetName
@@ -157,11 +157,8 @@ class _Problem:
         """The rows linearised at these coefficients."""
         predicted = np.empty(len(self.measured))
         slopes = np.empty((len(self.measured), len(theta)))
-
-        def work(chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
-            return self.linearise(self.vehicle, self.table, chunk.segments, self.target, theta)
-
-        for chunk, (value, slope) in by_chunk(work, self.chunks):
+        for chunk in self.chunks:
+            value, slope = self.linearise(self.vehicle, self.table, chunk.segments, self.target, theta)
             predicted[chunk.at], slopes[chunk.at] = value[: chunk.rows], slope[: chunk.rows]
         return _Point(theta, predicted, slopes)
 

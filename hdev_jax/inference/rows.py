@@ -3,10 +3,9 @@
 What adds up over rows needs no more than a chunk at a time, and every pass over a log runs the same compiled programs.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,30 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hdev_jax.inference.threads import side_by_side
 from hdev_jax.physics import derived
 from hdev_jax.physics.across import FIRST, LAST
 from hdev_jax.segments import Segments, trip_slices
 
-__all__ = [
-    "CHUNK_ROWS",
-    "Chunk",
-    "Fit",
-    "Shapes",
-    "by_chunk",
-    "chunks_of",
-    "chunks_of_fit",
-    "cut",
-    "padded",
-    "padded_rows",
-]
+__all__ = ["CHUNK_ROWS", "Chunk", "Fit", "Shapes", "chunks_of", "chunks_of_fit", "cut", "padded", "padded_rows"]
 
 Real = Float[Array, " row"] | Float[np.ndarray, " row"]
 FEW_ROWS = 4_096
 CHUNK_ROWS = 65_536  # rows at a time: 200 columns of them are 0.1 GB
-LONG_ROWS = 16_384  # rows of a chunk for which a thread is worth its while
-
-Result = TypeVar("Result")
 
 
 class Fit(eqx.Module):
@@ -170,14 +154,3 @@ def chunks_of_fit(rows: Fit, shapes: Shapes) -> Iterable[Chunk]:
     trips = sum(1 for _ in trip_slices(np.asarray(rows.segments.trip)[: rows.rows]))
     whole = jax.tree.map(jnp.asarray, rows.segments)
     return [Chunk(whole, measured, slice(0, rows.rows), 0, trips)]
-
-
-def by_chunk(work: Callable[[Chunk], Result], chunks: Iterable[Chunk]) -> Iterator[tuple[Chunk, Result]]:
-    """Each chunk with what `work` makes of it, in their order; long ones in a few threads, which changes the time
-    alone."""
-    rest = iter(chunks)
-    for first in rest:
-        if len(first.segments) < LONG_ROWS:
-            yield first, work(first)
-        else:
-            yield from side_by_side(work, chain([first], rest))

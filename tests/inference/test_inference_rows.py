@@ -1,15 +1,12 @@
 """Rows as estimators take them: chunks of whole trips in a few shapes, and the clusters of many trips."""
 
-import time
-
 import jax
 import numpy as np
 import pytest
 
 from hdev_jax.inference import clusters_of, padded
 from hdev_jax.inference.clusters import MOST_CLUSTERS
-from hdev_jax.inference.rows import LONG_ROWS, Shapes, by_chunk, chunks_of, cut
-from hdev_jax.inference.threads import THREADS, side_by_side
+from hdev_jax.inference.rows import Shapes, chunks_of, cut
 from hdev_jax.segments import Segments
 
 
@@ -50,41 +47,6 @@ def test_chunks_count_their_rows_anew():
         first = np.asarray(c.segments.channels["derived:first_row_of_trip"])[: c.rows]
         np.testing.assert_array_equal(first, np.repeat([0, 10, 20], 10))
     np.testing.assert_array_equal(np.concatenate([c.measured for c in chunks]), np.arange(90.0))
-
-
-def test_parts_are_worked_on_side_by_side_and_come_in_their_order():
-    """No more of them have begun, or are kept, than threads allow."""
-    begun, taken = [], []
-
-    def work(k):
-        begun.append(k)
-        time.sleep(0.02 if k % 2 == 0 else 0.0)
-        return k * k
-
-    for k, square in side_by_side(work, iter(range(9))):
-        taken.append(k)
-        assert square == k * k
-        assert len(begun) <= len(taken) + THREADS
-    assert taken == list(range(9))
-    assert list(side_by_side(work, [])) == []
-
-
-def test_what_goes_wrong_with_a_part_is_raised_there():
-    came = side_by_side(lambda k: 1 // (2 - k), range(5))
-    assert next(came) == (0, 0)
-    assert next(came) == (1, 1)
-    with pytest.raises(ZeroDivisionError):
-        next(came)
-
-
-@pytest.mark.parametrize("size", [64, LONG_ROWS])
-def test_chunks_short_and_long_come_in_their_order(size):
-    whole = prepared_rows(3 * size, 3)
-    chunks = list(chunks_of(whole, np.arange(3.0 * size), Shapes(3 * size, size, size)))
-    assert len(chunks) == 3
-    came = list(by_chunk(lambda c: float(np.sum(c.measured)), chunks))
-    assert [c for c, _ in came] == chunks
-    assert [total for _, total in came] == [float(np.sum(c.measured)) for c in chunks]
 
 
 def test_many_trips_share_clusters():

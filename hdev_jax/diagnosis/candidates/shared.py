@@ -4,7 +4,6 @@ again for each.)"""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from threading import Lock
 from typing import Any
 
 import jax
@@ -49,7 +48,6 @@ class SharedKernel:
     _sound: dict[TargetName, bool] = field(default_factory=dict, init=False, repr=False)
     _programs: dict[Any, Program] = field(default_factory=dict, init=False, repr=False)
     _results: dict[Any, tuple[Any, Linear]] = field(default_factory=dict, init=False, repr=False)
-    _lock: Lock = field(default_factory=Lock, init=False, repr=False)  # chunks are computed side by side
 
     def program(self, vehicle: Vehicle, *more: Effect, declared: Sequence[Place] = ()) -> Program:
         """The vehicle with every other effect of the library that is part of the kernel, and with `more`."""
@@ -97,17 +95,14 @@ class SharedKernel:
     def _kept(self, key: Any, held: Any, compute: Callable[[], Linear]) -> Linear:
         """What was fitted is scored at the same values, many times. `held`: what `key` has the ids of, so that no
         others get them."""
-        with self._lock:
-            if key in self._results:
-                return self._results[key][1]
-        result = compute()
-        for x in result:
-            x.flags.writeable = False  # the next caller gets the same arrays
-        with self._lock:
+        if key not in self._results:
+            result = compute()
+            for x in result:
+                x.flags.writeable = False  # the next caller gets the same arrays
             self._results[key] = held, result
             while len(self._results) > 1 and sum(x.nbytes for _, r in self._results.values() for x in r) > KEPT_BYTES:
                 self._results.pop(next(iter(self._results)))
-        return result
+        return self._results[key][1]
 
     def predict(self, vehicle: Vehicle, segments: Segments, target: TargetName) -> Float[np.ndarray, " row"]:
         """The prediction on every row, in the target's unit."""

@@ -14,7 +14,6 @@ from hdev_jax.diagnosis.noise.noise import Noise, whiten
 from hdev_jax.diagnosis.scores.evidence import Evidence
 from hdev_jax.inference import Calibration, Chunk, Clusters, linearised
 from hdev_jax.inference.calibrate import WEAK, Linearise
-from hdev_jax.inference.rows import by_chunk
 from hdev_jax.segments import trip_slices
 from hdev_jax.targets import TargetName
 
@@ -111,7 +110,8 @@ def distance_from_table(fit: Calibration) -> tuple[np.ndarray, np.ndarray]:
     return fit.values - prior, sd
 
 
-def _add_white(sums: Sums, baseline: Baseline, chunk: Chunk, white: np.ndarray) -> None:
+def _add_white(sums: Sums, baseline: Baseline, chunk: Chunk, rows: np.ndarray) -> None:
+    white = baseline.white(chunk, rows)
     ids = baseline.clusters.ids[chunk.at]
     sums.add(white[:, :-1], ids)
     if baseline.noise.level_sd > 0:
@@ -122,8 +122,8 @@ def evidence_of(baseline: Baseline, width: int = 0, write: Write = lambda out, c
     """Evidence by generalised least squares from the Jacobian, `width` columns that `write` makes, and the residual."""
     moved, sd = distance_from_table(baseline.fit)
     sums = Sums(len(sd) + width + 1, baseline.clusters.count, baseline.trips)
-    for chunk, white in by_chunk(lambda c: baseline.white(c, baseline.rows(c, width, write)), baseline.chunks()):
-        _add_white(sums, baseline, chunk, white)
+    for chunk in baseline.chunks():
+        _add_white(sums, baseline, chunk, baseline.rows(chunk, width, write))
     return sums.evidence(len(sd), moved=moved, prior_sd=sd, level_sd=baseline.noise.level_sd)
 
 
@@ -139,13 +139,10 @@ def both_looks(
     base = len(sd)
     white, plain = (Sums(base + source.width + 1, baseline.clusters.count, baseline.trips) for _ in range(2))
     between, rows_in_all = np.zeros(source.width), 0
-
-    def looks(chunk: Chunk) -> tuple[np.ndarray, np.ndarray]:
+    for chunk in baseline.chunks():
         rows = baseline.rows(chunk, source.width, lambda out, c: source.write(out, c.segments))
-        return rows[: chunk.rows], baseline.white(chunk, rows)
-
-    for chunk, (rows, whitened) in by_chunk(looks, baseline.chunks()):
-        _add_white(white, baseline, chunk, whitened)
+        _add_white(white, baseline, chunk, rows)
+        rows = rows[: chunk.rows]
         plain.add(rows, baseline.clusters.ids[chunk.at])
         for s in chunk.slices():
             between += np.sum(rows[s, base:-1], axis=0) ** 2 / (s.stop - s.start)
@@ -165,12 +162,8 @@ def both_looks(
 def written_by_chunk(baseline: Baseline, source: Source, at: tuple[int, ...]) -> Float[np.ndarray, "row k"]:
     """A few of the source's columns on every row of the log."""
     out = np.empty((len(baseline.clusters.ids), len(at)))
-
-    def columns(chunk: Chunk) -> np.ndarray:
+    for chunk in baseline.chunks():
         part = np.empty((len(chunk.segments), len(at)))
         source.write(part, chunk.segments, at)
-        return part
-
-    for chunk, part in by_chunk(columns, baseline.chunks()):
         out[chunk.at] = part[: chunk.rows]
     return out

@@ -11,7 +11,6 @@ from hdev_jax.inference.states.chain import draw, smooth
 from hdev_jax.inference.states.lanes import Lanes
 from hdev_jax.inference.states.model import Switching, kept_errors, log_t, scales
 from hdev_jax.inference.states.rows import StateRows
-from hdev_jax.inference.threads import side_by_side
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Decoded", "decode", "energy_draws"]
@@ -166,10 +165,9 @@ def _laid(model: Switching, rows: StateRows) -> tuple[Lanes, _Levels, _Laid]:
 
 def decode(model: Switching, rows: StateRows) -> Decoded:
     """The states of rows by filter and smoother."""
-    slices = _parts(rows.trip)
-    if len(slices) == 1:
-        return _decode(model, rows)
-    parts = [part for _, part in side_by_side(lambda s: _decode(model, rows.take(s)), slices)]
+    parts = [_decode(model, rows.take(s)) for s in _parts(rows.trip)]
+    if len(parts) == 1:
+        return parts[0]
     on, ahead, error_w, same, moves = (np.concatenate(c) for c in zip(*(p[:-1] for p in parts), strict=True))
     return Decoded(on, ahead, error_w, same, moves, sum(p.log_likelihood for p in parts))
 
