@@ -122,7 +122,8 @@ def _write_index(home: Path, came: Outcomes) -> None:
             to = [("the sweep as a table over its runs", f"{artefact(path)}/report.html")]
             parts.append(Section(title_of(path), contents=[("", to)]))
         for run in runs:
-            part = of_run(Path(run["folder"]), run, made=_made(path, run["sweep"]), home=home)
+            made, changed = _made(path, run["sweep"]), _changed(path)
+            part = of_run(Path(run["folder"]), run, made=made, changed=changed, home=home)
             part = dataclasses.replace(part, title=_title(path, run), said=[*about(path), *part.said])
             parts.append(part)
             kind = kind_of(path)
@@ -169,11 +170,14 @@ def _table(caption: str, rows: Sequence[Mapping[str, Any]]) -> list[Table]:
 
 
 def _made(path: Path, delta: Mapping[str, Any]) -> list[str]:
-    """The command of a run, and what its config changes in the one that it extends."""
+    """The command of a run."""
     point = shown_point(delta)
-    lines = [f"python -m experiments {shown(path)} --out DIR{f': the run at {point}' if point else ''}"]
-    changed = [
+    return [f"python -m experiments {shown(path)} --out DIR{f': the run at {point}' if point else ''}"]
+
+
+def _changed(path: Path) -> list[str]:
+    """What a config changes in the one that it extends."""
+    return [
         f"{k} = {new!r:.60} ({'not there' if old is None else f'there {old!r:.60}'})"
         for k, (old, new) in changes(path).items()
     ]
-    return [*lines, f"Changes in the config that it extends: {'; '.join(changed)}."] if changed else lines

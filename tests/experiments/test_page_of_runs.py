@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.runner.pages.html import MOST_ROWS, of_run, write_html
+from experiments.runner.pages.html import MOST_COLUMNS, MOST_ROWS, of_run, write_html
 from experiments.runner.tables import markdown
 
 METRICS = {
@@ -56,3 +56,14 @@ def test_an_error_with_a_sign_is_compared_by_its_size(tmp_path):
     (lines,) = [t[1] for f in part.folded for t in f.tables if t[0] == "Paper against ours"]
     assert lines[1][:5] == ["bias", "PE", "2", "-1", "0.5"]
     assert lines[2][-1] == "left out"
+
+
+def test_a_wide_table_shows_its_first_columns_and_is_whole_on_a_click(tmp_path):
+    folder = run_of(tmp_path / "run", 2)
+    wide = [[f"column {k}" for k in range(MOST_COLUMNS + 3)], ["1"] * (MOST_COLUMNS + 3)]
+    (folder / "tables" / "table.md").write_text(markdown(wide, "Wide"), encoding="utf-8")
+    part = of_run(folder, METRICS, changed=["by = 2.0 (not there)"])
+    assert [len(row) for row in part.tables[0][1]] == [MOST_COLUMNS, MOST_COLUMNS]
+    folded = {f.title: f for f in part.folded}
+    assert [len(row) for row in folded["More tables"].tables[0][1]] == [MOST_COLUMNS + 3] * 2
+    assert folded["Changes in the config that it extends"].said == ["by = 2.0 (not there)"]

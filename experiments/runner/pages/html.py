@@ -11,10 +11,11 @@ from experiments.runner.compare import comparison, findings, missed, notes
 from experiments.runner.tables import cells, read_markdown
 from hdev_jax.rundir import Run, atomic_file
 
-__all__ = ["MOST_ROWS", "Folded", "Section", "Table", "of_run", "write_html", "write_page"]
+__all__ = ["MOST_COLUMNS", "MOST_ROWS", "Folded", "Section", "Table", "of_run", "write_html", "write_page"]
 
 Table = tuple[str, list[list[str]]]  # its caption; its lines, the head first
 
+MOST_COLUMNS = 8  # of the table that a page shows
 MOST_ROWS = 20  # of a table that is open; a longer one is folded
 _NUMBER = re.compile(r"[-−+±<]?\s?[\d.,]+( ?(%|±|to|of|x|×).*)?|–|yes|no|")
 
@@ -94,22 +95,29 @@ class Section:
         return re.sub(r"[^\w.]+", "-", self.title).strip("-")
 
 
-def of_run(folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = (), home: Path | None = None) -> Section:
-    """The part of a page for the run in `folder`: what it found, its figures and first table; targets missed, notes,
-    its other tables and the paper's numbers folded.
+def of_run(
+    folder: Path, metrics: Mapping[str, Any], *, made: Sequence[str] = (), changed: Sequence[str] = (),
+    home: Path | None = None,
+) -> Section:  # fmt: skip
+    """The part of a page for the run in `folder`: what it found, its figures and the first columns of its first table;
+    targets missed, notes, its other tables and the paper's numbers folded.
 
-    **Arguments:** `made`, lines on what made it; `home`, the folder of the page, for links to the run's files.
+    **Arguments:** `made`, lines on what made it; `changed`, what its config changes in the one that it extends; `home`,
+    the folder of the page, for links to the run's files.
     """
     files = sorted((folder / "tables").glob("*.md"), key=lambda path: (path.stem != "table", path.stem))
     tables = [read_markdown(path) for path in files]
     against = comparison(metrics)
     more = [*tables[1:], *([("Paper against ours", cells(against, 4))] if against else [])]
     first = tables[:1]
+    if first and len(first[0][1][0]) > MOST_COLUMNS:
+        more.insert(0, first[0])
+        first = [(first[0][0], [row[:MOST_COLUMNS] for row in first[0][1]])]
     folded = [Folded("Targets missed", missed(metrics)), Folded("Notes", notes(metrics))]
     if first and len(first[0][1]) > MOST_ROWS + 1:
         folded.insert(0, Folded(f"Table of {len(first[0][1]) - 1} rows", tables=first))
         first = []
-    folded.append(Folded("More tables", tables=more))
+    folded += [Folded("More tables", tables=more), Folded("Changes in the config that it extends", changed)]
     images = sorted((folder / "figures").glob("*.png"))
     names = ("report.html", "config.toml", "metrics.json", "log.txt")
     return Section(

@@ -10,13 +10,12 @@ from typing import Any
 from experiments.runner.compare import as_good, comparison, decides, findings, headlines, merged, missed, notes
 from experiments.runner.config import shown
 from experiments.runner.figures import against_paper
-from experiments.runner.pages.html import MOST_ROWS
+from experiments.runner.pages.html import MOST_COLUMNS, MOST_ROWS
 from experiments.runner.store import HERE
 from experiments.runner.tables import cells, markdown
 
 __all__ = ["about", "folded", "heading", "kind_of", "part", "title_of", "wrapped", "write_docs", "write_list_docs"]
 
-MOST_COLUMNS = 8  # of the table that a page shows
 MOST_MISSED = 4  # targets that a page shows; more are folded
 WIDTH = 120
 
