@@ -84,7 +84,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         "planted": len(truth), "found": len(off), "in_a_week": sum(x <= WEEK_DAYS for x in off), "days_off": off,
         "others": len(set(changed) - set(truth)),
         "unlike": sum(e["kind"] == "level" for e in result.summary["unlike"]), "shown": shown,
-        "named_alone": sum(task["effect"] in e for e in alone), "any_alone": sum(bool(e) for e in alone),
+        "shown_alone": sum(task["effect"] in e for e in alone), "any_alone": sum(bool(e) for e in alone),
         "not_done": sum(r["status"] != "done" for r in records),
         "seconds_per_vehicle": seconds / len(records),
         "bytes_per_vehicle": float(np.mean([len(str(r)) for r in records])),
@@ -113,7 +113,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
     for kind, size in config.kinds.items():
         found = [r for t, r in results if t["kind"] == kind]
         total = {k: sum(r[k] for r in found) for k in ("planted", "found", "in_a_week", "others", "unlike",
-                                                       "named_alone", "any_alone", "not_done")}  # fmt: skip
+                                                       "shown_alone", "any_alone", "not_done")}  # fmt: skip
         false = [set(r["shown"]) - ({config.effect} if kind == "small" else set()) for r in found]
         mine = {
             **total,
@@ -133,7 +133,7 @@ def collect(config: Config, results: Sequence[tuple[dict[str, Any], dict[str, An
             "changed vehicles found": f"{total['found']} of {total['planted']}" if total["planted"] else None,
             "date within a week": total["in_a_week"] if total["planted"] else None,
             "fleets that show the effect": mine["effect_shown"] if kind == "small" else None,
-            "vehicles that show it alone": total["named_alone"] if kind == "small" else None,
+            "vehicles whose own diagnosis shows it": total["shown_alone"] if kind == "small" else None,
             "fleets with anything false": mine["fleets_with_anything_false"],
             "others called changed": total["others"], "called different": total["unlike"],
             "fleets with a false effect of a type": mine["fleets_with_a_false_effect"],
@@ -154,7 +154,7 @@ def _findings(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
             yield (f"Of {o['planted']} changed vehicles among {o['vehicles']}, {o['found']} are found, "
                    f"{o['in_a_week']} with the date within a week, and {o['others']} others are named")  # fmt: skip
         elif row["name"] == "small":
-            alone = f"in {o['named_alone']} of their {o['vehicles']} vehicles the vehicle's own diagnosis shows it"
+            alone = f"in {o['shown_alone']} of their {o['vehicles']} vehicles the vehicle's own diagnosis shows it"
             yield (f"An effect of a tenth of the noise in all vehicles is found in {o['effect_shown']} of {n} fleets; "
                    f"{alone} (adjusted over the fleet); {false}")  # fmt: skip
         else:

@@ -1,4 +1,4 @@
-"""docs/settings.md: every number that decides what is named, with what half and double of it do to planted logs.
+"""docs/settings.md: the numbers that decide what is named, with what half and double of it do to planted logs.
 
 `python -m experiments.planted.settings_page --docs docs` writes the table. With `--run OUT`, the folder of
 `python -m experiments configs/studies/settings.toml --out OUT`, its columns half and double show the study's results.

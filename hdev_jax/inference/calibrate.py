@@ -96,9 +96,9 @@ def _jacobian_of(structure: Any, start: np.ndarray, scale: np.ndarray, z: np.nda
 def _linearised(
     vehicle: Vehicle, structure: Any, target: TargetName, segments: Segments, theta: Any
 ) -> tuple[Array, Array]:
-    """The prediction, and a line of slopes for each of `theta`: without a transposition, as `jax.jacfwd` has one."""
+    """The prediction, and its derivatives [free, row], which `jax.jacfwd` would transpose."""
     value, push = jax.linearize(lambda x: insert(vehicle, structure, x).predict(segments, target), theta)
-    return value, jax.vmap(push)(jnp.eye(len(theta)))
+    return value, jax.vmap(push)(jnp.eye(len(theta), dtype=theta.dtype))
 
 
 def linearised(

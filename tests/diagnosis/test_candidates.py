@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from planted import opened
+from planted import opened, training
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, finer, realised
 from hdev_jax.diagnosis.candidates.facts import facts_of
@@ -493,3 +493,19 @@ def test_of_two_limits_of_one_effect_the_lower_is_the_lower(problem):
     )
     pairs = [(x["heat_c"], x["cool_c"]) for c in every if {"heat_c", "cool_c"} <= {*(x := dict(c.shapes))}]
     assert sorted(set(pairs)) == [(10.0, 14.0), (10.0, 22.0), (18.0, 22.0)]
+
+
+def test_what_was_fitted_is_scored_without_being_computed_again(tmp_path):
+    """By the values of the vehicle, whichever holds them; at others, or on other rows, it is."""
+    _, problem, _ = opened(tmp_path, seed=2, trips=3, rows_per_trip=80)
+    rows = training(problem)
+    table, segments = problem.table, rows.chunks[0].segments
+    theta = table.values(problem.vehicle) * 1.1
+    fitted = table.insert(problem.vehicle, theta)
+    first = rows.kernel.linearised(problem.vehicle, table, segments, problem.target, theta)
+    again = rows.kernel.linearised(fitted, table, segments, problem.target)
+    assert again[1] is first[1]
+    assert rows.kernel.linearised(problem.vehicle, table, segments, problem.target)[1] is not first[1]
+    others = rows.kernel.linearised(fitted, table, jax.tree.map(np.array, segments), problem.target)
+    assert others[1] is not first[1]
+    np.testing.assert_array_equal(others[1], first[1])

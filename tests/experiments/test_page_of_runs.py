@@ -58,12 +58,17 @@ def test_an_error_with_a_sign_is_compared_by_its_size(tmp_path):
     assert lines[2][-1] == "left out"
 
 
-def test_a_wide_table_shows_its_first_columns_and_is_whole_on_a_click(tmp_path):
+@pytest.mark.parametrize("rows", [1, MOST_ROWS + 1])
+def test_a_wide_table_shows_its_first_columns_and_is_whole_on_a_click(tmp_path, rows):
     folder = run_of(tmp_path / "run", 2)
-    wide = [[f"column {k}" for k in range(MOST_COLUMNS + 3)], ["1"] * (MOST_COLUMNS + 3)]
+    wide = [[f"column {k}" for k in range(MOST_COLUMNS + 3)], *[["1"] * (MOST_COLUMNS + 3)] * rows]
     (folder / "tables" / "table.md").write_text(markdown(wide, "Wide"), encoding="utf-8")
     part = of_run(folder, METRICS, changed=["by = 2.0 (not there)"])
-    assert [len(row) for row in part.tables[0][1]] == [MOST_COLUMNS, MOST_COLUMNS]
     folded = {f.title: f for f in part.folded}
-    assert [len(row) for row in folded["More tables"].tables[0][1]] == [MOST_COLUMNS + 3] * 2
+    if rows > MOST_ROWS:
+        assert part.tables == []
+        assert [len(row) for row in folded[f"Table of {rows} rows"].tables[0][1]] == [MOST_COLUMNS + 3] * (rows + 1)
+        return
+    assert [len(row) for row in part.tables[0][1]] == [MOST_COLUMNS, MOST_COLUMNS]
+    assert [len(row) for row in folded["All columns"].tables[0][1]] == [MOST_COLUMNS + 3] * 2
     assert folded["Changes in the config that it extends"].said == ["by = 2.0 (not there)"]

@@ -21,7 +21,8 @@ from hdev_jax.inference.states import (
     shares_of,
     what_it_depends_on,
 )
-from hdev_jax.physics.states import SwitchingLoad, expected_share
+from hdev_jax.inference.states.chances import _Moves
+from hdev_jax.physics.states import COVARIATES, SwitchingLoad, expected_share
 from hdev_jax.segments import Segments
 
 TRIPS, SECONDS, MORE = 6, 1000, 1800  # of a trip; more of two loads, or of long rows
@@ -239,3 +240,25 @@ def test_the_effect_expects_what_the_chain_expects():
     np.testing.assert_allclose(
         replace(model, by=0.0 * by).expected(rows)[:, 0], expected_share(rows.temp_c, model.share[0])
     )
+
+
+def test_the_gradient_of_the_moves_is_that_of_their_likelihood():
+    """By central differences, and as the sum of the rows' own."""
+    rng, n = np.random.default_rng(0), 300
+    rows = StateRows(
+        np.zeros(n), np.repeat(np.arange(3), 100), rng.uniform(1.0, 40.0, n), rng.uniform(-10.0, 30.0, n),
+        np.zeros(n, int), 0.1, rng.normal(size=(n, len(COVARIATES))),
+    )  # fmt: skip
+    decoded = decode(start(5000.0), rows)._replace(moves=rng.dirichlet(np.ones(4), n).reshape(n, 1, 2, 2))
+    moves, columns = _Moves(start(5000.0), rows, decoded, 0), (0, 2)
+    theta = np.r_[moves.start, 0.3, -0.2]
+
+    def log_likelihood(x):
+        on = moves._chance(x, columns).on
+        return np.sum(moves.moved[:, :, 1] * np.log(on) + moves.moved[:, :, 0] * np.log1p(-on))
+
+    chance, h = moves._chance(theta, columns), 1e-6
+    numeric = [(log_likelihood(theta + h * e) - log_likelihood(theta - h * e)) / (2 * h) for e in np.eye(len(theta))]
+    np.testing.assert_allclose(moves._gradient(chance), numeric, rtol=1e-5, atol=1e-5)
+    each = np.einsum("rb,rbk->k", moves._scores(chance), moves._jacobian(chance))
+    np.testing.assert_allclose(moves._gradient(chance), each, rtol=1e-9)

@@ -110,13 +110,13 @@ def of_run(
     against = comparison(metrics)
     more = [*tables[1:], *([("Paper against ours", cells(against, 4))] if against else [])]
     first = tables[:1]
-    if first and len(first[0][1][0]) > MOST_COLUMNS:
-        more.insert(0, first[0])
-        first = [(first[0][0], [row[:MOST_COLUMNS] for row in first[0][1]])]
     folded = [Folded("Targets missed", missed(metrics)), Folded("Notes", notes(metrics))]
     if first and len(first[0][1]) > MOST_ROWS + 1:
         folded.insert(0, Folded(f"Table of {len(first[0][1]) - 1} rows", tables=first))
         first = []
+    elif first and len(first[0][1][0]) > MOST_COLUMNS:
+        folded.insert(0, Folded("All columns", tables=first))
+        first = [(first[0][0], [row[:MOST_COLUMNS] for row in first[0][1]])]
     folded += [Folded("More tables", tables=more), Folded("Changes in the config that it extends", changed)]
     images = sorted((folder / "figures").glob("*.png"))
     names = ("report.html", "config.toml", "metrics.json", "log.txt")

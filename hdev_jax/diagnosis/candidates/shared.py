@@ -25,10 +25,11 @@ __all__ = ["SharedKernel", "absent", "apart", "of_library"]
 # Of a log of 14,000 rows a column takes 2.3 ms with every effect, so those of a step 0.3 s; to trace and compile them
 # anew takes 5 to 20 s. Twice or half of it changes the time alone.
 SHORT_ROWS = 65_536
-# Bytes of Jacobians that are kept, which changes the time alone: ten of 65,536 rows and 20 coefficients
-KEPT_BYTES = 100_000_000
+# Jacobians of no more rows than that which are kept, which changes the time alone: 2 MB each for 14,000 rows and 20
+# coefficients, 11 MB for a chunk of a long log
+RESULTS = 12
 
-Linear = tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]
+Linearised = tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row free"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class SharedKernel:
     _last: list[Any] = field(default_factory=list, init=False, repr=False)
     _sound: dict[TargetName, bool] = field(default_factory=dict, init=False, repr=False)
     _programs: dict[Any, Program] = field(default_factory=dict, init=False, repr=False)
-    _results: dict[Any, tuple[Any, Linear]] = field(default_factory=dict, init=False, repr=False)
+    _results: dict[Any, tuple[Any, Linearised]] = field(default_factory=dict, init=False, repr=False)
 
     def program(self, vehicle: Vehicle, *more: Effect, declared: Sequence[Place] = ()) -> Program:
         """The vehicle with every other effect of the library that is part of the kernel, and with `more`."""
@@ -68,15 +69,16 @@ class SharedKernel:
 
     def linearised(
         self, vehicle: Vehicle, table: ParameterTable, segments: Segments, target: TargetName, theta: Any = None
-    ) -> Linear:
+    ) -> Linearised:
         """The prediction, in the target's unit, and its derivative in the free coefficients, per unit of each, at their
         present values or at `theta`."""
         if not table.free:
             return linearised(vehicle, table, segments, target, theta)
         if not self._of_library(vehicle, target):
-            key = id(vehicle), id(table), None if theta is None else np.asarray(theta).tobytes(), target, id(segments)
-            held = vehicle, table, segments
-            return self._kept(key, held, lambda: linearised(vehicle, table, segments, target, theta))
+            leaves, form = jax.tree.flatten(vehicle if theta is None else table.insert(vehicle, theta))
+            places = tuple((c.path, c.group) for c in table.free)
+            key = form, tuple(np.asarray(x).tobytes() for x in leaves), places, target, id(segments)
+            return self._kept(key, segments, lambda: linearised(vehicle, table, segments, target, theta))
         if not (self._last and self._last[0] is vehicle and self._last[1] is table):  # a solver asks many times
             self._last[:] = vehicle, table, self._of_table(vehicle, table)
         program, values, free = self._last[2]
@@ -84,7 +86,7 @@ class SharedKernel:
             values = values.copy()
             values[free] = np.asarray(theta)
 
-        def compute() -> Linear:
+        def compute() -> Linearised:
             result = program.linearised(jax.tree.map(jnp.asarray, segments), target, values, free)
             if not all(np.all(np.isfinite(x)) for x in result):  # at these values, or on other rows than `serves` saw
                 result = linearised(vehicle, table, segments, target, theta)
@@ -92,17 +94,19 @@ class SharedKernel:
 
         return self._kept((id(program), values.tobytes(), tuple(free), target, id(segments)), segments, compute)
 
-    def _kept(self, key: Any, held: Any, compute: Callable[[], Linear]) -> Linear:
-        """What was fitted is scored at the same values, many times. `held`: what `key` has the ids of, so that no
-        others get them."""
-        if key not in self._results:
-            result = compute()
+    def _kept(self, key: Any, segments: Segments, compute: Callable[[], Linearised]) -> Linearised:
+        """What was fitted is scored at the same values, many times. The segments are held, so that no others have their
+        id."""
+        if key in self._results:
+            return self._results[key][1]
+        result = compute()
+        if len(segments) <= SHORT_ROWS:
             for x in result:
                 x.flags.writeable = False  # the next caller gets the same arrays
-            self._results[key] = held, result
-            while len(self._results) > 1 and sum(x.nbytes for _, r in self._results.values() for x in r) > KEPT_BYTES:
+            self._results[key] = segments, result
+            while len(self._results) > RESULTS:
                 self._results.pop(next(iter(self._results)))
-        return self._results[key][1]
+        return result
 
     def predict(self, vehicle: Vehicle, segments: Segments, target: TargetName) -> Float[np.ndarray, " row"]:
         """The prediction on every row, in the target's unit."""

@@ -174,8 +174,12 @@ def _sought(
         if model is not None and held is None and len(tests) == 1:
             starts += besides(model)
         tests.append(last)
-        tried = [fit_switching(m, some_rows(rows), FIRST_ROUNDS) for m in starts]  # as many as the test looks at
-        model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
+        if len(starts) == 1:
+            model, decoded = fit_switching(starts[0], rows, 2 * FIRST_ROUNDS)
+        else:
+            some = some_rows(rows)  # as many as the test looks at
+            tried = [fit_switching(m, some, FIRST_ROUNDS) for m in starts]
+            model, decoded = fit_switching(max(tried, key=lambda t: t[1].log_likelihood)[0], rows, FIRST_ROUNDS)
         left = replace(rows, residual_w=rows.residual_w - model.predicted_w(decoded.on))
     if model is None or held is not None:
         return (None if model is held else model), tests

@@ -31,9 +31,9 @@ PULL = np.pad(SHRINK * (np.eye(KNOTS) - 1.0 / KNOTS), ((1, 0), (1, 0)))  # of me
 
 
 class _Chance(NamedTuple):
-    """Of each row: chance of being on after it by the state before it; its derivatives by the logarithm of the memory
-    and by the log-odds, which are the same from either state; and those of the log-odds by the log-odds of the knots,
-    and by the coefficients."""
+    """Of each row: chance of being on after it by the state before it (`on`); its derivatives by the logarithm of the
+    memory (`by_memory`) and, the same from either state, by the row's log-odds (`by_odds`); theirs by the share of time
+    on (`by_share`), the share's at a knot by its log-odds (`by_knot`); and theirs by the coefficients (`columns`)."""
 
     on: Float[np.ndarray, "row before"]
     by_memory: Float[np.ndarray, "row before"]
@@ -73,22 +73,22 @@ class _Moves:
         by_odds = ((1.0 - keep) * p * (1.0 - p))[:, 0]
         return _Chance(on, longer, by_odds, 1.0 / (share * (1.0 - share)), own * (1.0 - own), x)
 
-    def _each(self, chance: _Chance) -> Float[np.ndarray, "row before"]:
+    def _scores(self, chance: _Chance) -> Float[np.ndarray, "row before"]:
         """Derivatives of each row's log-likelihood by its chances of being on."""
         return self.moved[:, :, 1] / chance.on - self.moved[:, :, 0] / (1.0 - chance.on)
 
-    def _slopes(self, chance: _Chance) -> Float[np.ndarray, "row before k"]:
+    def _jacobian(self, chance: _Chance) -> Float[np.ndarray, "row before k"]:
         """Derivatives of the chances by all that is fitted."""
         knots = self.hats * chance.by_share[:, None] * chance.by_knot
         same = chance.by_odds[:, None] * np.hstack([knots, chance.columns])
         return np.concatenate([chance.by_memory[:, :, None], same[:, None, :].repeat(2, axis=1)], axis=2)
 
-    def _slope(self, chance: _Chance) -> Float[np.ndarray, " k"]:
+    def _gradient(self, chance: _Chance) -> Float[np.ndarray, " k"]:
         """Derivatives of the log-likelihood of all rows."""
-        each = self._each(chance)
-        weight = np.sum(each, axis=1) * chance.by_odds
+        scores = self._scores(chance)
+        weight = np.sum(scores, axis=1) * chance.by_odds
         knots = (weight * chance.by_share) @ self.hats * chance.by_knot
-        return np.r_[np.sum(each * chance.by_memory), knots, weight @ chance.columns]
+        return np.r_[np.sum(scores * chance.by_memory), knots, weight @ chance.columns]
 
     def fitted(self, columns: Sequence[int], steps: int = 100) -> _Fitted:
         """The values that suit the moves best, or better than the present ones after so many `steps`."""
@@ -96,9 +96,9 @@ class _Moves:
         def cost(theta: np.ndarray) -> tuple[float, np.ndarray]:
             chance, pull = self._chance(theta, columns), PULL @ theta[:FIRST]
             total = np.sum(self.moved[:, :, 1] * np.log(chance.on) + self.moved[:, :, 0] * np.log1p(-chance.on))
-            slope = self._slope(chance)
-            slope[:FIRST] -= pull
-            return 0.5 * float(theta[:FIRST] @ pull) - float(total), -slope
+            gradient = self._gradient(chance)
+            gradient[:FIRST] -= pull
+            return 0.5 * float(theta[:FIRST] @ pull) - float(total), -gradient
 
         memory = (np.log(LEAST_MEMORY_S), np.log(MOST_MEMORY_S))
         odds = [(-FURTHEST, FURTHEST)] * KNOTS + [(-2.0 * FURTHEST, 2.0 * FURTHEST)] * len(columns)
@@ -111,17 +111,17 @@ class _Moves:
     def p_last(self, fitted: _Fitted, columns: Sequence[int], clusters: Int[np.ndarray, " row"]) -> float:
         """p of the last coefficient, with errors of whole clusters: the jackknife in one step, Student's t."""
         chance = self._chance(fitted.theta, columns)
-        slopes = self._slopes(chance)
         weight = self.moved.sum(axis=2) / (chance.on * (1.0 - chance.on))
         at = np.flatnonzero(np.r_[True, np.diff(clusters) != 0])
         if (n := len(at)) < 3:
             return 1.0
-        grams = np.stack([np.einsum("rb,rbj,rbk->jk", weight[a:b], slopes[a:b], slopes[a:b])
+        jacobian = self._jacobian(chance)
+        grams = np.stack([np.einsum("rb,rbj,rbk->jk", weight[a:b], jacobian[a:b], jacobian[a:b])
                           for a, b in pairwise([*at, len(clusters)])])  # fmt: skip
         total = grams.sum(axis=0)
         total += 1e-9 * np.trace(total) * np.eye(len(total))
         total[:FIRST, :FIRST] += PULL
-        scores = np.add.reduceat(np.einsum("rb,rbk->rk", self._each(chance), slopes), at)
+        scores = np.add.reduceat(np.einsum("rb,rbk->rk", self._scores(chance), jacobian), at)
         moves = np.linalg.solve(total - (1.0 - 1e-6) * grams, scores[:, :, None])[:, -1, 0]
         error = float(np.sqrt((n - 1) / n * np.sum((moves - moves.mean()) ** 2)))
         naive = float(np.sqrt(np.linalg.inv(total)[-1, -1]))

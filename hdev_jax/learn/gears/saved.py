@@ -53,7 +53,7 @@ def read_gear_model(path: str | Path) -> Trees:
         if PLACE in found.features:
             raise InputError(
                 f"gear model {path}: has the feature '{PLACE}', so its classes are distances from the reference gear, "
-                "and this file does not say which; it has to be written with save_gear_model"
+                "and which they are is not known from this file; it has to be written with save_gear_model"
             )
         gears = tuple(float(g + 1) for g in range(len(found.classes)))
         return _named(found, gears, found.features)
