@@ -30,7 +30,10 @@ STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
 MOST_STEPS = 50
 SETTLED = 1e-3  # standard errors that a further step would move the estimate by
-LEAST_GAIN = 1e-5  # of a step, in log-likelihood
+LEAST_GAIN = 1e-3  # of a step, in log-likelihood: 0.04 standard errors; at a kink (a threshold) steps gain ever less
+# Damping of the first step; of the one after the first that gains nothing; how fast it then grows. It falls by how well
+# the step did as expected (Nielsen, Technical University of Denmark, IMM-REP-1999-05).
+UNDAMPED, DAMPED, GROWTH = 1e-9, 1e-2, 4.0
 UNBOUNDED = 1e9  # a bound beyond it is none
 
 
@@ -163,9 +166,10 @@ class _Problem:
         return _Point(theta, predicted, slopes)
 
     def cost(self, point: _Point, weight: Float[np.ndarray, " row"]) -> float:
-        """Half the sum of squares, of rows and of the prior."""
+        """Half the sum of squares, of rows and of the prior; infinite where a prediction is no number."""
         rows = weight * (self.measured - point.predicted)
-        return 0.5 * float(rows @ rows) + 0.5 * float(np.sum(((point.theta - self.prior) / self.prior_sd) ** 2))
+        total = 0.5 * float(rows @ rows) + 0.5 * float(np.sum(((point.theta - self.prior) / self.prior_sd) ** 2))
+        return total if np.isfinite(total) else np.inf
 
     def solve(self, point: _Point, weight: Float[np.ndarray, " row"]) -> tuple[_Point, bool, str, int]:
         """Levenberg-Marquardt (Marquardt, SIAM J. Appl. Math. 11, 1963) from a point.
@@ -179,7 +183,7 @@ class _Problem:
                 start[k] = inside(start[k], lower, upper)
         if np.any(start != point.theta):
             point = self.at(start)
-        z, damping, growth, cost = np.zeros(len(start)), 1e-9, 10.0, self.cost(point, weight)
+        z, damping, growth, cost = np.zeros(len(start)), UNDAMPED, GROWTH, self.cost(point, weight)
         precision = 1.0 / self.prior_sd**2
         for step in range(1, MOST_STEPS + 1):
             _, slope = _jacobian_of(structure, start, self.scale, z)
@@ -200,16 +204,17 @@ class _Problem:
             expected = float(move @ gradient - 0.5 * move @ hessian @ move)
             trial = self.at(_jacobian_of(structure, start, self.scale, z + move)[0])
             gained = cost - self.cost(trial, weight) if trial.finite else -np.inf
+            least = max(LEAST_GAIN, 1e-13 * cost)  # less is rounding
             if gained > 0:
-                ratio = gained / max(expected, 1e-300)
                 point, z, cost = trial, z + move, cost - gained
-                damping, growth = max(damping / 10.0 if ratio > 0.5 else damping, 1e-12), 10.0
-                if gained < max(LEAST_GAIN, 1e-13 * cost):  # at a kink a step never reaches the optimum of its line
+                as_expected = 2.0 * min(gained / max(expected, 1e-300), 1.0) - 1.0
+                damping, growth = max(damping * max(0.1, 1.0 - as_expected**3), UNDAMPED), GROWTH
+                if gained < least:
                     return point, True, "converged", step
             else:
-                if expected < 1e-13 * cost:  # rounding: there is nothing left to gain
+                if expected < least:
                     return point, True, "converged", step
-                damping, growth = damping * growth, growth * 10.0
+                damping, growth = max(damping * growth, DAMPED), growth * GROWTH
         return point, False, f"stopped after {MOST_STEPS} steps; start nearer or give a prior", MOST_STEPS
 
 

@@ -249,8 +249,10 @@ def test_signs_flip_columns_by_cluster():
     sign = np.random.default_rng(1).choice([-1.0, 1.0], 9)
     flipped = rows.evidence().flipped(candidate(0, 2), sign)
     rows.columns[:, [0, 2]] *= sign[rows.ids][:, None]
+    every = np.arange(BASE + CANDIDATES + 1)
     for v in range(len(LEVELS)):
-        np.testing.assert_allclose(flipped.by_cluster(v), rows.evidence().by_cluster(v), rtol=1e-9, atol=1e-9)
+        there, flip = (e.by_cluster(v, every) for e in (rows.evidence(), flipped))
+        np.testing.assert_allclose(flip, there, rtol=1e-9, atol=1e-9)
     evidence = rows.evidence()
     for one in (-1.0, 1.0):
         same = evidence.flipped(candidate(0), np.full(9, one))
@@ -277,7 +279,7 @@ def test_sign_placebos_of_a_consistent_effect():
 def test_one_candidate_alone():
     rows = Rows()
     evidence = rows.evidence()
-    small, alone = evidence.only(candidate(2, 0))
+    small, (alone,) = evidence.only([candidate(2, 0)])
     assert alone.columns == (0, 1)
     one, other = evidence.gain(evidence.totals(), (2, 0)), small.gain(small.totals(), alone.columns)
     assert one[0] == pytest.approx(other[0])

@@ -61,8 +61,11 @@ def two_exchanged(round_: Round) -> State | None:
     """The state with two found effects exchanged for two others, each of which passes every gate beside the other."""
     training, state, scores = round_.training, round_.state, round_.scores
     asked = [f for f in state.found if can_be_asked(f) and not f.score.plain]
+    out = {*state.barred, *state.refused, *round_.reasons, *scores.absorbed_by}
+    # each in its best way alone: every pair that is out has equations of its own, of all columns a tenth of a gigabyte
+    small, open_ = scores.white.only([s.candidate for k, s in scores.best.items() if k not in out and not s.plain])
     for f, g in combinations(asked, 2):
-        ahead = _best_pair(round_, model_without(scores.white, scores.baseline.fit, f, g), {f.id, g.id})
+        ahead = _best_pair(round_, model_without(small, scores.baseline.fit, f, g), open_)
         if ahead is None:
             continue
         a, b = (c.id for c in ahead)
@@ -83,33 +86,33 @@ def two_exchanged(round_: Round) -> State | None:
     return None
 
 
-def _best_pair(round_: Round, w: Without, out: set[str]) -> list[Candidate] | None:
-    """The plausible pair that explains most in place of those that are `out`; None where it is not well ahead."""
-    scores, settings = round_.scores, round_.training.settings
-    out = {*out, *round_.state.barred, *round_.state.refused, *round_.reasons, *scores.absorbed_by}
-    open_ = [s.candidate for id_, s in scores.best.items() if id_ not in out and not s.plain]
-    pairs = list(combinations(w.rivals([c for c in open_ if c.kind == "size"]), 2))
+def _best_pair(round_: Round, w: Without, open_: Sequence[Candidate]) -> list[Candidate] | None:
+    """The plausible pair of those that are `open_` that explains most in place of the two that are out; None where it
+    is not well ahead."""
+    scores, settings, totals = round_.scores, round_.training.settings, w.evidence.totals()
+    rivals = w.rivals(open_)
+    pairs = list(combinations([c for c in rivals if c.kind == "size"], 2))
 
-    def score(pair: Sequence[Candidate]) -> Score:
-        return w.evidence.score(replace(pair[0], columns=tuple(k for c in pair for k in c.columns)))
+    def together(*each: Candidate) -> Candidate:
+        return replace(each[0], columns=tuple(k for c in each for k in c.columns))
 
-    own, places = score(w.each), [k for c in w.each for k in c.columns]
+    def worths(ways: Sequence[Sequence[Candidate]]) -> np.ndarray:
+        gains = w.evidence.gains(totals, [together(*way).columns for way in ways])
+        return np.array([_together(scores, float(x), way) for x, way in zip(gains, ways, strict=True)])
+
     # a third effect that is only not added yet is no reason for an exchange
-    more = w.evidence.gains(w.evidence.totals(), [(*places, *c.columns) for c in w.rivals(open_)])
-    worth_ = [_together(scores, float(x), (*w.each, c)) for x, c in zip(more, open_, strict=True)]
-    to_beat = max([_together(scores, own.gain, w.each), *(x for x in worth_ if np.isfinite(x))])
-    gains = w.evidence.gains(w.evidence.totals(), [(*a.columns, *b.columns) for a, b in pairs])
-    worths = np.array([_together(scores, float(x), pair) for x, pair in zip(gains, pairs, strict=True)])
-    for k in np.argsort(-worths):
-        if not _well_ahead(round_, float(worths[k]), to_beat):
+    own = worths([w.each, *((*w.each, c) for c in rivals)])
+    to_beat, of_pairs = float(np.max(own, where=np.isfinite(own), initial=-np.inf)), worths(pairs)
+    for k in np.argsort(-of_pairs):
+        if not _well_ahead(round_, float(of_pairs[k]), to_beat):
             return None
         a, b = pairs[int(k)]
         if _test(a.id, b.id, *(c.id for c in w.each)) in round_.state.tested:
             continue
-        new = score((a, b))
+        new, held = w.evidence.scores([together(a, b), together(*w.each)])
         each = zip((a, b), np.split(new.beta, [len(a.columns)]), strict=True)
         fine = all(plausible(replace(scores.best[c.id], beta=x), settings) for c, x in each)
-        fine = fine and _well_ahead(round_, new.left_out_gain, own.left_out_gain)
+        fine = fine and _well_ahead(round_, new.left_out_gain, held.left_out_gain)
         if fine and all(w.evidence.beside(x.columns, y.columns) <= scores.level(y.id) for x, y in ((a, b), (b, a))):
             return [a, b]
     return None

@@ -8,7 +8,7 @@ import numpy as np
 from hdev_jax.diagnosis.competition.grid import LEADERS
 from hdev_jax.diagnosis.competition.refit import Refit, refit
 from hdev_jax.diagnosis.competition.state import Found, State
-from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class, stability
+from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import Scores, inside
@@ -140,7 +140,7 @@ def _taken(round_: Round, s: Score, came: Refit, gain: float) -> State | None:
         id_,
         came.score,
         float(scores.q[id_]),
-        stability(asked),
+        asked.stability,
         of_class(asked),
         float(gain),
         scores.between(s.candidate),

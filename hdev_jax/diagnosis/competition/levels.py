@@ -1,5 +1,6 @@
 """Has a residual levels? The likelihood that a load which switches gains, against its gain on noise of that colour."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,9 @@ LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
 LOAD_NUMBERS = 8  # free numbers of a load: its power, its base, shares at four temperatures, a memory, the errors' size
 LEAST_SPREAD = 0.5 * float(np.sqrt(2.0 * LOAD_NUMBERS))  # sd of a load's gain on noise: of half a χ² of so many
-EARLY = 3  # surrogates, after which one that gains as much ends the test: p is 0.25 at least, and the rest saves time
+# Surrogates after which one that gains as much ends the test (p is 0.25 at least); and after which p ends it where more
+# of them would hardly change the answer: the level is missed, or met, by a factor `SURE`. Both save time.
+FIRST_LOOK, SECOND_LOOK, SURE = 3, 6, 10.0
 
 
 @dataclass(frozen=True)
@@ -40,14 +43,22 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
         return None
     model, gain = _best(rows)
     noise = estimate_noise(rows.residual_w / rows.wide, rows.trip, rows.duration_s, levels=False)
-    others = []
-    for _ in range(training.settings.shifts):
+    others, most = list[float](), training.settings.shifts
+    level = training.settings.fdr / len(training.library)
+    for _ in range(most):
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
-        if len(others) == EARLY and gain <= max(others):
+        if len(others) == FIRST_LOOK and gain <= max(others):
             return Tested(model, gain, 1.0)
-    spread = max(float(np.std(others, ddof=1)), LEAST_SPREAD) * np.sqrt(1.0 + 1.0 / len(others))
-    p = float(stats.t.sf((gain - np.mean(others)) / spread, len(others) - 1))
-    return Tested(model, gain, p)
+        if len(others) == SECOND_LOOK and (_p(gain, others) * SURE < level or _p(gain, others, most) > SURE * level):
+            break
+    return Tested(model, gain, _p(gain, others))
+
+
+def _p(gain: float, others: Sequence[float], count: int | None = None) -> float:
+    """p of a gain among those of noise, taken as normal; or what it would be if `count` of them had this spread."""
+    n = count or len(others)
+    spread = max(float(np.std(others, ddof=1)), LEAST_SPREAD) * np.sqrt(1.0 + 1.0 / n)
+    return float(stats.t.sf((gain - np.mean(others)) / spread, n - 1))
 
 
 def some_rows(rows: StateRows) -> StateRows:

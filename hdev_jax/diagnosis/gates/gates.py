@@ -5,6 +5,7 @@ Each is a function of the candidate's score and of the scores of all, and return
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -39,6 +40,11 @@ class Asked:
     def unit(self) -> str:
         """What a cluster is, in words."""
         return self.scores.baseline.clusters.pieces
+
+    @cached_property
+    def stability(self) -> float:
+        """`stability` of the score, drawn once."""
+        return stability(self)
 
 
 Gate = Callable[[Asked], Rejection | None]
@@ -130,10 +136,9 @@ def _beats_placebos(a: Asked) -> Rejection | None:
 
 
 def _stable(a: Asked) -> Rejection | None:
-    share = stability(a)
-    if share >= a.scores.settings.stable:
+    if a.stability >= a.scores.settings.stable:
         return None
-    return Rejection(Kind.UNSTABLE, {"percent": 100.0 * share, "unit": a.unit})
+    return Rejection(Kind.UNSTABLE, {"percent": 100.0 * a.stability, "unit": a.unit})
 
 
 SCORE_GATES: tuple[Gate, ...] = (
@@ -208,9 +213,9 @@ def stability(a: Asked) -> float:
             inexact=settings.inexact,
         )
     }  # fmt: skip
-    small = [scores.evidence(s).only(s.candidate) for s in rivals]
+    small = [scores.evidence(s).only([s.candidate]) for s in rivals]
     drawn = np.stack([a.rng.integers(0, g, g) for _ in range(RESAMPLES)])
-    gains = np.stack([_gains_of(s, *own, drawn) for s, own in zip(rivals, small, strict=True)])
+    gains = np.stack([_gains_of(s, evidence, c, drawn) for s, (evidence, (c,)) in zip(rivals, small, strict=True)])
     worths = gains + np.array([[worth(0.0, s.candidate, settings)] for s in rivals])
     named = np.array([s.candidate.id in names for s in rivals])
     return float(np.mean(named[np.argmax(worths, axis=0)] & (np.max(worths, axis=0) > 0)))

@@ -62,8 +62,9 @@ class Evidence(NormalEquations):
             for v in np.unique(suits).tolist():
                 here = np.flatnonzero(suits == v)
                 beta, gain = x[v, here, self.base :], likelihood[v, here] - before
-                full = self._jackknife(at[here], v)
-                left_out = missed - np.sum(self._loss(full, self._with_base(at[here]), v), axis=0) - self.cost[v]
+                blocks = self._blocks(at[here], v)
+                full = self._jackknife(blocks)
+                left_out = missed - np.sum(self._loss(full, blocks), axis=0) - self.cost[v]
                 p_model = stats.chi2.sf(2 * np.maximum(gain, 0.0), at.shape[-1])
                 p_cluster = wald(beta, full[..., self.base :])
                 for i, k in enumerate(places[here]):
@@ -79,7 +80,7 @@ class Evidence(NormalEquations):
         likelihood, x = self._fit(self.totals(), at)
         v = int(np.argmax(likelihood))
         beta, g = x[v, self.base :], self.count
-        spread = self._jackknife(at, v)[:, self.base :] - beta
+        spread = self._jackknife(self._blocks(at, v))[:, self.base :] - beta
         return beta, np.sqrt((g - 1) / g * np.sum(spread**2, axis=0))
 
     def bearing(self, candidate: Candidate) -> Float[np.ndarray, " k"]:
@@ -100,7 +101,7 @@ class Evidence(NormalEquations):
         index = self._with_base(at)
         normal = self._normal(totals[v], at)[0]
         weights = np.stack([solved(normal, e) for e in np.eye(len(index))[self.base :]])
-        variance = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v)[:, index[:, None], index], weights)
+        variance = np.einsum("ki,gij,kj->kg", weights, self.by_cluster(v, index), weights)
         variance = np.maximum(variance, 0.0)  # rounding of what the levels take off
         return variance / np.maximum(np.sum(variance, axis=1, keepdims=True), 1e-300)
 
@@ -125,9 +126,9 @@ class Evidence(NormalEquations):
         for places, at in self._alike([c.columns for c in candidates], g):
             k = at.shape[-1]
             likelihood, x = self._fit(totals, at)
-            gain, full = self._plain_gain(at, x[0])
-            beta = x[0, :, self.base :]
-            better = self._base_loss(0)[:, None] - self._loss(full, self._with_base(at), 0)
+            blocks, beta = self._blocks(at, 0), x[0, :, self.base :]
+            gain, full = self._plain_gain(blocks, beta)
+            better = self._base_loss(0)[:, None] - self._loss(full, blocks)
             t = np.mean(better, axis=0) / (np.std(better, axis=0) + 1e-300) * np.sqrt(g)
             # as much of it as clusters keep that are left out of the fit
             whole = np.max(likelihood, axis=0) - self.base_likelihood(totals)
@@ -145,12 +146,13 @@ class Evidence(NormalEquations):
     def plain_gain(self, columns: Sequence[int]) -> float:
         """The gain of `plain_score` alone, for resampling."""
         at = self.base + np.asarray(columns, dtype=int)
-        return float(self._plain_gain(at, self._fit(np.sum(self.by_cluster(0), axis=0)[None], at)[1][0])[0])
+        beta = self._fit(self.totals()[:1], at)[1][0, self.base :]
+        return float(self._plain_gain(self._blocks(at, 0), beta)[0])
 
-    def _plain_gain(self, at: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gains of ways [*way k] with these coefficients [*way n], and the coefficients with each cluster left out."""
-        full, k, g = self._jackknife(at, 0), at.shape[-1], self.count
-        p = wald(x[..., self.base :], full[..., self.base :])
+    def _plain_gain(self, blocks: np.ndarray, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gains of ways by `_blocks` and coefficients [*way k], and all coefficients with each cluster left out."""
+        full, k, g = self._jackknife(blocks), beta.shape[-1], self.count
+        p = wald(beta, full[..., self.base :])
         if g < least_clusters(k):
             return np.zeros_like(p), full
         # the likelihood ratio that an F of this size stands for; p can underflow, its logarithm here is bounded
@@ -164,7 +166,7 @@ class Evidence(NormalEquations):
             return 1.0
         likelihood, x = self._fit(self.totals(), at)
         v, skip = int(np.argmax(likelihood)), self.base + len(other)
-        return float(wald(x[v, skip:], self._jackknife(at, v)[:, skip:]))
+        return float(wald(x[v, skip:], self._jackknife(self._blocks(at, v))[:, skip:]))
 
     def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
         """The same evidence with the candidate's columns given a sign in each cluster."""
@@ -189,19 +191,19 @@ class Evidence(NormalEquations):
 
         Whether a cluster that is left out has it is not known: it is as likely as among the others.
         """
-        x = self.within(on)._jackknife(np.array([self.base]), 0)
-        index = np.arange(self.base + 1)
+        at = np.array([self.base])
+        x, blocks = self._jackknife(self.within(on)._blocks(at, 0)), self._blocks(at, 0)
         share = np.clip((np.sum(on) - on) / (len(on) - 1), 1e-9, 1.0 - 1e-9)
-        with_it, without = (self._loss(x * np.r_[np.ones(self.base), k], index, 0) for k in (1.0, 0.0))
+        with_it, without = (self._loss(x * np.r_[np.ones(self.base), k], blocks) for k in (1.0, 0.0))
         either = np.logaddexp(np.log(share) - with_it, np.log1p(-share) - without)
         return float(np.sum(self._base_loss(0) + either))
 
     def sign_placebos(self, s: Score, rng: np.random.Generator, draws: int) -> Float[np.ndarray, " draw"]:
         """Gains of the same columns with each cluster's sign drawn at random: what no consistent effect would give."""
-        small, candidate = self.only(s.candidate)
+        small, (candidate,) = self.only([s.candidate])
         out = np.zeros(draws)
         # what lives in k clusters meets itself, up to its sign, in one draw of 2^(k−1): that is no placebo
-        energy = np.einsum("gii->g", small.by_cluster(0)[:, self.base : -1, self.base : -1])
+        energy = np.einsum("gii->g", small.by_cluster(0, self.base + np.arange(len(candidate.columns))))
         for i in range(draws):
             sign = rng.choice([-1.0, 1.0], size=self.count)
             if abs(sign @ energy) > 0.98 * energy.sum():
@@ -211,9 +213,11 @@ class Evidence(NormalEquations):
             out[i] = other.plain_gain(columns) if s.plain else other.gain(other.totals(), columns)[0]
         return out
 
-    def only(self, candidate: Candidate) -> tuple["Evidence", Candidate]:
-        """Evidence of one candidate alone, and the candidate with its columns' places in it."""
-        index = np.r_[np.arange(self.base), self.base + np.asarray(candidate.columns), self.grams.shape[-1] - 1]
+    def only(self, candidates: Sequence[Candidate]) -> tuple["Evidence", list[Candidate]]:
+        """Evidence of some candidates alone, and these with their columns' places in it."""
+        places = list(dict.fromkeys(k for c in candidates for k in c.columns))
+        index = np.r_[np.arange(self.base), self.base + np.array(places, dtype=int), self.grams.shape[-1] - 1]
         grams, levels = self.grams[:, index[:, None], index[None, :]], self.levels[:, index]
-        small = replace(self, grams=grams, levels=levels)
-        return small, replace(candidate, columns=tuple(range(len(candidate.columns))))
+        at = {k: i for i, k in enumerate(places)}
+        moved = [replace(c, columns=tuple(at[k] for k in c.columns)) for c in candidates]
+        return replace(self, grams=grams, levels=levels), moved

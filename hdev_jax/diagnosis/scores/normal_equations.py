@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hdev_jax.diagnosis.scores.significance import wald
-from hdev_jax.segments import trip_slices
 
 __all__ = ["NormalEquations", "solved"]
 
@@ -43,7 +42,6 @@ class NormalEquations:
     base: int
     precision: Float[np.ndarray, " base"]
     pull: Float[np.ndarray, " base"]
-    _kept: dict[int, np.ndarray] = field(init=False, repr=False, compare=False, default_factory=dict)
     _missed: dict[int, np.ndarray] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     @property
@@ -59,17 +57,15 @@ class NormalEquations:
     def _shrink(self, v: int) -> np.ndarray:
         return self.variances[v] / (1.0 + self.variances[v] * self.squares)
 
-    def by_cluster(self, v: int) -> Float[np.ndarray, "cluster d d"]:
-        """Gram matrices with random intercepts of the v-th variance taken out."""
-        if not self.variances[v]:
-            return self.grams
-        if v not in self._kept:
-            out, shrink = self.grams.copy(), self._shrink(v)
-            for g, part in trip_slices(self.home):
-                out[g] -= (self.levels[part] * shrink[part, None]).T @ self.levels[part]
-            self._kept.clear()  # one variance at a time: each is as large as all Gram matrices
-            self._kept[v] = out
-        return self._kept[v]
+    def by_cluster(self, v: int, at: Int[np.ndarray, "*way n"]) -> Float[np.ndarray, "cluster *way n n"]:
+        """Gram matrices of the columns `at` with random intercepts of the v-th variance taken out."""
+        out = self.grams[:, at[..., :, None], at[..., None, :]]
+        if self.variances[v]:
+            levels = self.levels[:, at]
+            shrunk = levels * self._shrink(v).reshape(-1, *(1,) * at.ndim)
+            starts = np.flatnonzero(np.r_[True, np.diff(self.home) != 0])  # trips of a cluster stand together
+            out[self.home[starts]] -= np.add.reduceat(shrunk[..., :, None] * levels[..., None, :], starts, axis=0)
+        return out
 
     @cached_property
     def _total(self) -> np.ndarray:
@@ -201,36 +197,39 @@ class NormalEquations:
         d = np.sqrt(np.diag(normal))
         model = np.linalg.pinv(normal / np.outer(d, d), rcond=1e-12) / np.outer(d, d)
         own = np.sqrt(np.diag(model))
-        error = np.maximum(own, np.sqrt((g - 1) / g * np.sum((self._jackknife(none, v) - x[v]) ** 2, axis=0)))
+        left_out = self._jackknife(self._blocks(none, v))
+        error = np.maximum(own, np.sqrt((g - 1) / g * np.sum((left_out - x[v]) ** 2, axis=0)))
         scale = np.divide(error, own, out=np.ones_like(own), where=own > 0)
         return x[v], model * np.outer(scale, scale)
 
     def present(self, at: Sequence[int], values: Float[np.ndarray, " k"]) -> float:
         """p of base columns against being taken out: their values against zero with jackknifed clusters."""
-        likelihood, x = self._fit(self.totals(), np.empty(0, int))
+        none, index = np.empty(0, int), np.asarray(at)
+        likelihood, x = self._fit(self.totals(), none)
         v = int(np.argmax(likelihood))
-        index = np.asarray(at)
-        return float(wald(x[v, index] + values, self._jackknife(np.empty(0, int), v)[:, index] + values))
+        return float(wald(x[v, index] + values, self._jackknife(self._blocks(none, v))[:, index] + values))
 
-    def _jackknife(self, at: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way n"]:
-        """Coefficients of base and `at` columns [*way k] with each cluster left out in turn."""
-        index = np.concatenate([self._with_base(at), np.full((*at.shape[:-1], 1), self.grams.shape[-1] - 1)], axis=-1)
-        grams = self.by_cluster(v)[:, index[..., :, None], index[..., None, :]]
-        a, b = self._normal(grams.sum(axis=0) - grams, np.arange(self.base, index.shape[-1] - 1))
+    def _blocks(self, at: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way m m"]:
+        """`by_cluster` of the base columns, those at `at` [*way k] and the residual."""
+        last = np.full((*at.shape[:-1], 1), self.grams.shape[-1] - 1)
+        return self.by_cluster(v, np.concatenate([self._with_base(at), last], axis=-1))
+
+    def _jackknife(self, blocks: np.ndarray) -> Float[np.ndarray, "cluster *way n"]:
+        """Coefficients of the columns of `_blocks` with each cluster left out in turn."""
+        a, b = self._normal(blocks.sum(axis=0) - blocks, np.arange(self.base, blocks.shape[-1] - 1))
         return solved(a, b) if a.shape[-1] else b
 
-    def _loss(self, x: np.ndarray, index: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way"]:
-        """Half the sum of squares of each cluster under its own left-out coefficients of columns `index` [*way n]."""
-        grams = self.by_cluster(v)
-        inner, cross = grams[:, index[..., :, None], index[..., None, :]], grams[:, index, -1]
-        own = grams[:, -1, -1].reshape(-1, *(1,) * (index.ndim - 1))
-        fitted = np.matmul(inner, x[..., None])[..., 0] - 2.0 * cross
-        return 0.5 * (own + np.einsum("...i,...i->...", x, fitted))
+    @staticmethod
+    def _loss(x: np.ndarray, blocks: np.ndarray) -> Float[np.ndarray, "cluster *way"]:
+        """Half the sum of squares of each cluster of `_blocks` under its own left-out coefficients [cluster *way n]."""
+        fitted = np.matmul(blocks[..., :-1, :-1], x[..., None])[..., 0] - 2.0 * blocks[..., :-1, -1]
+        return 0.5 * (blocks[..., -1, -1] + np.einsum("...i,...i->...", x, fitted))
 
     def _base_loss(self, v: int) -> Float[np.ndarray, " cluster"]:
         """`_loss` of the base alone, the same for every candidate."""
         if v not in self._missed:
-            self._missed[v] = self._loss(self._jackknife(np.empty(0, int), v), np.arange(self.base), v)
+            blocks = self._blocks(np.empty(0, int), v)
+            self._missed[v] = self._loss(self._jackknife(blocks), blocks)
         return self._missed[v]
 
     def moved(self, step: Float[np.ndarray, " base"]) -> "NormalEquations":

@@ -94,8 +94,9 @@ class Sums:
         """
         precision = 1.0 / prior_sd**2
         trips = slice(None) if level_sd > 0 else slice(0, 0)
+        grams = self.grams if variance == 1.0 else self.grams / variance
         return Evidence(
-            self.grams / variance, self.levels[trips], self.squares[trips], self.home[trips],
+            grams, self.levels[trips], self.squares[trips], self.home[trips],
             np.array(LEVELS if level_sd > 0 else (0.0,)) * level_sd**2, base, precision, precision * moved,
         )  # fmt: skip
 
