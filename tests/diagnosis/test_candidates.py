@@ -143,9 +143,13 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
     assert len(programs[0]) == 1
 
 
-def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows):
+@pytest.mark.parametrize("short", [True, False])
+def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows, monkeypatch, short):
     """Beside effects of one row, across rows (a delay of the readings) and of the instrument, with every coefficient
-    free; whatever was found, the kernel is compiled once, and each instrument."""
+    free; whatever was found, the kernel is compiled once, and each instrument. Of a long log vehicles share none, and
+    one is compiled once for each set of effects."""
+    if not short:
+        monkeypatch.setattr("hdev_jax.diagnosis.candidates.shared.SHORT_ROWS", rows.rows - 1)
     facts = facts_of(rows.segments, rows.rows)
     found = [
         with_values(LIBRARY["auxiliary_power"], facts.gears, power_w=900.0),
@@ -168,10 +172,13 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows)
         plain = np.asarray(predict(vehicle, rows.segments, problem.target))
         shared = kernel.predict(vehicle, rows.segments, problem.target)
         assert np.all(np.abs(shared - plain) <= 1e-12 * np.max(np.abs(plain)))
-        _, part, after = kernel._of_table(vehicle, table)[0].parts
+        whole = kernel._of_table(vehicle, table, shared=short)[0]
+        assert kernel._of_table(table.insert(vehicle, theta), table, shared=short)[0] is whole
+        _, part, after = whole.parts
         programs.add((part.structure, jax.tree.structure(part.car)))
         instruments |= {(x.structure, jax.tree.structure(x.car)) for x in after}
-    assert len(programs) == 1
+    assert kernel.serves(vehicle, problem.target) == short
+    assert len(programs) == (1 if short else 2)
     assert len(instruments) == 2
 
 
@@ -198,7 +205,8 @@ def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows)
         ]
         vehicle, sizes = problem.vehicle.plus(*has), ["power_w", "loss"]
         table = ParameterTable((*problem.table.rows, *(c for e in has for c in effect_coefficients(e, sizes))))
-        assert kernel._of_library(vehicle, problem.target)
+        assert kernel._of_library(vehicle)
+        assert kernel.serves(vehicle, problem.target)
         programs.append(kernel._of_table(vehicle, table)[0])
         if more:  # another program of the same kind
             continue

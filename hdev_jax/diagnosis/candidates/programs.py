@@ -16,7 +16,7 @@ from hdev_jax.physics import Effect, Grouped, Size, Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
-__all__ = ["Place", "Program", "Recipe", "computed", "written"]
+__all__ = ["PER_PASS", "SIDE_BY_SIDE", "Place", "Program", "Recipe", "computed", "written"]
 
 Place = tuple[str, int | None]  # a coefficient's path, and its group
 Structure = tuple[tuple[str, int | None, float, float], ...]
