@@ -30,9 +30,12 @@ STUDENT_DF = 4.0  # Lange, Little and Taylor, JASA 84 (1989): degrees of freedom
 WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty direction solvable, moves nothing else
 MOST_STEPS = 50
 SETTLED = 1e-3  # standard errors that a further step would move the estimate by
-LEAST_GAIN = 1e-3  # of a step, in log-likelihood: 0.04 standard errors; at a kink (a threshold) steps gain ever less
-# Damping of the first step; of the one after the first that gains nothing; how fast it then grows. It falls by how well
-# the step did as expected (Nielsen, Technical University of Denmark, IMM-REP-1999-05).
+LEAST_GAIN = 1e-3  # of a whole step, in log-likelihood: 0.04 standard errors
+NO_GAIN = 1e-6  # what a step that fails had to gain at least, for a shorter one to be tried
+FEW_GAINS = 4  # steps in a row that gain so little: at a kink (a threshold) they go on gaining ever less
+# Damping of the first step; of the one after the first that fails; how much faster it grows with each failure. After a
+# step that succeeds it falls by how well the gain was foreseen (after Nielsen, Technical University of Denmark,
+# IMM-REP-1999-05).
 UNDAMPED, DAMPED, GROWTH = 1e-9, 1e-2, 4.0
 UNBOUNDED = 1e9  # a bound beyond it is none
 
@@ -184,6 +187,7 @@ class _Problem:
         if np.any(start != point.theta):
             point = self.at(start)
         z, damping, growth, cost = np.zeros(len(start)), UNDAMPED, GROWTH, self.cost(point, weight)
+        few = 0  # steps in a row that gained little
         precision = 1.0 / self.prior_sd**2
         for step in range(1, MOST_STEPS + 1):
             _, slope = _jacobian_of(structure, start, self.scale, z)
@@ -203,16 +207,17 @@ class _Problem:
                 return point, False, "the normal equations are singular; give the coefficients priors", step
             expected = float(move @ gradient - 0.5 * move @ hessian @ move)
             trial = self.at(_jacobian_of(structure, start, self.scale, z + move)[0])
-            gained = cost - self.cost(trial, weight) if trial.finite else -np.inf
-            least = max(LEAST_GAIN, 1e-13 * cost)  # less is rounding
-            if gained > 0:
-                point, z, cost = trial, z + move, cost - gained
-                as_expected = 2.0 * min(gained / max(expected, 1e-300), 1.0) - 1.0
-                damping, growth = max(damping * max(0.1, 1.0 - as_expected**3), UNDAMPED), GROWTH
-                if gained < least:
+            cost_there = self.cost(trial, weight) if trial.finite else np.inf
+            if cost_there < cost:
+                gained, whole = cost - cost_there, expected > 0.25 * float(newton @ right)  # half of what it would gain
+                point, z, cost = trial, z + move, cost_there
+                foreseen = 2.0 * min(gained / max(expected, 1e-300), 1.0) - 1.0
+                damping, growth = max(damping * max(0.1, 1.0 - foreseen**3), UNDAMPED), GROWTH
+                few = few + 1 if gained < LEAST_GAIN else 0
+                if few and (whole or few == FEW_GAINS):
                     return point, True, "converged", step
             else:
-                if expected < least:
+                if expected < NO_GAIN:
                     return point, True, "converged", step
                 damping, growth = max(damping * growth, DAMPED), growth * GROWTH
         return point, False, f"stopped after {MOST_STEPS} steps; start nearer or give a prior", MOST_STEPS
@@ -291,6 +296,8 @@ def calibrate(
             pull = np.abs(1.0 - (sigma**2 * inflation) / (new_sigma**2 * new_inflation))
             pull = pull * (point.theta - prior) / prior_sd**2
             settled = bool(np.all(np.abs(covariance @ pull) < 0.01 * np.sqrt(np.diag(covariance))))
+            # what ended the steps was measured by the noise before: with half of it they may have ended early
+            settled = settled and sigma**2 * inflation < 4.0 * new_sigma**2 * new_inflation
         sigma, inflation = new_sigma, new_inflation
         if settled:
             break

@@ -9,7 +9,7 @@ from planted import declared, opened, training
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.state import Verdict
 from hdev_jax.diagnosis.competition.verdicts import verdicts_of
-from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class, stability
+from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection, sentence
 from hdev_jax.diagnosis.remainder.remainder import Remainder
 from hdev_jax.diagnosis.result.summary import _not_decidable
@@ -45,7 +45,7 @@ def asked(log, scores, id_: str, **values) -> Asked:
 def test_what_is_there_passes_every_gate(log, scores):
     a = asked(log, scores, "standstill_load")
     assert first_rejection(a, EVERY) is None
-    assert stability(a) > 0.9
+    assert a.stability > 0.9
     assert of_class(a) == ()
 
 

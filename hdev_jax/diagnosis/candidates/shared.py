@@ -1,6 +1,6 @@
 """The kernel that the vehicles of one search share: every effect of the library is in it, at its null where it was not
 found, so that it is compiled once. (Effects with a search of their own are in it once they are found: it is compiled
-again for each.)"""
+again for each.) On long logs, where absent effects cost more than compiling, each set of effects has its own."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -56,8 +56,9 @@ class SharedKernel:
         return Program.of(base, {**rest, **{e.id: e for e in more}}.values(), found, declared)
 
     def _own_program(self, vehicle: Vehicle, declared: Sequence[Place]) -> Program:
-        """The vehicle alone, with the parameters of its effects as arguments. Of a long log its derivatives take a
-        third of the time that they take in one piece: what acts across rows is apart."""
+        """The vehicle alone, with the parameters of its effects as arguments: for a log that shared programs do not
+        serve. Derivatives take a third of the time that they take in one piece, where all of them would go through the
+        corrections across rows, which few coefficients change."""
         return Program.of(vehicle, (), [e.id for e in vehicle.effects if type(e) not in DECLARED], declared)
 
     def serves(self, vehicle: Vehicle, target: TargetName) -> bool:

@@ -61,8 +61,10 @@ def two_exchanged(round_: Round) -> State | None:
     """The state with two found effects exchanged for two others, each of which passes every gate beside the other."""
     training, state, scores = round_.training, round_.state, round_.scores
     asked = [f for f in state.found if can_be_asked(f) and not f.score.plain]
+    if len(asked) < 2:
+        return None
     out = {*state.barred, *state.refused, *round_.reasons, *scores.absorbed_by}
-    # each in its best way alone: every pair that is out has equations of its own, of all columns a tenth of a gigabyte
+    # each effect in its best way alone: the equations of all columns are 0.1 GB, and each pair copies them
     small, open_ = scores.white.only([s.candidate for k, s in scores.best.items() if k not in out and not s.plain])
     for f, g in combinations(asked, 2):
         ahead = _best_pair(round_, model_without(small, scores.baseline.fit, f, g), open_)
@@ -87,8 +89,8 @@ def two_exchanged(round_: Round) -> State | None:
 
 
 def _best_pair(round_: Round, w: Without, open_: Sequence[Candidate]) -> list[Candidate] | None:
-    """The plausible pair of those that are `open_` that explains most in place of the two that are out; None where it
-    is not well ahead."""
+    """The best plausible pair of the candidates `open_` to replace the two that `w` is without; None where it is not
+    well ahead."""
     scores, settings, totals = round_.scores, round_.training.settings, w.evidence.totals()
     rivals = w.rivals(open_)
     pairs = list(combinations([c for c in rivals if c.kind == "size"], 2))
@@ -102,7 +104,9 @@ def _best_pair(round_: Round, w: Without, open_: Sequence[Candidate]) -> list[Ca
 
     # a third effect that is only not added yet is no reason for an exchange
     own = worths([w.each, *((*w.each, c) for c in rivals)])
-    to_beat, of_pairs = float(np.max(own, where=np.isfinite(own), initial=-np.inf)), worths(pairs)
+    if not np.any(np.isfinite(own)):
+        return None
+    to_beat, of_pairs = float(np.max(own[np.isfinite(own)])), worths(pairs)
     for k in np.argsort(-of_pairs):
         if not _well_ahead(round_, float(of_pairs[k]), to_beat):
             return None

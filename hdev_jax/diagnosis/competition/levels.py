@@ -22,8 +22,9 @@ LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
 LOAD_NUMBERS = 8  # free numbers of a load: its power, its base, shares at four temperatures, a memory, the errors' size
 LEAST_SPREAD = 0.5 * float(np.sqrt(2.0 * LOAD_NUMBERS))  # sd of a load's gain on noise: of half a χ² of so many
-# Surrogates after which one that gains as much ends the test (p is 0.25 at least); and after which p ends it where more
-# of them would hardly change the answer: the level is missed, or met, by a factor `SURE`. Both save time.
+# Surrogates after which the test may end, to save time: at the first look where one of them gains as much (p is 0.25 at
+# least); at the second where p meets the level, or by its spread so far would miss it, by a factor `SURE`. That adds a
+# tenth of the level to its false alarms at most.
 FIRST_LOOK, SECOND_LOOK, SURE = 3, 6, 10.0
 
 

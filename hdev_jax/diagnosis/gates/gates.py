@@ -20,7 +20,7 @@ from hdev_jax.diagnosis.scores.significance import least_clusters
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference import Chunk
 
-__all__ = ["DRAWN_GATES", "MOST_IN_CLASS", "RESAMPLES", "SCORE_GATES", "Asked", "alike", "first_rejection", "stability"]
+__all__ = ["DRAWN_GATES", "MOST_IN_CLASS", "RESAMPLES", "SCORE_GATES", "Asked", "alike", "first_rejection"]
 
 MOST_IN_CLASS = 2  # members of a class that are listed at most: contract, part 4
 RESAMPLES = 100  # sets of clusters: a share to ± 5 points
@@ -43,8 +43,9 @@ class Asked:
 
     @cached_property
     def stability(self) -> float:
-        """`stability` of the score, drawn once."""
-        return stability(self)
+        """Share of resampled sets of clusters in which the same effect, one of its class, or one of more numbers in
+        whose class it is, comes first of its kind."""
+        return _stability(self)
 
 
 Gate = Callable[[Asked], Rejection | None]
@@ -188,13 +189,9 @@ def alike(
     return tuple(sorted(found, key=lambda id_: -found[id_]))
 
 
-def stability(a: Asked) -> float:
-    """Share of resampled sets of clusters in which the same effect, one of its class, or one of more numbers in whose
-    class it is, comes first of its kind.
-
-    Its rivals are the candidates with p at most 0.01 before any correction that no joint refit or placebo has turned
-    down.
-    """
+def _stability(a: Asked) -> float:
+    """`Asked.stability`. Its rivals are the candidates with p at most 0.01 before any correction that no joint refit or
+    placebo has turned down."""
     scores, chosen = a.scores, a.score
     settings, g = scores.settings, scores.white.count
     names = {chosen.candidate.id, *of_class(a)[:MOST_IN_CLASS]}

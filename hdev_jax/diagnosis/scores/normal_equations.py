@@ -63,7 +63,7 @@ class NormalEquations:
         if self.variances[v]:
             levels = self.levels[:, at]
             shrunk = levels * self._shrink(v).reshape(-1, *(1,) * at.ndim)
-            starts = np.flatnonzero(np.r_[True, np.diff(self.home) != 0])  # trips of a cluster stand together
+            starts = np.flatnonzero(np.r_[True, np.diff(self.home) != 0])  # a cluster's trips follow one another
             out[self.home[starts]] -= np.add.reduceat(shrunk[..., :, None] * levels[..., None, :], starts, axis=0)
         return out
 
@@ -140,7 +140,7 @@ class NormalEquations:
         holds of `cells` matrices for each."""
         count = np.array([len(w) for w in ways], dtype=int)
         for k in np.unique(count):
-            places, size = np.flatnonzero(count == k), cells * (self.base + int(k) + 1) ** 2
+            places, size = np.flatnonzero(count == k), max(cells, len(self.home)) * (self.base + int(k) + 1) ** 2
             for part in np.array_split(places, min(len(places), -(-len(places) * size // AT_ONCE))):
                 yield part, self.base + np.array([ways[i] for i in part], dtype=int)
 
