@@ -182,9 +182,13 @@ def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows,
     assert len(instruments) == 2
 
 
-def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows):
+@pytest.mark.parametrize("short", [True, False])
+def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows, monkeypatch, short):
     """A load that switches, by its decoded state, a cycle with a phase and a mode in each trip, the last of them
-    unknown: one program whatever their sizes and phases, another one where a trip more has a phase."""
+    unknown: one program whatever their sizes and phases, another one where a trip more has a phase; of a long log also
+    where there is one effect more."""
+    if not short:
+        monkeypatch.setattr("hdev_jax.diagnosis.candidates.shared.SHORT_ROWS", rows.rows - 1)
     facts = facts_of(rows.segments, rows.rows)
     segments = rows.segments.with_channels(**{"derived:switching_load": np.arange(len(rows.measured)) // 7 % 2.0})
     trips = int(np.max(np.asarray(segments.trip)))
@@ -206,8 +210,8 @@ def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows)
         vehicle, sizes = problem.vehicle.plus(*has), ["power_w", "loss"]
         table = ParameterTable((*problem.table.rows, *(c for e in has for c in effect_coefficients(e, sizes))))
         assert kernel._of_library(vehicle)
-        assert kernel.serves(vehicle, problem.target)
-        programs.append(kernel._of_table(vehicle, table)[0])
+        assert kernel.serves(vehicle, problem.target) == short
+        programs.append(kernel._of_table(vehicle, table, shared=short)[0])
         if more:  # another program of the same kind
             continue
         expected = linearised(vehicle, table, segments, problem.target)
@@ -215,7 +219,7 @@ def test_the_shared_kernel_has_the_effects_that_were_searched_for(problem, rows)
         for a, b in zip(got, expected, strict=True):
             assert np.all(np.abs(a - b) <= 1e-9 * np.max(np.abs(b), axis=0))
         np.testing.assert_allclose(kernel.predict(vehicle, segments, problem.target), expected[0], rtol=1e-9)
-    assert programs[0] is programs[1]
+    assert (programs[0] is programs[1]) == short
     assert programs[1] is not programs[2]
 
 

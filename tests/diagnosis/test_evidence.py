@@ -286,6 +286,41 @@ def test_one_candidate_alone():
     np.testing.assert_allclose(one[1], other[1])
 
 
+def test_some_candidates_alone_share_their_columns():
+    evidence = Rows().evidence()
+    small, (one, two) = evidence.only([candidate(2, 0), candidate(0)])
+    assert (one.columns, two.columns) == ((0, 1), (1,))
+    for own, there in ((one, candidate(2, 0)), (two, candidate(0))):
+        assert small.score(own).gain == pytest.approx(evidence.score(there).gain)
+        assert small.score(own).p_cluster == pytest.approx(evidence.score(there).p_cluster)
+    none, left = evidence.only([])
+    assert not left
+    assert none.base_likelihood(none.totals()) == pytest.approx(evidence.base_likelihood(evidence.totals()))
+
+
+def test_trips_of_a_cluster_have_levels_of_their_own():
+    """Nine trips in four clusters: each cluster's rows less what the intercepts of its trips take, trip by trip."""
+    rows = Rows()
+    home = np.array([0, 0, 0, 1, 2, 2, 3, 3, 3])
+    ids, trips = home[rows.ids], [s for _, s in trip_slices(rows.ids)]
+    white = rows.white
+    sums = Sums(white.shape[1] - 1, 4, len(trips))
+    sums.add(white[:, :-1], ids)
+    sums.add_levels(white[:, :-1], white[:, -1], ids, trips)
+    evidence = sums.evidence(BASE, level_sd=0.8, moved=MOVED, prior_sd=PRIOR_SD)
+    at = np.array([3, 0, 5])
+    for v, variance in enumerate(evidence.variances):
+        expected = np.zeros((4, 3, 3))
+        for t, s in enumerate(trips):
+            x, one = white[s][:, at], white[s][:, -1:]
+            covariance = np.eye(len(x)) + variance * one @ one.T
+            expected[home[t]] += x.T @ np.linalg.solve(covariance, x)
+        np.testing.assert_allclose(evidence.by_cluster(v, at), expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            evidence.by_cluster(v, np.array([at, at[::-1]]))[:, 0], expected, rtol=1e-9, atol=1e-9
+        )
+
+
 def test_plain_rows_count_clusters_alone():
     """The rows' variance scales the prior, nothing else: p does not change with it when there is hardly any prior."""
     rows = Rows(level=0.0)

@@ -124,6 +124,31 @@ def test_noise_has_no_levels(noise, short):
     assert result is None or result.p * len(LIBRARY) > 0.05
 
 
+@pytest.mark.parametrize("load_w", [6e3, 0.0])
+def test_a_clear_answer_needs_few_surrogates(short, load_w):
+    """A load that is far from noise, and noise: six in place of nineteen, and the answer is as clear."""
+
+    class Counting(np.random.Generator):
+        drawn = 0
+
+        def choice(self, *args, **options):
+            self.drawn += 1
+            return super().choice(*args, **options)
+
+    trips, n = 8, 400
+    rng = np.random.default_rng(2)
+    on = (np.arange(trips * n) // 45 % 2).astype(float)
+    rows = StateRows(
+        load_w * on + 500.0 * rng.standard_normal(trips * n), np.repeat(np.arange(trips), n), np.ones(trips * n),
+        np.full(trips * n, 15.0), np.zeros(trips * n, int), 0.1,
+    )  # fmt: skip
+    counting = Counting(np.random.PCG64(0))
+    result = level_test(rows, short[-1], counting)
+    assert result is not None
+    assert (result.p * len(LIBRARY) < 0.01) == (load_w > 0)
+    assert counting.drawn <= 6 * trips
+
+
 def test_a_power_that_is_missing_constant_or_short_gives_no_load(short):
     rng = np.random.default_rng(0)
     for residual in (np.zeros(500), np.full(500, 3e3), np.array([1.0, 2.0]), np.r_[np.nan, np.ones(499)]):

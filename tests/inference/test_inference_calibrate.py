@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from inference_rows import C_RR_SD, PRIOR, PRIOR_SD, by_hand, closed_form, driving, power_kw, tabular, truck
+from scipy import optimize
 
 from hdev_jax.inference import Calibration, Coefficient, Fit, ParameterTable, calibrate, cluster_rows, padded
 from hdev_jax.physics import Grouped
@@ -295,6 +296,49 @@ def test_fit_is_a_pytree_of_one_shape():
     heavier = eqx.tree_at(lambda f: f.weight, fit, 2 * np.asarray(fit.weight))
     assert isinstance(heavier, Fit)
     assert heavier.rows == 10
+
+
+@pytest.mark.parametrize(
+    ("start", "apart", "hinge"),
+    [((0.3, 2.0), 0.03, 3.0), ((0.3, 0.3), 0.003, 0.0), ((2.0, 2.0), 0.003, 0.0), ((1.5, 0.2), 0.003, 0.0)],
+)
+def test_no_other_method_goes_further_from_where_a_fit_ends(start, apart, hinge):
+    """Two coefficients that hardly differ, in a model that bends, without and with a kink: whole steps overshoot, and
+    shorter ones gain little long before the optimum."""
+    s = driving(*(24,) * 10, seed=5)
+    rng = np.random.default_rng(3)
+    u = np.linspace(0.5, 2.0, len(s))
+    v = u + apart * rng.standard_normal(len(s))
+
+    def model(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a, b = theta / PRIOR
+        above = a * u > 1.2
+        value = np.exp(a * u) + np.exp(b * v) + hinge * np.where(above, a * u - 1.2, 0.0)
+        slopes = np.stack([u * np.exp(a * u) + hinge * above * u, v * np.exp(b * v)], axis=1)
+        return value, slopes / PRIOR
+
+    def linearise(vehicle, table, segments, target, theta=None) -> tuple[np.ndarray, np.ndarray]:
+        value, slopes = model(np.asarray(table.values(vehicle) if theta is None else theta))
+        more = len(segments) - len(value)
+        return np.r_[value, np.zeros(more)], np.r_[slopes, np.zeros((more, 2))]
+
+    y = model(PRIOR)[0] + 0.5 * rng.standard_normal(len(s))
+    fit = calibrate(
+        tabular().insert(truck(), jnp.asarray(np.array(start) * PRIOR)), tabular(30.0), padded(s, y), TARGET, cluster_rows(s),
+        linearise=linearise,
+    )  # fmt: skip
+    assert fit.converged
+
+    def cost(theta: np.ndarray) -> float:
+        rows = (y - model(theta)[0]) / fit.sigma
+        return 0.5 * float(rows @ rows) / fit.inflation + 0.5 * float(
+            np.sum(((theta / PRIOR - 1.0) * PRIOR / (30.0 * PRIOR_SD)) ** 2)
+        )
+
+    best = optimize.minimize(
+        lambda x: cost(x * fit.values), np.ones(2), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-9}
+    )
+    assert cost(fit.values) - best.fun < 5e-4
 
 
 def test_a_fit_that_runs_out_of_steps(monkeypatch):
