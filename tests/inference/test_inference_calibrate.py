@@ -323,17 +323,14 @@ def test_no_other_method_goes_further_from_where_a_fit_ends(start, apart, hinge)
         return np.r_[value, np.zeros(more)], np.r_[slopes, np.zeros((more, 2))]
 
     y = model(PRIOR)[0] + 0.5 * rng.standard_normal(len(s))
-    fit = calibrate(
-        tabular().insert(truck(), jnp.asarray(np.array(start) * PRIOR)), tabular(30.0), padded(s, y), TARGET, cluster_rows(s),
-        linearise=linearise,
-    )  # fmt: skip
+    vehicle = tabular().insert(truck(), jnp.asarray(np.array(start) * PRIOR))
+    fit = calibrate(vehicle, tabular(30.0), padded(s, y), TARGET, cluster_rows(s), linearise=linearise)
     assert fit.converged
 
     def cost(theta: np.ndarray) -> float:
         rows = (y - model(theta)[0]) / fit.sigma
-        return 0.5 * float(rows @ rows) / fit.inflation + 0.5 * float(
-            np.sum(((theta / PRIOR - 1.0) * PRIOR / (30.0 * PRIOR_SD)) ** 2)
-        )
+        prior = (theta - PRIOR) / (30.0 * PRIOR_SD)
+        return 0.5 * float(rows @ rows) / fit.inflation + 0.5 * float(prior @ prior)
 
     best = optimize.minimize(
         lambda x: cost(x * fit.values), np.ones(2), method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-9}
