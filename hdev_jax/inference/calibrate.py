@@ -31,12 +31,12 @@ WEAK = 1e3  # sd of what has no prior, in its own scales: keeps an empty directi
 MOST_STEPS = 50
 SETTLED = 1e-3  # standard errors that a further step would move the estimate by
 LEAST_GAIN = 1e-3  # of a whole step, in log-likelihood: 0.04 standard errors
-NO_GAIN = 1e-6  # what a step that fails had to gain at least, for a shorter one to be tried
-FEW_GAINS = 4  # steps in a row that gain so little: at a kink (a threshold) they go on gaining ever less
-# Damping of the first step; of the one after the first that fails; how much faster it grows with each failure. After a
-# step that succeeds it falls by how well the gain was foreseen (after Nielsen, Technical University of Denmark,
-# IMM-REP-1999-05).
-UNDAMPED, DAMPED, GROWTH = 1e-9, 1e-2, 4.0
+NO_GAIN = 1e-6  # expected gain below which a failed step is not shortened any more
+FEW_GAINS = 4  # successful steps in a row below `LEAST_GAIN` that end a fit: at a kink each gains less than the last
+# Damping of the first step, and its least; of the one after the first that fails; how much faster it grows with each
+# failure. After a step that succeeds it falls by how well the gain was foreseen (after Nielsen, Technical University of
+# Denmark, IMM-REP-1999-05).
+UNDAMPED, LEAST_DAMPED, DAMPED, GROWTH = 1e-9, 1e-12, 1e-2, 4.0
 UNBOUNDED = 1e9  # a bound beyond it is none
 
 
@@ -209,12 +209,13 @@ class _Problem:
             trial = self.at(_jacobian_of(structure, start, self.scale, z + move)[0])
             cost_there = self.cost(trial, weight) if trial.finite else np.inf
             if cost_there < cost:
-                gained, whole = cost - cost_there, expected > 0.25 * float(newton @ right)  # half of what it would gain
-                point, z, cost = trial, z + move, cost_there
+                gained = cost - cost_there
                 foreseen = 2.0 * min(gained / max(expected, 1e-300), 1.0) - 1.0
-                damping, growth = max(damping * max(0.1, 1.0 - foreseen**3), UNDAMPED), GROWTH
+                whole = expected > 0.25 * float(newton @ right)  # half of what the step would gain without damping
+                point, z, cost = trial, z + move, cost_there
+                damping, growth = max(damping * max(0.1, 1.0 - foreseen**3), LEAST_DAMPED), GROWTH
                 few = few + 1 if gained < LEAST_GAIN else 0
-                if few and (whole or few == FEW_GAINS):
+                if few and ((whole and foreseen > 0.0) or few == FEW_GAINS):
                     return point, True, "converged", step
             else:
                 if expected < NO_GAIN:
@@ -296,8 +297,8 @@ def calibrate(
             pull = np.abs(1.0 - (sigma**2 * inflation) / (new_sigma**2 * new_inflation))
             pull = pull * (point.theta - prior) / prior_sd**2
             settled = bool(np.all(np.abs(covariance @ pull) < 0.01 * np.sqrt(np.diag(covariance))))
-            # what ended the steps was measured by the noise before: with half of it they may have ended early
-            settled = settled and sigma**2 * inflation < 4.0 * new_sigma**2 * new_inflation
+        # the steps ended by what they gain over the noise before: with less than half of it they may have ended early
+        settled = settled and sigma**2 * inflation < 4.0 * new_sigma**2 * new_inflation
         sigma, inflation = new_sigma, new_inflation
         if settled:
             break

@@ -146,8 +146,8 @@ def test_programs_that_a_search_shares_make_the_same_columns(problem, rows):
 @pytest.mark.parametrize("short", [True, False])
 def test_the_shared_kernel_gives_the_same_prediction_and_jacobian(problem, rows, monkeypatch, short):
     """Beside effects of one row, across rows (a delay of the readings) and of the instrument, with every coefficient
-    free; whatever was found, the kernel is compiled once, and each instrument. Of a long log vehicles share none, and
-    one is compiled once for each set of effects."""
+    free; whatever was found, the kernel is compiled once, and each instrument. On a long log each set of effects has
+    its own program, compiled once."""
     if not short:
         monkeypatch.setattr("hdev_jax.diagnosis.candidates.shared.SHORT_ROWS", rows.rows - 1)
     facts = facts_of(rows.segments, rows.rows)

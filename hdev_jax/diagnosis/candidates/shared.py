@@ -57,8 +57,8 @@ class SharedKernel:
 
     def _own_program(self, vehicle: Vehicle, declared: Sequence[Place]) -> Program:
         """The vehicle alone, with the parameters of its effects as arguments: for a log that shared programs do not
-        serve. Derivatives take a third of the time that they take in one piece, where all of them would go through the
-        corrections across rows, which few coefficients change."""
+        serve. In one piece, every derivative passes through the corrections across rows, which few coefficients change;
+        in parts they take a third of the time."""
         return Program.of(vehicle, (), [e.id for e in vehicle.effects if type(e) not in DECLARED], declared)
 
     def serves(self, vehicle: Vehicle, target: TargetName) -> bool:
@@ -85,10 +85,11 @@ class SharedKernel:
             places = tuple((c.path, c.group) for c in table.free)
             key = form, tuple(np.asarray(x).tobytes() for x in leaves), places, target, id(segments)
             return self._kept(key, segments, lambda: linearised(vehicle, table, segments, target, theta))
-        if not (self._last and self._last[0] is vehicle and self._last[1] is table):  # a solver asks many times
+        asked = vehicle, table, target
+        if not all(a is b for a, b in zip(asked, self._last or (None,) * 3, strict=False)):  # a solver asks many times
             shared = self.serves(vehicle, target)
-            self._last[:] = vehicle, table, self._of_table(vehicle, table, shared=shared), shared
-        (program, values, free), shared = self._last[2:]
+            self._last[:] = *asked, self._of_table(vehicle, table, shared=shared), shared
+        (program, values, free), shared = self._last[3:]
         if theta is not None:
             values = values.copy()
             values[free] = np.asarray(theta)
@@ -132,7 +133,7 @@ class SharedKernel:
         return bool(beside) and all(of_library(type(e)) and self.library.get(e.id) is type(e) for e in beside)
 
     def _of_table(
-        self, vehicle: Vehicle, table: ParameterTable, *, shared: bool = True
+        self, vehicle: Vehicle, table: ParameterTable, *, shared: bool
     ) -> tuple[Program, Float[np.ndarray, " parameter"], list[int]]:
         """The program with the table's coefficients as arguments, their values, and where among them the free ones
         are. It is made once for vehicles that differ in these coefficients and, where it is shared, in effects that are

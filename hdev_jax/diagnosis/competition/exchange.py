@@ -107,13 +107,15 @@ def _best_pair(round_: Round, w: Without, open_: Sequence[Candidate]) -> list[Ca
     if not np.any(np.isfinite(own)):
         return None
     to_beat, of_pairs = float(np.max(own[np.isfinite(own)])), worths(pairs)
+    held: Score | None = None  # of the two that are out: its tests cost more than all of the above
     for k in np.argsort(-of_pairs):
         if not _well_ahead(round_, float(of_pairs[k]), to_beat):
             return None
         a, b = pairs[int(k)]
         if _test(a.id, b.id, *(c.id for c in w.each)) in round_.state.tested:
             continue
-        new, held = w.evidence.scores([together(a, b), together(*w.each)])
+        new = w.evidence.score(together(a, b))
+        held = w.evidence.score(together(*w.each)) if held is None else held
         each = zip((a, b), np.split(new.beta, [len(a.columns)]), strict=True)
         fine = all(plausible(replace(scores.best[c.id], beta=x), settings) for c, x in each)
         fine = fine and _well_ahead(round_, new.left_out_gain, held.left_out_gain)

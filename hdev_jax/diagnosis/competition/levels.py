@@ -22,9 +22,9 @@ LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
 LOAD_NUMBERS = 8  # free numbers of a load: its power, its base, shares at four temperatures, a memory, the errors' size
 LEAST_SPREAD = 0.5 * float(np.sqrt(2.0 * LOAD_NUMBERS))  # sd of a load's gain on noise: of half a χ² of so many
-# Surrogates after which the test may end, to save time: at the first look where one of them gains as much (p is 0.25 at
-# least); at the second where p meets the level, or by its spread so far would miss it, by a factor `SURE`. That adds a
-# tenth of the level to its false alarms at most.
+# The test may end early, to save time: after `FIRST_LOOK` surrogates if one gains as much (p is 0.25 at least); after
+# `SECOND_LOOK` if p is below the level by a factor `SURE`, or if all surrogates, at this spread, would leave it as far
+# above. That adds a tenth of the level to the false alarms at most.
 FIRST_LOOK, SECOND_LOOK, SURE = 3, 6, 10.0
 
 
@@ -44,7 +44,8 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
         return None
     model, gain = _best(rows)
     noise = estimate_noise(rows.residual_w / rows.wide, rows.trip, rows.duration_s, levels=False)
-    others, most = list[float](), training.settings.shifts
+    others: list[float] = []
+    most = training.settings.shifts
     level = training.settings.fdr / len(training.library)
     for _ in range(most):
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])

@@ -56,7 +56,7 @@ class Evidence(NormalEquations):
         own = int(np.argmax(base))  # the base at the variance that suits the base
         before, missed = float(base[own]), float(np.sum(self._base_loss(own))) + self.cost[own]
         out: dict[int, Score] = {}
-        for places, at in self._alike([c.columns for c in candidates], g):
+        for places, at in self._alike([c.columns for c in candidates], max(g, len(self.home))):
             likelihood, x = self._fit(totals, at)
             suits = np.argmax(likelihood, axis=0)
             for v in np.unique(suits).tolist():
@@ -123,7 +123,7 @@ class Evidence(NormalEquations):
         """
         totals, g = self.totals(), self.count
         out: dict[int, Score] = {}
-        for places, at in self._alike([c.columns for c in candidates], g):
+        for places, at in self._alike([c.columns for c in candidates], max(g, len(self.home))):
             k = at.shape[-1]
             likelihood, x = self._fit(totals, at)
             blocks, beta = self._blocks(at, 0), x[0, :, self.base :]

@@ -140,7 +140,7 @@ class NormalEquations:
         holds of `cells` matrices for each."""
         count = np.array([len(w) for w in ways], dtype=int)
         for k in np.unique(count):
-            places, size = np.flatnonzero(count == k), max(cells, len(self.home)) * (self.base + int(k) + 1) ** 2
+            places, size = np.flatnonzero(count == k), cells * (self.base + int(k) + 1) ** 2
             for part in np.array_split(places, min(len(places), -(-len(places) * size // AT_ONCE))):
                 yield part, self.base + np.array([ways[i] for i in part], dtype=int)
 
