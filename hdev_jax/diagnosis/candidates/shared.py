@@ -85,11 +85,11 @@ class SharedKernel:
             places = tuple((c.path, c.group) for c in table.free)
             key = form, tuple(np.asarray(x).tobytes() for x in leaves), places, target, id(segments)
             return self._kept(key, segments, lambda: linearised(vehicle, table, segments, target, theta))
-        asked = vehicle, table, target
-        if not all(a is b for a, b in zip(asked, self._last or (None,) * 3, strict=False)):  # a solver asks many times
+        last = self._last  # a solver asks many times
+        if not (last and last[0] is vehicle and last[1] is table and last[2] == target):
             shared = self.serves(vehicle, target)
-            self._last[:] = *asked, self._of_table(vehicle, table, shared=shared), shared
-        (program, values, free), shared = self._last[3:]
+            last[:] = vehicle, table, target, self._of_table(vehicle, table, shared=shared), shared
+        (program, values, free), shared = last[3:]
         if theta is not None:
             values = values.copy()
             values[free] = np.asarray(theta)
