@@ -23,7 +23,7 @@ from experiments.simulators.tables import collect
 from experiments.simulators.truth import make
 from experiments.simulators.vehicles import Vehicle
 from hdev_jax.diagnosis.diagnose import Outcome, diagnose
-from hdev_jax.diagnosis.settings import SETTINGS, Settings
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs import by_distance, read_log
 from hdev_jax.physics import LIBRARY
@@ -105,10 +105,10 @@ def _missing(summary: Mapping[str, Any]) -> list[str]:
     return [str(k) for k in summary.get("missing_channels", ())]
 
 
-def _reasons(summary: Mapping[str, Any]) -> list[str]:
-    """Effects that the report gives as reasons of declared coefficients that are far above the sheet's values."""
-    moved = summary["baseline"]["parameters"].values()
-    return sorted({k for p in moved if p.get("prior_z", 0.0) > SETTINGS.far for k in p["absorbs"]})
+def _reasons(summary: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Effects that the report gives as reasons why a declared coefficient ends above the sheet's value."""
+    ends = summary["after"]["parameters"].items()
+    return {k: list(p["absorbs"]) for k, p in ends if p["absorbs"] and p.get("prior_z", 0.0) > 0.0}
 
 
 def _coefficients(outcome: Outcome) -> dict[str, dict[str, float]]:

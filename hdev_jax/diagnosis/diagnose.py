@@ -98,7 +98,8 @@ def _diagnosed(
     # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing;
     #    the declared one where the held-out trips contradict them
     # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
-    #    points, random intercepts of trips. While most of it is structure, no instrument is the cause
+    #    points, random intercepts of trips. While most of it is structure, or the log lacks the slope, no instrument is
+    #    the cause
     tell("error before and after on the held-out test trips")
     training = rows_with(training, state)
 
@@ -108,10 +109,11 @@ def _diagnosed(
         )
 
     model = handed_out(named_alone(training, state), state, "remainder")
-    if model.left.significant and model.left.share > settings.instrument_share:
-        physics = no_instrument_named(training, model.named, model.left.share)
+    lacks = model.left.missing_channels
+    if lacks or (model.left.significant and model.left.share > settings.instrument_share):
+        physics = no_instrument_named(training, model.named, model.left.share, lacks)
         if physics is not model.named:
-            tell("most of what is left is structure: no instrument's fault is named")
+            tell("what is left is mostly structure, or like a channel that the log lacks: no instrument is named")
             model = handed_out(physics, None, "remainder-2")
     named, steps, predicted, given, left = model
 

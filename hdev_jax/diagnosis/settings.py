@@ -139,6 +139,17 @@ class Settings:
         "s",
         "a minute",
     )
+    first_look: int = _number(
+        3, "placebos of a load that switches, after which one that gains as much ends the test", "draws", "to save "
+        "time: p is a quarter at least",
+    )  # fmt: skip
+    second_look: int = _number(
+        6, "placebos of a load that switches, after which a clear answer ends the test", "draws", "to save time"
+    )
+    clear: float = _number(
+        10.0, "factor from the level of that test at which its answer is clear", "1",
+        "adds at most a tenth of the level to the false alarms",
+    )  # fmt: skip
     load_sure: float = _number(
         0.8, "least probability of a decoded state, on and off alike", "1",
         "planted loads: 0.81 and more where power and time on are right, 0.72 to 0.76 where not; a car's noise 0.78",

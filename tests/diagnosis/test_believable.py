@@ -17,11 +17,13 @@ from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.compete import compete, no_instrument_named
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.needed import backward, without_idle_switches
+from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import score_all
+from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference import effect_coefficients
 from hdev_jax.inference.sheet import read_sheet
@@ -173,6 +175,69 @@ def test_no_instrument_is_named_while_most_of_what_is_left_is_structure():
     assert verdict.rejection.kind is Kind.INSTRUMENT
     assert "70 %" in str(verdict.rejection)
     assert no_instrument_named(rows, less, 0.7) is less
+
+
+def test_neither_payload_nor_an_instrument_is_named_where_the_log_lacks_the_slope_that_the_rest_behaves_like():
+    problem, _ = nothing()
+    both = changed(changed(problem, MassScale(0.15)), LIBRARY["auxiliary_power"](9000.0))
+    rows = training(both, ["mass_scale", "auxiliary_power"])
+    state = found_in_turn(rows, both, ["mass_scale", "auxiliary_power"])
+    less = no_instrument_named(rows, state, 0.0, ["grade_rad"])
+    assert less.ids == ("auxiliary_power",)
+    (verdict,) = [v for v in less.verdicts if v.id == "mass_scale"]
+    assert verdict.rejection.kind is Kind.MISSING_CHANNEL
+    assert "grade_rad" in str(verdict.rejection)
+    assert no_instrument_named(rows, state, 0.7) is state, "structure alone takes out instruments, not the payload"
+
+
+def twisted(back: float) -> Problem:
+    """A log in which cornering would cost energy from trip to trip, and give some `back` inside trips."""
+    problem = without_noise(nothing()[0])
+    bends = changed(problem, LIBRARY["cornering"](0.02)).measured - problem.measured
+    trip = np.asarray(problem.segments.trip)
+    mean = (np.bincount(trip, bends) / np.bincount(trip))[trip]
+    return replace(problem, measured=problem.measured + 6.0 * mean - back * (bends - mean))
+
+
+def test_what_has_one_sign_from_trip_to_trip_and_the_other_inside_them_is_no_effect():
+    problem = twisted(0.1)
+    rows = training(problem, ["cornering"])
+    state = declared(rows, problem)
+    scores = score_all(rows, state.fit)
+    s = scores.best["cornering"]
+    plain, white = scores.plain.estimate(s.candidate), scores.white.estimate(s.candidate)
+    assert plain[0][0] > SETTINGS.stands * plain[1][0]
+    assert white[0][0] < -SETTINGS.stands * white[1][0]
+    assert refit(rows, state, s, scores).fit is None
+
+
+def test_an_effect_goes_whose_fitted_size_has_the_other_sign_than_its_test():
+    problem = twisted(0.3)
+    rows = training(problem, ["cornering"])
+    state = declared(rows, problem)
+    s = score_all(rows, state.fit).best["cornering"]
+    bends = LIBRARY["cornering"](0.02)
+    table = state.fit.table.plus(*effect_coefficients(bends, ("coefficient",)))
+    fit = rows.calibrate(state.fit.vehicle.plus(bends), table)
+    assert fit.values[-1] > 0
+    found_once = Found("cornering", replace(s, plain=False), 0.0, 1.0, (), 9.0)
+    assert backward(rows, replace(state, fit=fit, found=(found_once,)), newest=True).ids == ()
+
+
+def test_a_constant_load_that_ordinary_least_squares_alone_show_is_asked_before_a_load_that_begins():
+    problem = changed(nothing()[0], LIBRARY["auxiliary_power"](3000.0))
+    rows = training(problem, ["auxiliary_power", "step_change"])
+    state = declared(rows, problem)
+    scores = score_all(rows, state.fit)
+    constant, begins = scores.best["auxiliary_power"], scores.best["step_change"]
+    (seen,) = scores.plain.plain_scores([constant.candidate])
+    assert seen.plain
+    assert not begins.plain
+    for p, first in ((0.1 * begins.p, "auxiliary_power"), (100.0 * begins.p, "step_change")):
+        scores.replaced(replace(seen, p_model=p, p_cluster=p))
+        new = forward(Round(rows, state, scores, np.random.default_rng(0)))
+        assert new is not None
+        assert new.ids == (first,)
 
 
 @pytest.mark.parametrize(("limit_w", "stays"), [(9e5, False), (3e4, True)])

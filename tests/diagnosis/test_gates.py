@@ -80,7 +80,12 @@ def test_where_readings_have_errors_a_small_gain_is_no_cause(log, scores):
 def test_what_a_coefficient_takes_up_is_said_first(log, scores):
     scores.absorbed_by["standstill_load"] = "road.c_rr"
     why = first_rejection(asked(log, scores, "standstill_load", left_out_gain=-9.0), EVERY)
-    assert why == Rejection(Kind.ABSORBED, {"by": "road.c_rr"})
+    assert why is not None
+    assert (why.kind, why.numbers["by"]) == (Kind.ABSORBED, "road.c_rr")
+    assert why.numbers["sizes"]["power_w"] > 0, "it may be the reason"
+    why = first_rejection(asked(log, scores, "standstill_load", beta=np.array([-100.0])), EVERY)
+    assert why is not None
+    assert why.numbers["sizes"] == {}, "a load below nothing is no reason"
 
 
 @pytest.mark.parametrize("plain", [False, True], ids=["shifted in time", "signs at random"])
@@ -124,6 +129,7 @@ def test_an_effect_without_a_column_has_none(log):
 NUMBERS = {
     "reason": "needs the channel gap_m", "by": "road.c_rr", "least": 3, "there": 2, "q": 0.21, "how": "its column",
     "percent": 12.4, "name": "road.c_rr", "z": 3.2, "beside": "headwind", "share": 0.25,
+    "channels": "grade_rad",
 }  # fmt: skip
 
 

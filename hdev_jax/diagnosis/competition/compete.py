@@ -138,19 +138,24 @@ def none_named(state: State, declared: Calibration) -> State:
     return State(declared, verdicts=(*_verdicts(state.found, why), *state.verdicts), absorbs=state.absorbs)
 
 
-def no_instrument_named(training: Training, state: State, share: float) -> State:
+def no_instrument_named(training: Training, state: State, share: float, missing: Sequence[str] = ()) -> State:
     """The state without instruments' faults, and without what is not needed any more; itself where it has none.
 
     `share`: of the variance that is left, what the log's channels predict: then the model's form is wrong, and an
-    instrument not the likely cause.
+    instrument not the likely cause. Nor is the payload where the log lacks a channel that the rest behaves like
+    (`missing`).
     """
-    blamed = [f for f in state.found if f.score.candidate.effect.instrument]
+    why = Rejection(Kind.INSTRUMENT, {"percent": 100.0 * share})
+    if missing:
+        why = Rejection(Kind.MISSING_CHANNEL, {"channels": ", ".join(missing)})
+    every = [f.score.candidate.effect for f in state.found]
+    blamed = [f for f, e in zip(state.found, every, strict=True) if e.instrument or (missing and e.stage == "sensors")]
     if not blamed:
         return state
     less = without(training, state, *(f.id for f in blamed))
     kept = decoded_again(training, backward(training, less, newest=True))
     lost = [f for f in less.found if f.id not in kept.ids]
-    verdicts = _verdicts(blamed, Rejection(Kind.INSTRUMENT, {"percent": 100.0 * share}))
+    verdicts = _verdicts(blamed, why)
     verdicts += tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
     return replace(kept, verdicts=(*verdicts, *state.verdicts))
 

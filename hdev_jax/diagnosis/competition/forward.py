@@ -61,6 +61,7 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
         able.sort(key=lambda s: (s.plain, -scores.worth(s)))
         if not able:
             return None
+        able = _constant_first(scores, able)
         first, members = _plainest(round_, able)
         bar = settings.close * scores.worth(first)
         rivals = [s for s in able if s.plain == first.plain and s.candidate.id not in members]
@@ -73,6 +74,31 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
             if (new := _taken(round_, s, fit, gain)) is not None:
                 return new
     return None
+
+
+def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
+    """The candidates; where a load leads, the constant load stands before it and all others that are less significant
+    wait for the next round.
+
+    Rows that are compared with their neighbours, as generalised least squares do, say little of a constant, and more of
+    a load that begins, ends or grows: whatever is constant would be called that first.
+    """
+
+    def p(s: Score) -> float:
+        return s.p * scores.ways[s.candidate.id]
+
+    def is_load(s: Score) -> bool:
+        effect = s.candidate.effect
+        units = {s.candidate.parameter(n).unit for n in s.candidate.sizes}
+        return units == {"W"} and effect.stage == "battery" and not effect.of_efficiency
+
+    def is_constant(s: Score) -> bool:
+        return is_load(s) and all(s.candidate.parameter(n).constant for n in s.candidate.sizes)
+
+    constant = next((s for s in able if is_constant(s)), None)
+    if constant is None or not is_load(able[0]) or p(constant) > p(able[0]):
+        return able
+    return [constant, *(s for s in able if not (is_load(s) and p(s) >= p(constant)))]
 
 
 def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:

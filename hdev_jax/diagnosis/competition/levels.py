@@ -7,6 +7,7 @@ import numpy as np
 from scipy import signal, stats
 
 from hdev_jax.diagnosis.noise.noise import Noise, estimate_noise
+from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference.states import Decoded, StateRows, Switching, errors_alone, fit_switching
 from hdev_jax.physics.states import KNOTS_C
@@ -22,10 +23,6 @@ LEAST_STRETCH = 600  # rows of a trip that it looks at
 BESIDES = (0.4, 0.6, 1.6, 2.5)  # powers of a second load to start from, over the first's
 LOAD_NUMBERS = 8  # free numbers of a load: its power, its base, shares at four temperatures, a memory, the errors' size
 LEAST_SPREAD = 0.5 * float(np.sqrt(2.0 * LOAD_NUMBERS))  # sd of a load's gain on noise: of half a χ² of so many
-# The test may end early, to save time: after `FIRST_LOOK` surrogates if one gains as much (p is 0.25 at least); after
-# `SECOND_LOOK` if p is below the level by a factor `SURE`, or if all surrogates, at this spread, would leave it as far
-# above. That adds a tenth of the level to the false alarms at most.
-FIRST_LOOK, SECOND_LOOK, SURE = 3, 6, 10.0
 
 
 @dataclass(frozen=True)
@@ -45,15 +42,20 @@ def level_test(rows: StateRows, training: Training, rng: np.random.Generator) ->
     model, gain = _best(rows)
     noise = estimate_noise(rows.residual_w / rows.wide, rows.trip, rows.duration_s, levels=False)
     others: list[float] = []
-    most = training.settings.shifts
-    level = training.settings.fdr / len(training.library)
-    for _ in range(most):
+    settings = training.settings
+    level = settings.fdr / len(training.library)
+    for _ in range(settings.shifts):
         others.append(_best(replace(rows, residual_w=_surrogate(rows, noise, rng)))[1])
-        if len(others) == FIRST_LOOK and gain <= max(others):
+        if len(others) == settings.first_look and gain <= max(others):
             return Tested(model, gain, 1.0)
-        if len(others) == SECOND_LOOK and (_p(gain, others) * SURE < level or _p(gain, others, most) > SURE * level):
+        if len(others) == settings.second_look and _clear(gain, others, level, settings):
             break
     return Tested(model, gain, _p(gain, others))
+
+
+def _clear(gain: float, others: Sequence[float], level: float, settings: Settings) -> bool:
+    """Whether p is far below the level, or would be as far above it if all placebos had this spread."""
+    return _p(gain, others) * settings.clear < level or _p(gain, others, settings.shifts) > settings.clear * level
 
 
 def _p(gain: float, others: Sequence[float], count: int | None = None) -> float:

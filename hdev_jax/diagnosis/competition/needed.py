@@ -173,7 +173,10 @@ def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *,
     if not old:
         return 0.0
     own = needed(evidence, state.fit, f)
-    stands = own.left_out_gain > 0.0 and in_range(state.fit, f.score.candidate)
+    c = f.score.candidate
+    now = state.fit.values[_places(state.fit, f)] - np.array([c.parameter(n).null for n in own.candidate.sizes])
+    turned = bool(np.all(now * own.beta < 0.0))  # as it is fitted it has the other sign
+    stands = own.left_out_gain > 0.0 and in_range(state.fit, c) and not turned
     return own.p if stands else 1.0
 
 

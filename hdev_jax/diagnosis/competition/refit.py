@@ -57,6 +57,8 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
         one = (1.0 - settings.agrees) / (len(c.groups) if None not in c.groups else 1)
         apart = stats.t.isf(one, np.maximum(scores.plain.bearing(c) - 1.0, 1.0))
         turned = clear & (np.sign(plain) != np.sign(white))
+        if np.any(turned & (np.abs(white) > settings.stands * white_sd)):
+            return failed  # each sign is significant by its own weights: something else is missing first
         generalise = bool(np.all((np.abs(plain - white) <= apart * plain_sd) & ~turned))
     better = generalise and bool(np.all(settings.known * white_sd <= plain_sd))
     # one linear step predicts the result of a refit, unless thresholds and time constants are free to move
@@ -271,7 +273,7 @@ def _stands(fit: Calibration, candidate: Candidate, settings: Settings) -> bool:
     if not in_range(fit, candidate):
         return False
     if candidate.kind == "limit":
-        return True
+        return not candidate.parameter(candidate.sizes[0]).smooth or large_enough(fit, candidate)
     if not large_enough(fit, candidate):
         return False
     at = [k for k, c in enumerate(fit.table.free) if c.path.rpartition(".")[2] in candidate.sizes

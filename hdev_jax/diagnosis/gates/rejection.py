@@ -28,6 +28,7 @@ class Kind(StrEnum):
     SUPERFLUOUS = "superfluous"
     NOT_HELD_OUT = "not_held_out"
     INSTRUMENT = "instrument"
+    MISSING_CHANNEL = "missing_channel"
     FOUND = "found"
     DECLARED = "declared"
 
@@ -67,6 +68,7 @@ SENTENCES = {
     Kind.SUPERFLUOUS: "not significant given {beside}",
     Kind.NOT_HELD_OUT: "rejected by the held-out trips: the model with all found effects predicts them worse",
     Kind.INSTRUMENT: "no instrument fault is named, as {percent:.0f} % of the remaining variance is not noise",
+    Kind.MISSING_CHANNEL: "no payload and no instrument fault is named, as the log lacks a channel: {channels}",
     Kind.FOUND: "found",
     Kind.DECLARED: "declared in the sheet",
 }

@@ -36,6 +36,25 @@ def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> di
     return block
 
 
+def _as_they_end(fit: Calibration, state: State, settings: Settings) -> dict[str, Any]:
+    """The declared coefficients of the model with the effects, as in `baseline.parameters`, `absorbs` being what each
+    may stand for: effects of plausible sizes that these rows cannot distinguish from it, the best first. They are those
+    that would explain more than chance does (that the sheet's other values fit again is a part of it), or any where the
+    coefficient is far from its table."""
+    declared = {k: v for k, v in baseline_block(fit, {}).items() if not k.startswith("effects.")}
+    able = [v for v in state.verdicts if v.rejection.kind is Kind.ABSORBED and v.rejection.numbers["sizes"]]
+    for name, block in declared.items():
+        gains = {v.id: v.score or 0.0 for v in able if v.rejection.numbers["by"] == name}
+        best = max(gains.values(), default=0.0)
+        least = settings.class_share * best if best > settings.ahead else 0.0 if _far(block, settings) else np.inf
+        block["absorbs"] = sorted((k for k, x in gains.items() if x >= least), key=lambda k: -gains[k])
+    return declared
+
+
+def _far(block: Mapping[str, Any], settings: Settings) -> bool:
+    return abs(block.get("prior_z", 0.0)) > settings.far
+
+
 def _sized(value: float, error: float, clusters: int) -> dict[str, Any]:
     """A size with its uncertainty from few clusters: Student's t with `clusters` − 1 degrees of freedom.
 
@@ -180,7 +199,11 @@ def summarise(
             "unused_trips": split.names(split.unused),
         },
         "before": block(predicted[0]),
-        "after": {**block(predicted[-1]), **(errors_by_knowledge(problem, split, given) if given else {})},
+        "after": {
+            **block(predicted[-1]),
+            **(errors_by_knowledge(problem, split, given) if given else {}),
+            "parameters": _as_they_end(steps[-1], state, training.settings),
+        },
         "baseline": {"parameters": baseline_block(steps[0], state.absorbs)},
         "effects": effects,
         "candidates": candidates,
@@ -267,10 +290,14 @@ def _warnings(steps: list[Calibration], state: State, settings: Settings) -> lis
     for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
         if not fit.converged:
             out.append(f"the fit of the {when} stopped early: {fit.message}")
-    for name, p in baseline_block(steps[0], state.absorbs).items():
-        if abs(p.get("prior_z", 0.0)) > settings.far:
+    blocks = [("declared model", baseline_block(steps[0], state.absorbs))]
+    if state.found:
+        blocks.append(("model with the effects", _as_they_end(steps[-1], state, settings)))
+    for when, block in blocks:
+        for name, p in block.items():
             held = f"; on this log it cannot be distinguished from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
-            out.append(f"{name} moved {p['prior_z']:+.1f} prior sd from its table in the declared model{held}")
+            if "prior_z" in p and (_far(p, settings) or (held and when != "declared model")):
+                out.append(f"{name} moved {p['prior_z']:+.1f} prior sd from its table in the {when}{held}")
     return out
 
 
