@@ -6,19 +6,7 @@ from typing import Any
 
 from experiments.simulators.plants import FORMS, INSTRUMENTS, PAYLOAD, PLANTS
 
-__all__ = [
-    "MOST",
-    "PLAUSIBLE",
-    "blamed",
-    "covered",
-    "false",
-    "implausible",
-    "moved",
-    "named",
-    "reasoned",
-    "right",
-    "sized",
-]
+__all__ = ["MOST", "PLAUSIBLE", "blamed", "covered", "false", "implausible", "moved", "named", "right", "sized"]
 
 NINETY = 1.645  # standard deviations of a normal distribution to each side that hold 90 %
 MOST = 3  # names of a class that still is an answer
@@ -71,12 +59,6 @@ def moved(task: Mapping[str, Any], result: Result) -> bool:
     return False
 
 
-def reasoned(task: Mapping[str, Any], result: Result) -> bool:
-    """Whether the change is among the reasons given for a declared coefficient that ends above the sheet's value: the
-    two, and what else is given, being a class of at most three."""
-    return any(PLANTS[task["plant"]].names & {*ids} and 1 + len(ids) <= MOST for ids in result["reasons"].values())
-
-
 def covered(result: Result) -> list[bool]:
     """Of each coefficient whose truth is a number: does its 90 % interval hold it?"""
     pairs = [(c, result["truth"][k]) for k, c in result["coefficients"].items() if k in result["truth"]]
@@ -99,7 +81,7 @@ def right(task: Mapping[str, Any], result: Result) -> bool:
 
     Nothing changed: no false name, and the form of the efficiency is named, or something is called unexplained. A
     channel missing: no false name, and something is called unexplained or that channel is said to be missing. One
-    change: an entry holds it, a declared coefficient tells it, or it is among the few reasons given for one.
+    change: an entry holds it, or a declared coefficient tells it.
     """
     plant = PLANTS[task["plant"]]
     wrong = false(task, result["named"])
@@ -108,7 +90,7 @@ def right(task: Mapping[str, Any], result: Result) -> bool:
     if not plant.names and not plant.coefficients:
         form = any(_ids(e) & _forms(task) for e in result["named"])
         return not wrong and (form or result["unexplained"] or result["two_efficiencies"])
-    return named(task, result) or moved(task, result) or reasoned(task, result)
+    return named(task, result) or moved(task, result)
 
 
 def sized(task: Mapping[str, Any], result: Result) -> dict[str, float] | None:

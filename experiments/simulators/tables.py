@@ -23,8 +23,7 @@ NOTES = (
     "efficiency, losses by load), or the sheet already declares two efficiencies, or the diagnosis reports "
     "unexplained structure. Right, with one change: an entry or a class of at most three contains it, or the "
     "declared coefficient that absorbs it moves the right way, with a 90 % interval that excludes the sheet's "
-    "value, or it is among the reasons (two at most) that the report gives for a coefficient above the sheet's value. "
-    "(Of a class at most three names are printed; a class of more than three counts as its first name alone.) "
+    "value. (Of a class at most three names are printed; a class of more than three counts as its first name alone.) "
     "Right, with no slope in the log: no false name, and the diagnosis reports unexplained structure or that "
     "the slope is missing",
     "False name: an entry that is neither the change nor the form of the efficiency. (The sheet declares one "
@@ -39,7 +38,8 @@ NOTES = (
     "changed. Segments of 100 m average over what happens within them, for both fits",
     "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
     "split braking between motor and friction brakes, so regeneration that is lost is taken from the electric power",
-    "Some of these logs were looked at while the method was changed",
+    "No log of these seeds was looked at while the method was changed; of others, with the same vehicles and changes, "
+    "some were",
     "Rivals get the declared model's residual and every effect's column. *Named* is over the logs whose change is an "
     "effect of the library, *nothing changed* over the logs without a change, all else over all n. A name is right if "
     "it is the change, and false if it is neither the change nor the form of the efficiency. LightGBM names nothing",
@@ -84,17 +84,18 @@ def collect(config: Config, results: Group, run: Run) -> dict[str, Any]:
 
 def headwind_note(results: Group) -> list[str]:
     """A change that no log can tell from a declared coefficient: how often the report says so."""
+    names = PLANTS["headwind"].names
     wind, still = (
-        [scores.reasoned({"plant": "headwind"}, r) for t, r in results if (t["plant"] == "headwind") is there]
+        [bool(names & {*r["reasons"]}) for t, r in results if (t["plant"] == "headwind") is there]
         for there in (True, False)
     )
     if not wind:
         return []
     return [
         "Wind from the front at all times looks like more drag area. "
-        f"In {sum(wind)} of {len(wind)} logs with a headwind the report says that a coefficient is above the sheet's "
-        f"value and that a headwind may be the reason, as it does in {sum(still)} of the {len(still)} others. "
-        "That counts as right, as a class does"
+        f"In {sum(wind)} of {len(wind)} logs with a headwind the report says that a coefficient is far above the "
+        f"sheet's value and that a headwind may be the reason, as it does in {sum(still)} of the {len(still)} others. "
+        "That is not counted as right"
     ]
 
 
@@ -167,8 +168,8 @@ def _at_most(value: float, wanted: float) -> tuple[float, bool]:
 def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray, list[list[str]]]:
     """Changes with their number of logs, what was named, its share of each change's logs [%], which names are right.
 
-    An entry that holds the change is shown as it; so is a declared coefficient that tells it, or for which it is given
-    as a reason; a log without a name is "nothing", or "unexplained" where it is called so.
+    An entry that holds the change is shown as it; so is a declared coefficient that tells it; a log without a name
+    is "nothing", or "unexplained" where it is called so.
     """
     groups = _by(results, lambda t: t["plant"])
     cells: list[dict[str, float]] = []
@@ -179,8 +180,6 @@ def confusion(results: Group) -> tuple[list[str], list[str], np.ndarray, list[li
             said = {next(iter(fine & set(e["class"])), e["id"]) for e in r["named"]}
             if scores.moved(t, r):
                 said |= {k for k in PLANTS[plant].coefficients[:1] if not said & fine}
-            if scores.reasoned(t, r):
-                said |= fine
             for name in said or {"unexplained" if r["unexplained"] else "nothing"}:
                 row[name] = row.get(name, 0.0) + 100.0 / len(group)
         cells.append(row)
@@ -220,7 +219,6 @@ def said_rows(results: Group) -> list[dict[str, Any]]:
         entries = [f"{' or '.join(e['class'])} ({_sizes(e)})" for e in r["named"]]
         moved = PLANTS[t["plant"]].coefficients[:1] if scores.moved(t, r) else ()
         told = [f"{names.coefficient(k)[0]} moved from the sheet" for k in moved]
-        told += [f"{names.coefficient(k)[0]} above the sheet, or {' or '.join(ids)}" for k, ids in r["reasons"].items()]
         rows.append({
             "log": f"{t['line']}, {t['vehicle']}, seed {t['seed']}", "changed": PLANTS[t["plant"]].words,
             "said": "; ".join([*entries, *told]) or "nothing", "right": scores.right(t, r),

@@ -98,8 +98,8 @@ def _diagnosed(
     # 3. The model that is handed out: the named effects alone, by generalised least squares where nothing is missing;
     #    the declared one where the held-out trips contradict them
     # 4. What remains, given the states that were decoded: the term without a name, a flexible learner, cycles, change
-    #    points, random intercepts of trips. While most of it is structure, or the log lacks the slope, no instrument is
-    #    the cause
+    #    points, random intercepts of trips. While most of it is structure, no instrument is the cause; nor is the
+    #    payload while most of it behaves like a slope that the log lacks
     tell("error before and after on the held-out test trips")
     training = rows_with(training, state)
 
@@ -109,11 +109,12 @@ def _diagnosed(
         )
 
     model = handed_out(named_alone(training, state), state, "remainder")
-    lacks = model.left.missing_channels
-    if lacks or (model.left.significant and model.left.share > settings.instrument_share):
-        physics = no_instrument_named(training, model.named, model.left.share, lacks)
+    lacks = model.left.missing_channels if model.left.missing_share > settings.instrument_share else ()
+    share = model.left.missing_share if lacks else model.left.share
+    if model.left.significant and share > settings.instrument_share:
+        physics = no_instrument_named(training, model.named, share, lacks)
         if physics is not model.named:
-            tell("what is left is mostly structure, or like a channel that the log lacks: no instrument is named")
+            tell("most of what is left is structure, or like a channel that the log lacks: no instrument is named")
             model = handed_out(physics, None, "remainder-2")
     named, steps, predicted, given, left = model
 

@@ -141,7 +141,7 @@ class Settings:
     )
     first_look: int = _number(
         3, "placebos of a load that switches, after which one that gains as much ends the test", "draws", "to save "
-        "time: p is a quarter at least",
+        "time: of three and it, one in four",
     )  # fmt: skip
     second_look: int = _number(
         6, "placebos of a load that switches, after which a clear answer ends the test", "draws", "to save time"

@@ -16,12 +16,13 @@ from planted import SHORT, declared, diagnosed, found_in_turn, named, opened, tr
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.compete import compete, no_instrument_named
 from hdev_jax.diagnosis.competition.forward import Round, forward
-from hdev_jax.diagnosis.competition.needed import backward, without_idle_switches
+from hdev_jax.diagnosis.competition.needed import backward, needed, without_idle_switches
 from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.scores.evidence import Score
+from hdev_jax.diagnosis.scores.passes import evidence_of
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import SETTINGS
 from hdev_jax.fleet import synthetic_log
@@ -182,11 +183,13 @@ def test_neither_payload_nor_an_instrument_is_named_where_the_log_lacks_the_slop
     both = changed(changed(problem, MassScale(0.15)), LIBRARY["auxiliary_power"](9000.0))
     rows = training(both, ["mass_scale", "auxiliary_power"])
     state = found_in_turn(rows, both, ["mass_scale", "auxiliary_power"])
-    less = no_instrument_named(rows, state, 0.0, ["grade_rad"])
+    less = no_instrument_named(rows, state, 0.6, ["grade_rad"])
     assert less.ids == ("auxiliary_power",)
     (verdict,) = [v for v in less.verdicts if v.id == "mass_scale"]
     assert verdict.rejection.kind is Kind.MISSING_CHANNEL
-    assert "grade_rad" in str(verdict.rejection)
+    assert "60 % of the remaining variance behaves like a channel that the log lacks (grade_rad)" in str(
+        verdict.rejection
+    )
     assert no_instrument_named(rows, state, 0.7) is state, "structure alone takes out instruments, not the payload"
 
 
@@ -208,7 +211,8 @@ def test_what_has_one_sign_from_trip_to_trip_and_the_other_inside_them_is_no_eff
     plain, white = scores.plain.estimate(s.candidate), scores.white.estimate(s.candidate)
     assert plain[0][0] > SETTINGS.stands * plain[1][0]
     assert white[0][0] < -SETTINGS.stands * white[1][0]
-    assert refit(rows, state, s, scores).fit is None
+    came = refit(rows, state, s, scores)
+    assert (came.fit, came.kind) == (None, Kind.OPPOSITE)
 
 
 def test_an_effect_goes_whose_fitted_size_has_the_other_sign_than_its_test():
@@ -221,6 +225,10 @@ def test_an_effect_goes_whose_fitted_size_has_the_other_sign_than_its_test():
     fit = rows.calibrate(state.fit.vehicle.plus(bends), table)
     assert fit.values[-1] > 0
     found_once = Found("cornering", replace(s, plain=False), 0.0, 1.0, (), 9.0)
+    own = needed(evidence_of(rows.baseline(fit)), fit, found_once)
+    assert own.beta[0] < 0
+    assert own.p < SETTINGS.stays
+    assert own.left_out_gain > 0
     assert backward(rows, replace(state, fit=fit, found=(found_once,)), newest=True).ids == ()
 
 
@@ -233,8 +241,13 @@ def test_a_constant_load_that_ordinary_least_squares_alone_show_is_asked_before_
     (seen,) = scores.plain.plain_scores([constant.candidate])
     assert seen.plain
     assert not begins.plain
-    for p, first in ((0.1 * begins.p, "auxiliary_power"), (100.0 * begins.p, "step_change")):
+    for p, p_begins, first in (
+        (1e-6, 1e-5, "auxiliary_power"),
+        (1e-3, 1e-5, "step_change"),
+        (1e-15, begins.p, "step_change"),  # of which these rows are certain
+    ):
         scores.replaced(replace(seen, p_model=p, p_cluster=p))
+        scores.replaced(replace(begins, p_model=p_begins, p_cluster=p_begins))
         new = forward(Round(rows, state, scores, np.random.default_rng(0)))
         assert new is not None
         assert new.ids == (first,)
@@ -279,3 +292,21 @@ def test_a_slope_that_the_log_lacks_is_the_first_suspect(tmp_path):
     assert summary["missing_channels"] == []
     assert "slope" not in summary["unexplained"]["signature"]
     assert summary["verdict"] == "nothing_missing"
+
+
+def test_a_coefficient_that_ends_far_from_its_table_is_said_with_what_it_may_stand_for():
+    """A slope that is always read too low looks like rolling resistance, whatever effect is found beside it."""
+    problem, split = nothing()
+    steep = changed(changed(problem, LIBRARY["grade_bias"](0.004)), LIBRARY["auxiliary_power"](6000.0))
+    library = {k: LIBRARY[k] for k in ("grade_bias", "auxiliary_power")}
+    summary = diagnosed(steep, split, library).summary
+    ends = summary["after"]["parameters"]
+    assert ends["road.c_rr"]["prior_z"] > SETTINGS.far
+    assert ends["road.c_rr"]["absorbs"] == ["grade_bias"]
+    assert ends["road.cda_m2"]["absorbs"] == []
+    (note,) = [n for n in summary["notes"] if n.startswith("road.c_rr moved")]
+    assert "in the model with the effects" in note
+    assert "cannot be distinguished from grade_bias" in note
+    calm = diagnosed(changed(problem, LIBRARY["auxiliary_power"](6000.0)), split, library).summary
+    assert not any(p["absorbs"] for p in calm["after"]["parameters"].values())
+    assert not [n for n in calm["notes"] if "moved" in n]

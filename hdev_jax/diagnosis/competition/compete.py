@@ -142,12 +142,13 @@ def no_instrument_named(training: Training, state: State, share: float, missing:
     """The state without instruments' faults, and without what is not needed any more; itself where it has none.
 
     `share`: of the variance that is left, what the log's channels predict: then the model's form is wrong, and an
-    instrument not the likely cause. Nor is the payload where the log lacks a channel that the rest behaves like
+    instrument not the likely cause. Nor is the payload where this share behaves like channels that the log lacks
     (`missing`).
     """
-    why = Rejection(Kind.INSTRUMENT, {"percent": 100.0 * share})
+    percent = 100.0 * share
+    why = Rejection(Kind.INSTRUMENT, {"percent": percent})
     if missing:
-        why = Rejection(Kind.MISSING_CHANNEL, {"channels": ", ".join(missing)})
+        why = Rejection(Kind.MISSING_CHANNEL, {"percent": percent, "channels": ", ".join(missing)})
     every = [f.score.candidate.effect for f in state.found]
     blamed = [f for f, e in zip(state.found, every, strict=True) if e.instrument or (missing and e.stage == "sensors")]
     if not blamed:

@@ -9,9 +9,9 @@ from hdev_jax.diagnosis.competition.grid import LEADERS
 from hdev_jax.diagnosis.competition.refit import Refit, refit
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class
-from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
+from hdev_jax.diagnosis.gates.rejection import Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
-from hdev_jax.diagnosis.scores.scores import Scores, inside
+from hdev_jax.diagnosis.scores.scores import CERTAIN, Scores, inside
 from hdev_jax.diagnosis.training import Training
 
 __all__ = ["Round", "forward"]
@@ -77,8 +77,8 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
 
 
 def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
-    """The candidates; where a load leads, the constant load stands before it and all others that are less significant
-    wait for the next round.
+    """The candidates; where a load leads of which the rows are not certain, the constant load stands before it, and all
+    that are less significant than that one wait for the next try.
 
     Rows that are compared with their neighbours, as generalised least squares do, say little of a constant, and more of
     a load that begins, ends or grows: whatever is constant would be called that first.
@@ -96,7 +96,7 @@ def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
         return is_load(s) and all(s.candidate.parameter(n).constant for n in s.candidate.sizes)
 
     constant = next((s for s in able if is_constant(s)), None)
-    if constant is None or not is_load(able[0]) or p(constant) > p(able[0]):
+    if constant is None or not is_load(able[0]) or p(able[0]) <= max(CERTAIN, p(constant)):
         return able
     return [constant, *(s for s in able if not (is_load(s) and p(s) >= p(constant)))]
 
@@ -148,7 +148,7 @@ def _refitted(round_: Round, s: Score) -> Refit | None:
         round_.tell(f"refitting {s.candidate.id} with {len(s.candidate.sizes)} of its sizes")
         came = refit(round_.training, round_.state, s, round_.scores)
     if came.fit is None:
-        round_.turned_down(s.candidate.id, Rejection(Kind.REFIT))
+        round_.turned_down(s.candidate.id, Rejection(came.kind))
         return None
     return came
 

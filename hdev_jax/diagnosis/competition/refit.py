@@ -10,6 +10,7 @@ from scipy import stats
 from hdev_jax.diagnosis.candidates.candidate import Candidate, in_order, realised
 from hdev_jax.diagnosis.competition.grid import refined
 from hdev_jax.diagnosis.competition.state import State
+from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.noise.noise import Noise
 from hdev_jax.diagnosis.scores.evidence import Evidence, Score
 from hdev_jax.diagnosis.scores.gls import generalised
@@ -30,12 +31,13 @@ __all__ = [
 class Refit:
     """A joint refit: the `fit` (None where the candidate is out of range or not significant in it), its gain in
     log-likelihood, the score at the shapes that it started from; where that is the reason, `fewer`, the candidate
-    without the group (a gear) or the size that ends out of range."""
+    without the group (a gear) or the size that ends out of range; `kind`, why there is none."""
 
     fit: Calibration | None
     gain: float
     score: Score
     fewer: Candidate | None = None
+    kind: Kind = Kind.REFIT
 
 
 def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
@@ -57,8 +59,10 @@ def refit(training: Training, state: State, s: Score, scores: Scores) -> Refit:
         one = (1.0 - settings.agrees) / (len(c.groups) if None not in c.groups else 1)
         apart = stats.t.isf(one, np.maximum(scores.plain.bearing(c) - 1.0, 1.0))
         turned = clear & (np.sign(plain) != np.sign(white))
-        if np.any(turned & (np.abs(white) > settings.stands * white_sd)):
-            return failed  # each sign is significant by its own weights: something else is missing first
+        both = turned & (np.abs(plain) > apart * plain_sd) & (np.abs(white) > apart * white_sd)
+        if np.any(both):  # each sign is significant by its own weights
+            less = c.narrower(~both) if None in c.groups else c.only(~both)
+            return replace(failed, fewer=less, kind=Kind.OPPOSITE)
         generalise = bool(np.all((np.abs(plain - white) <= apart * plain_sd) & ~turned))
     better = generalise and bool(np.all(settings.known * white_sd <= plain_sd))
     # one linear step predicts the result of a refit, unless thresholds and time constants are free to move

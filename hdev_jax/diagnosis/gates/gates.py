@@ -52,14 +52,10 @@ Gate = Callable[[Asked], Rejection | None]
 
 
 def _not_absorbed(a: Asked) -> Rejection | None:
-    """What a coefficient takes up is no effect of its own; its sizes are kept where they are plausible, for the report
-    says it as a possible reason of that coefficient's value."""
-    s = a.score
-    if not (by := a.scores.absorbed_by.get(s.candidate.id)):
+    """What a coefficient takes up is no effect of its own; where it is plausible it may be the reason of its value."""
+    if not (by := a.scores.absorbed_by.get(a.score.candidate.id)):
         return None
-    could = plausible(s, a.scores.settings) and s.candidate.kind == "size"
-    sizes = dict(zip(s.candidate.sizes, map(float, s.beta), strict=True)) if could else {}
-    return Rejection(Kind.ABSORBED, {"by": by, "sizes": sizes})
+    return Rejection(Kind.ABSORBED, {"by": by, "plausible": plausible(a.score, a.scores.settings)})
 
 
 def _enough_clusters(a: Asked) -> Rejection | None:

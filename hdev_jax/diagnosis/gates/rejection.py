@@ -22,6 +22,7 @@ class Kind(StrEnum):
     READINGS = "readings"
     OUTSCORED = "outscored"
     REFIT = "refit"
+    OPPOSITE = "opposite_signs"
     FAR = "far_from_table"
     PLACEBO = "placebo"
     UNSTABLE = "unstable"
@@ -62,13 +63,17 @@ SENTENCES = {
     Kind.READINGS: "explains {share:.1%} of the error; errors of the readings can explain as much",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
+    Kind.OPPOSITE: "its generalised and its ordinary least-squares estimate are significant with opposite signs",
     Kind.FAR: "it would move {name} to {z:+.1f} prior sd from the sheet's value",
     Kind.PLACEBO: "a placebo ({how}) does as well",
     Kind.UNSTABLE: "ranks first in only {percent:.0f} % of resampled sets of {unit}",
     Kind.SUPERFLUOUS: "not significant given {beside}",
     Kind.NOT_HELD_OUT: "rejected by the held-out trips: the model with all found effects predicts them worse",
     Kind.INSTRUMENT: "no instrument fault is named, as {percent:.0f} % of the remaining variance is not noise",
-    Kind.MISSING_CHANNEL: "no payload and no instrument fault is named, as the log lacks a channel: {channels}",
+    Kind.MISSING_CHANNEL: (
+        "no payload and no instrument fault is named, as {percent:.0f} % of the remaining variance behaves like a "
+        "channel that the log lacks ({channels})"
+    ),
     Kind.FOUND: "found",
     Kind.DECLARED: "declared in the sheet",
 }

@@ -53,6 +53,7 @@ class Remainder:
     memory_s: float | None = None
     course: Mapping[str, Any] | None = None  # of what is slow: kWh by trip, and its power in one of the test trips
     missing_channels: tuple[str, ...] = ()  # what the model needs and the log lacks, where the rest behaves like it
+    missing_share: float = 0.0  # of the remaining variance that behaves like it
     confirmed: bool = False  # whether cross-validation over training clusters confirms the learner's share
 
 
@@ -161,6 +162,7 @@ def remainder(
         correction=curve(correction, test, list(names), order[0], problem.unit) if learned and order else None,
         behaves_like=drift.like, sd=drift.sd if np.isfinite(drift.sd) else None, memory_s=drift.memory_s or None,
         course=course, missing_channels=("grade_rad",) if slope else (),
+        missing_share=slope.rms**2 if slope else 0.0,
         expression=formula.words if formula is not None else None, confirmed=learned,
     )  # fmt: skip
 

@@ -37,17 +37,14 @@ def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> di
 
 
 def _as_they_end(fit: Calibration, state: State, settings: Settings) -> dict[str, Any]:
-    """The declared coefficients of the model with the effects, as in `baseline.parameters`, `absorbs` being what each
-    may stand for: effects of plausible sizes that these rows cannot distinguish from it, the best first. They are those
-    that would explain more than chance does (that the sheet's other values fit again is a part of it), or any where the
-    coefficient is far from its table."""
+    """The declared coefficients of the model with the effects, as in `baseline.parameters`; `absorbs` of one that is
+    far from its table are the effects that it may stand for: those of plausible sizes, the best first."""
     declared = {k: v for k, v in baseline_block(fit, {}).items() if not k.startswith("effects.")}
-    able = [v for v in state.verdicts if v.rejection.kind is Kind.ABSORBED and v.rejection.numbers["sizes"]]
+    able = [v for v in state.verdicts if v.rejection.kind is Kind.ABSORBED and v.rejection.numbers.get("plausible")]
+    able.sort(key=lambda v: -(v.score or 0.0))
     for name, block in declared.items():
-        gains = {v.id: v.score or 0.0 for v in able if v.rejection.numbers["by"] == name}
-        best = max(gains.values(), default=0.0)
-        least = settings.class_share * best if best > settings.ahead else 0.0 if _far(block, settings) else np.inf
-        block["absorbs"] = sorted((k for k, x in gains.items() if x >= least), key=lambda k: -gains[k])
+        if _far(block, settings):
+            block["absorbs"] = [v.id for v in able if v.rejection.numbers["by"] == name]
     return declared
 
 
@@ -290,14 +287,13 @@ def _warnings(steps: list[Calibration], state: State, settings: Settings) -> lis
     for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
         if not fit.converged:
             out.append(f"the fit of the {when} stopped early: {fit.message}")
-    blocks = [("declared model", baseline_block(steps[0], state.absorbs))]
-    if state.found:
-        blocks.append(("model with the effects", _as_they_end(steps[-1], state, settings)))
-    for when, block in blocks:
+    ends = _as_they_end(steps[-1], state, settings) if state.found else {}
+    ends = {k: p for k, p in ends.items() if _far(p, settings)}
+    begins = {k: p for k, p in baseline_block(steps[0], state.absorbs).items() if _far(p, settings) and k not in ends}
+    for when, block in (("declared model", begins), ("model with the effects", ends)):
         for name, p in block.items():
             held = f"; on this log it cannot be distinguished from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
-            if "prior_z" in p and (_far(p, settings) or (held and when != "declared model")):
-                out.append(f"{name} moved {p['prior_z']:+.1f} prior sd from its table in the {when}{held}")
+            out.append(f"{name} moved {p['prior_z']:+.1f} prior sd from its table in the {when}{held}")
     return out
 
 

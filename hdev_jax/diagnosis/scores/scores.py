@@ -20,6 +20,7 @@ from hdev_jax.physics import Parameter
 from hdev_jax.segments import READING_ERRORS
 
 __all__ = [
+    "CERTAIN",
     "NO_EFFECT",
     "Scores",
     "best_of",

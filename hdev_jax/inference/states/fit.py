@@ -27,12 +27,16 @@ SWEEPS = 4  # of reweighted least squares for the levels
 def fit_switching(
     model: Switching, rows: StateRows, rounds: int, *, coloured: bool = True
 ) -> tuple[Switching, Decoded]:
-    """Parameters by so many rounds of expectation-maximisation from `model`, and the states in the last round;
-    `coloured`: the errors have a memory."""
+    """Parameters by at most so many rounds of expectation-maximisation from `model`, and the states by them;
+    `coloured`: the errors have a memory. It ends where a round gains nothing: errors and chances are not maximised
+    jointly, and about the maximum a round may lose a little."""
     decoded = decode(model, rows)
     for _ in range(rounds):
-        model = _updated(model, rows, decoded, coloured)
-        decoded = decode(model, rows)
+        new = _updated(model, rows, decoded, coloured)
+        again = decode(new, rows)
+        if again.log_likelihood <= decoded.log_likelihood:
+            break
+        model, decoded = new, again
     return model, decoded
 
 
