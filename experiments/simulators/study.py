@@ -107,7 +107,7 @@ def _missing(summary: Mapping[str, Any]) -> list[str]:
 
 def _reasons(summary: Mapping[str, Any]) -> list[str]:
     """Effects that the report gives as reasons of declared coefficients that end far above the sheet's values."""
-    ends = summary["after"]["parameters"].values()
+    ends = summary["coefficients"].values()
     return sorted({k for p in ends if p.get("prior_z", 0.0) > 0.0 for k in p["absorbs"]})
 
 

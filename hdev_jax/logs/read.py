@@ -15,7 +15,7 @@ from hdev_jax.logs.instruments import Slope, end_speeds, instruments_of, metres,
 from hdev_jax.logs.intervals import sample_intervals, starts, trip_median
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import KINEMATICS, MEASURED, Log
-from hdev_jax.logs.presets import PRESETS, preset
+from hdev_jax.logs.presets import is_preset, preset
 from hdev_jax.logs.readers import Raw, find_files, read_raw
 from hdev_jax.logs.repair import repair
 from hdev_jax.logs.rows.charging import without_charging
@@ -83,7 +83,7 @@ def adapter_of(adapter: str | Path | Adapter | None) -> Adapter:
     if adapter is None:
         return Adapter()
     if isinstance(adapter, str | Path):
-        if str(adapter) in PRESETS and not Path(adapter).exists():
+        if is_preset(adapter):
             return preset(str(adapter))
         adapter = Adapter.load(adapter)
     if adapter.preset is not None and not adapter.where.startswith("preset "):

@@ -236,6 +236,7 @@ class StepChange(Effect):
     variants: ClassVar[tuple[Names, ...]] = (("power_w",), ("c_rr",), ("loss",))
     mistaken_for: ClassVar[Names] = ("rolling_temperature", "mass_scale")
     separated_by: ClassVar[str] = "the same trip again, before and after a service"
+    between_trips: ClassVar[bool] = True
     order: ClassVar[int] = 20
     power_w: Any
     c_rr: Any

@@ -163,6 +163,7 @@ class Effect(eqx.Module):
     same_as: ClassVar[Names] = ()  # declared coefficients that it is another name of, where a sheet estimates them
     of_efficiency: ClassVar[bool] = False  # every drive has it, where a sheet declares one efficiency for all of it
     instrument: ClassVar[bool] = False  # a fault of a reading: said only where no cause in the vehicle does as well
+    between_trips: ClassVar[bool] = False  # trips are compared with one another: it is known by the fewer of them
     declared: ClassVar[Mapping[str, str]] = {}  # fields of a declared term with their keys in a sheet
     searched: ClassVar[str] = ""  # where it is looked for, if its columns are not known before it is found
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hdev_jax import progress
-from hdev_jax.diagnosis.result.summary import baseline_block
+from hdev_jax.diagnosis.result.coefficients import baseline_block
 from hdev_jax.errors import InputError
 from hdev_jax.inference import cluster_rows, padded
 from hdev_jax.inference.posterior.methods import METHODS, Method, Outcome, calibrated

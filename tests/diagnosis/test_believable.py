@@ -16,7 +16,12 @@ from planted import SHORT, declared, diagnosed, found_in_turn, named, opened, tr
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.compete import compete, no_instrument_named
 from hdev_jax.diagnosis.competition.forward import Round, forward
-from hdev_jax.diagnosis.competition.needed import backward, needed, without_idle_switches
+from hdev_jax.diagnosis.competition.needed import (
+    backward,
+    needed,
+    without_idle_switches,
+    without_unclear,
+)
 from hdev_jax.diagnosis.competition.refit import refit
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.held_out import held_out_gain
@@ -300,7 +305,7 @@ def test_a_coefficient_that_ends_far_from_its_table_is_said_with_what_it_may_sta
     steep = changed(changed(problem, LIBRARY["grade_bias"](0.004)), LIBRARY["auxiliary_power"](6000.0))
     library = {k: LIBRARY[k] for k in ("grade_bias", "auxiliary_power")}
     summary = diagnosed(steep, split, library).summary
-    ends = summary["after"]["parameters"]
+    ends = summary["coefficients"]
     assert ends["road.c_rr"]["prior_z"] > SETTINGS.far
     assert ends["road.c_rr"]["absorbs"] == ["grade_bias"]
     assert ends["road.cda_m2"]["absorbs"] == []
@@ -308,5 +313,18 @@ def test_a_coefficient_that_ends_far_from_its_table_is_said_with_what_it_may_sta
     assert "in the model with the effects" in note
     assert "cannot be distinguished from grade_bias" in note
     calm = diagnosed(changed(problem, LIBRARY["auxiliary_power"](6000.0)), split, library).summary
-    assert not any(p["absorbs"] for p in calm["after"]["parameters"].values())
+    assert not any(p["absorbs"] for p in calm["coefficients"].values())
     assert not [n for n in calm["notes"] if "moved" in n]
+
+
+def test_no_name_stays_whose_size_may_be_nothing_as_it_is_fitted():
+    problem, _ = nothing()
+    both = changed(changed(problem, MassScale(0.1)), LIBRARY["auxiliary_power"](6000.0))
+    rows = training(both, ["mass_scale", "auxiliary_power"])
+    state = found_in_turn(rows, both, ["mass_scale", "auxiliary_power"])
+    assert without_unclear(rows, state) is state
+    alone = training(changed(problem, LIBRARY["auxiliary_power"](6000.0)), ["mass_scale", "auxiliary_power"])
+    less = without_unclear(alone, replace(state, fit=alone.calibrate(state.fit.vehicle, state.fit.table)))
+    assert less.ids == ("auxiliary_power",)
+    assert not less.fit.vehicle.has("mass_scale")
+    assert "mass_scale" in less.barred

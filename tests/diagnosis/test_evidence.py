@@ -1,5 +1,7 @@
 """Scores from Gram matrices against the same numbers from the rows themselves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -470,6 +472,20 @@ def test_a_size_rests_on_the_clusters_that_show_it(bearing):
     evidence = rows.evidence()
     assert evidence.bearing(candidate(0)) == pytest.approx([bearing], rel=0.03)
     assert np.all(evidence.bearing(candidate(0, 2)) == pytest.approx([bearing, 9.0], rel=0.05))
+
+
+@pytest.mark.parametrize("bearing", [2, 4, 9])
+def test_trips_that_are_compared_count_as_the_fewer_of_them(bearing):
+    """A change from a trip on is known by the trips that show it; what rows inside each trip show, by all clusters."""
+    rows = Rows(rows=400, level=0.0)
+    rows.columns[rows.ids >= bearing, 0] = 0.0
+    evidence = rows.evidence()
+    within = evidence.score(candidate(0))
+    between = evidence.score(replace(candidate(0), effect=LIBRARY["step_change"]))
+    f = stats.f.isf(within.p_cluster, 1, 8)
+    expected = stats.f.sf(f, 1, max(evidence.rests_on(candidate(0)), 2.0) - 1.0)
+    assert between.p_cluster == pytest.approx(expected, rel=1e-6)
+    assert (between.p_cluster > 2.0 * within.p_cluster) is (bearing < 9)
 
 
 def test_clusters_that_a_size_rests_on_are_those_of_its_variance():

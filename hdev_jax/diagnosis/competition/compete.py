@@ -11,7 +11,13 @@ from hdev_jax.diagnosis.competition.exchange import one_exchanged, two_exchanged
 from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.grid import sharpened
 from hdev_jax.diagnosis.competition.mode import add_mode
-from hdev_jax.diagnosis.competition.needed import backward, classes, without_far, without_idle_switches
+from hdev_jax.diagnosis.competition.needed import (
+    backward,
+    classes,
+    without_far,
+    without_idle_switches,
+    without_unclear,
+)
 from hdev_jax.diagnosis.competition.refit import widened, without
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.competition.switching import add_switching, decoded_again, mistaken, with_states
@@ -105,6 +111,7 @@ def _step(
     sought += [v for v in state.verdicts if v.id not in asked and training.library[v.id].searched]
     if new is None:
         less = without_far(training, without_idle_switches(training, state, scores), declared)
+        less = without_unclear(training, less)
         new = None if less is state else less
     if new is None:
         state = replace(state, found=classes(scores, state))

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition.refit import gained, in_range, large_enough, without
@@ -22,7 +23,10 @@ from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import Calibration
 from hdev_jax.physics import unavailable
 
-__all__ = ["backward", "can_be_asked", "classes", "model_without", "needed", "without_far", "without_idle_switches"]
+__all__ = [
+    "backward", "can_be_asked", "classes", "model_without", "needed", "without_far", "without_idle_switches",
+    "without_unclear",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -162,6 +166,25 @@ def without_far(training: Training, state: State, declared: Calibration) -> Stat
     return replace(
         less, removed={**less.removed, f.id: Rejection(Kind.FAR, {"name": name, "z": now[name], "times": 2})}
     )
+
+
+def without_unclear(training: Training, state: State) -> State:
+    """The state without effects none of whose sizes is told from nothing by its 90 % interval as it is fitted. Asked at
+    the end, for that is what a report shows."""
+    quantile = float(stats.t.ppf(0.95, max(training.clusters.count - 1, 1)))
+    while True:
+        unclear: dict[float, Found] = {}
+        for f in [f for f in state.found if can_be_asked(f)]:
+            at, c = _places(state.fit, f), f.score.candidate
+            nulls = [c.parameter(state.fit.table.free[k].path.rpartition(".")[2]).null for k in at]
+            t = float(np.max(np.abs(state.fit.values[at] - nulls) / np.maximum(state.fit.errors[at], 1e-300)))
+            if t < quantile:
+                unclear[t] = f
+        if not unclear:
+            return state
+        f = unclear[min(unclear)]
+        why = Rejection(Kind.REFIT, {"times": 2})
+        state = replace(without(training, state, f.id), removed={**state.removed, f.id: why})
 
 
 def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:

@@ -107,7 +107,7 @@ def _with(training: Training, state: State, s: Score, noise: Noise | None) -> Ca
         names = {r.name for r in table.free if r.known or (noise is not None and r in rows)}
         if names:
             known = _by_gls(training, state.fit, vehicle, table, noise or training.noise(state.fit), names)
-        if known is not None or not any(r.free and _is_shape(c, r) for r in rows):
+        if known is not None or not any(r.free and r.path.rpartition(".")[2] not in c.sizes for r in rows):
             break
     if known is None and noise is not None:
         return None
@@ -296,10 +296,6 @@ def _sizes(fit: Calibration, c: Candidate) -> Float[np.ndarray, " k"]:
     by = {(row.path, row.group): float(v) for row, v in zip(fit.table.free, fit.values, strict=True)}
     each = zip(c.sizes, c.groups, strict=True)
     return np.array([by[f"effects.{c.id}.{n}", g] - c.parameter(n).null for n, g in each])
-
-
-def _is_shape(candidate: Candidate, row: Coefficient) -> bool:
-    return row.path.rpartition(".")[2] not in candidate.sizes
 
 
 def _idle(candidate: Candidate, path: str) -> bool:

@@ -48,7 +48,8 @@ def _needed(round_: Round, s: Score) -> int | None:
     level = scores.level(id_)
     p = max(s.p_model, s.p_cluster)
     if s.p <= settings.hint or s.p_model <= level:
-        rests_on = scores.plain.rests_on(s.candidate) if s.plain else None
+        some = s.plain or s.candidate.effect.between_trips
+        rests_on = scores.evidence(s).rests_on(s.candidate) if some else None
         return clusters_needed(p, k, count, level, rests_on)
     if scores.baseline.clusters.kind != "trip" or not scores.between(s.candidate):
         return None

@@ -10,6 +10,8 @@ from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.gates.gates import MOST_IN_CLASS
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.remainder.remainder import Remainder
+from hdev_jax.diagnosis.result import notes
+from hdev_jax.diagnosis.result.coefficients import as_they_end, baseline_block
 from hdev_jax.diagnosis.result.hidden import Given, errors_by_knowledge, state_block
 from hdev_jax.diagnosis.result.intervals import Open
 from hdev_jax.diagnosis.result.modes import mode_block
@@ -19,37 +21,9 @@ from hdev_jax.inference import Calibration, cluster_rows
 from hdev_jax.physics import Choice, ModeChange, Parameter, StepChange
 from hdev_jax.problem import Problem, Split, metrics
 
-__all__ = ["baseline_block", "parameters_of", "summarise"]
+__all__ = ["parameters_of", "summarise"]
 
-ODD_SHARE = 0.2
 MOST_HINTED = 3
-
-
-def baseline_block(fit: Calibration, absorbs: Mapping[str, Sequence[str]]) -> dict[str, Any]:
-    """The contract's `baseline.parameters`: value, sd, prior, distance from the prior, what it may have absorbed."""
-    block = {}
-    for c, value, sd, z in zip(fit.table.free, fit.values, fit.sd, fit.prior_z(), strict=True):
-        prior = {} if c.sd is None else {"prior_value": c.value, "prior_sd": c.sd, "prior_z": float(z)}
-        block[c.name] = {
-            "value": float(value), "sd": float(sd), "unit": c.unit, **prior, "absorbs": list(absorbs.get(c.name, ())),
-        }  # fmt: skip
-    return block
-
-
-def _as_they_end(fit: Calibration, state: State, settings: Settings) -> dict[str, Any]:
-    """The declared coefficients of the model with the effects, as in `baseline.parameters`; `absorbs` of one that is
-    far from its table are the effects that it may stand for: those of plausible sizes, the best first."""
-    declared = {k: v for k, v in baseline_block(fit, {}).items() if not k.startswith("effects.")}
-    able = [v for v in state.verdicts if v.rejection.kind is Kind.ABSORBED and v.rejection.numbers.get("plausible")]
-    able.sort(key=lambda v: -(v.score or 0.0))
-    for name, block in declared.items():
-        if _far(block, settings):
-            block["absorbs"] = [v.id for v in able if v.rejection.numbers["by"] == name]
-    return declared
-
-
-def _far(block: Mapping[str, Any], settings: Settings) -> bool:
-    return abs(block.get("prior_z", 0.0)) > settings.far
 
 
 def _sized(value: float, error: float, clusters: int) -> dict[str, Any]:
@@ -196,12 +170,9 @@ def summarise(
             "unused_trips": split.names(split.unused),
         },
         "before": block(predicted[0]),
-        "after": {
-            **block(predicted[-1]),
-            **(errors_by_knowledge(problem, split, given) if given else {}),
-            "parameters": _as_they_end(steps[-1], state, training.settings),
-        },
+        "after": {**block(predicted[-1]), **(errors_by_knowledge(problem, split, given) if given else {})},
         "baseline": {"parameters": baseline_block(steps[0], state.absorbs)},
+        "coefficients": as_they_end(steps[-1], state, training.settings),
         "effects": effects,
         "candidates": candidates,
         "unexplained": {
@@ -227,11 +198,11 @@ def summarise(
         "subsets": _subsets(problem, test, predicted[0], predicted[-1]),
         "notes": [
             *problem.notes,
-            *_warnings(steps, state, training.settings),
-            *_known(problem, state, steps[-1], training, test, rmse[-1]),
-            *_by_trip(problem, state),
-            *(_of_last_vehicle(problem, train) if any(c["id"] == StepChange.id for c in candidates) else ()),
-            *_odd_rows(problem, predicted[0]),
+            *notes.warnings(steps, state, training.settings),
+            *notes.known(problem, state, steps[-1], training, test, rmse[-1]),
+            *notes.by_trip(problem, state),
+            *(notes.of_last_vehicle(problem, train) if any(c["id"] == StepChange.id for c in candidates) else ()),
+            *notes.odd_rows(problem, predicted[0]),
         ],
     }
 
@@ -280,73 +251,3 @@ def _subsets(problem: Problem, test: np.ndarray, before: np.ndarray, after: np.n
         for name, rows in parts.items()
         if (m := rows & test).sum() > 50
     }
-
-
-def _warnings(steps: list[Calibration], state: State, settings: Settings) -> list[str]:
-    out = []
-    for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
-        if not fit.converged:
-            out.append(f"the fit of the {when} stopped early: {fit.message}")
-    ends = _as_they_end(steps[-1], state, settings) if state.found else {}
-    ends = {k: p for k, p in ends.items() if _far(p, settings)}
-    begins = {k: p for k, p in baseline_block(steps[0], state.absorbs).items() if _far(p, settings) and k not in ends}
-    for when, block in (("declared model", begins), ("model with the effects", ends)):
-        for name, p in block.items():
-            held = f"; on this log it cannot be distinguished from {', '.join(p['absorbs'])}" if p["absorbs"] else ""
-            out.append(f"{name} moved {p['prior_z']:+.1f} prior sd from its table in the {when}{held}")
-    return out
-
-
-def _known(
-    problem: Problem, state: State, last: Calibration, training: Training, test: np.ndarray, rmse: float
-) -> list[str]:
-    """How the coefficients of the model with the effects are estimated, where not as those of the declared model."""
-    if last is state.fit or not state.found:
-        return []
-    said = problem.predict(state.fit.vehicle, compute=training.kernel.predict)[test]
-    plain = metrics(problem.measured[test], said, problem.weight()[test])["rmse"]
-    return [
-        "the model with the effects is fitted by generalised least squares, which gives smaller standard errors: test "
-        f"RMSE {rmse:.4g} {problem.unit}; by ordinary least squares, as for the declared model, {plain:.4g}"
-    ]
-
-
-def _by_trip(problem: Problem, state: State) -> list[str]:
-    """What was estimated for each trip: the phases of a cycle, the trips of a mode."""
-    out = []
-    for f in state.found:
-        values = next(iter(f.score.candidate.by_trip.values()), {})
-        by_trip = [(problem.log.trip_names[t], v) for t, v in values.items()]
-        mean = "other trips, and all trips by augmented_vehicle.toml, are predicted with its mean"
-        if f.score.candidate.effect.searched == "trips":
-            trips = ", ".join(t for t, v in by_trip if v > 0)
-            out.append(f"{f.id} is on in {trips}; {mean}")
-        elif by_trip:
-            phases = ", ".join(f"{t} {v:+.2f}" for t, v in by_trip)
-            out.append(f"{f.id}: phase by trip {phases}; {mean}")
-    return out
-
-
-def _of_last_vehicle(problem: Problem, train: np.ndarray) -> list[str]:
-    """A note where trips of several vehicles train: a change that stays is searched for in those of the last alone."""
-    ids = np.asarray(problem.segments.vehicle)[train]
-    if len(np.unique(ids)) < 2:
-        return []
-    last = problem.log.vehicle_names[int(ids[-1])]
-    return [f"{StepChange.id} is tried within the last trips of {last} only; diagnose the other vehicles separately"]
-
-
-def _odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
-    """A note on a single outlier that has much of the log's squared error."""
-    square = (problem.measured - declared) ** 2
-    worst = int(np.argmax(square))
-    share = square[worst] / max(float(np.sum(square)), 1e-300)
-    size = np.sort(np.abs(problem.measured))
-    if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) <= 3.0 * size[-2]:
-        return []
-    trip = problem.log.trip_names[int(problem.log.trip[worst])]
-    at = float(np.asarray(problem.segments.time_s)[worst])
-    return [
-        f"one row has {100 * share:.0f} % of the declared model's squared error: trip {trip} at {at:.6g} s, "
-        f"{problem.target} = {problem.measured[worst]:.6g}; if it is a measurement fault, remove it and run again"
-    ]

@@ -66,7 +66,7 @@ class Evidence(NormalEquations):
                 full = self._jackknife(blocks)
                 left_out = missed - np.sum(self._loss(full, blocks), axis=0) - self.cost[v]
                 p_model = stats.chi2.sf(2 * np.maximum(gain, 0.0), at.shape[-1])
-                p_cluster = wald(beta, full[..., self.base :])
+                p_cluster = wald(beta, full[..., self.base :], self._freedom([candidates[k] for k in places[here]]))
                 for i, k in enumerate(places[here]):
                     out[int(k)] = Score(
                         candidates[k], beta[i], float(gain[i]), float(p_model[i]), float(p_cluster[i]),
@@ -93,6 +93,13 @@ class Evidence(NormalEquations):
     def rests_on(self, candidate: Candidate) -> float:
         """How many clusters a candidate's coefficients rest on together, as `bearing` of each."""
         return 1.0 / max(float(np.sum(np.mean(self._shares(candidate), axis=0) ** 2)), 1e-300)
+
+    def _freedom(self, candidates: Sequence[Candidate], *, every: bool = False) -> Float[np.ndarray, " way"]:
+        """Degrees of freedom of the Wald test of each: those of the clusters that it rests on, where it compares trips
+        with one another, or for `every` one; else of all clusters, for rows inside each of them show the effect."""
+        k = np.array([len(c.columns) for c in candidates])
+        some = [self.rests_on(c) if every or c.effect.between_trips else np.inf for c in candidates]
+        return np.clip(some, k + 1, self.count) - k
 
     def _shares(self, candidate: Candidate) -> Float[np.ndarray, "k cluster"]:
         """The share that each cluster has in the variance of each coefficient."""
@@ -124,7 +131,6 @@ class Evidence(NormalEquations):
         totals, g = self.totals(), self.count
         out: dict[int, Score] = {}
         for places, at in self._alike([c.columns for c in candidates], max(g, len(self.home))):
-            k = at.shape[-1]
             likelihood, x = self._fit(totals, at)
             blocks, beta = self._blocks(at, 0), x[0, :, self.base :]
             gain, full = self._plain_gain(blocks, beta)
@@ -134,8 +140,7 @@ class Evidence(NormalEquations):
             whole = np.max(likelihood, axis=0) - self.base_likelihood(totals)
             kept = np.sum(better, axis=0) / np.maximum(whole, 1e-300)
             left_out = np.where(t > 1.0, gain * np.minimum(kept, 1.0), 0.0)
-            rests_on = np.array([self.rests_on(candidates[i]) for i in places])
-            p = wald(beta, full[..., self.base :], np.clip(rests_on, k + 1, g) - k)
+            p = wald(beta, full[..., self.base :], self._freedom([candidates[i] for i in places], every=True))
             for i, j in enumerate(places):
                 out[int(j)] = Score(
                     candidates[j], beta[i], float(gain[i]), float(p[i]), float(p[i]), float(left_out[i]),

@@ -8,7 +8,7 @@ from pathlib import Path
 from hdev_jax.errors import InputError
 from hdev_jax.logs.adapter import Adapter, near
 
-__all__ = ["PRESETS", "preset", "recognised"]
+__all__ = ["PRESETS", "is_preset", "preset", "recognised"]
 
 _FOLDER = Path(__file__).parent
 PRESETS = tuple(sorted(p.stem for p in _FOLDER.glob("*.toml")))
@@ -20,6 +20,11 @@ def _read(name: str) -> tuple[Adapter, tuple[str, ...]]:
     table = tomllib.loads((_FOLDER / f"{name}.toml").read_text(encoding="utf-8"))
     headers = tuple(table.pop("recognised_by"))
     return Adapter.from_dict({**table, "preset": name}, where=f"preset {name}"), headers
+
+
+def is_preset(adapter: str | Path) -> bool:
+    """Whether an adapter is given by the name of a preset; a file of that name comes first."""
+    return str(adapter) in PRESETS and not Path(adapter).exists()
 
 
 def preset(name: str, where: str = "adapter") -> Adapter:

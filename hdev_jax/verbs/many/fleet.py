@@ -16,6 +16,7 @@ import numpy as np
 from hdev_jax import progress
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import read_sheet
+from hdev_jax.logs.presets import PRESETS, is_preset
 from hdev_jax.many import FleetResult, Source, Workers, computed, fleet_result, looking_again, sources, vehicle_record
 from hdev_jax.report.many import fleet_page, fleet_text
 from hdev_jax.rundir import Run, atomic_file, open_run
@@ -66,20 +67,21 @@ def fleet(
         raise InputError(f"--target {target}: accepted: {', '.join(TARGETS)}")
     if workers < 1:
         raise InputError(f"--workers {workers}: 1 or more is expected")
-    if adapter is not None and not Path(adapter).is_file():
-        raise InputError(f"--adapter {adapter}: no such file")
+    rules = None if adapter is None or is_preset(adapter) else Path(adapter).resolve()
+    if rules is not None and not rules.is_file():
+        raise InputError(f"--adapter {adapter}: no such file, and no preset; there are {', '.join(PRESETS)}")
     seed = seed_of(seed)
     given = [logs] if isinstance(logs, str | Path) else list(logs)
     each, notes = sources(given, vehicles)
     config = {
         "verb": "fleet", "logs": [str(p) for p in given], "vehicles": str(vehicles), "count": len(each),
         "vehicles_sha256": _fingerprint(each), "adapter": None if adapter is None else str(adapter),
-        "adapter_sha256": None if adapter is None else digest(Path(adapter)), "target": target, "price": price,
+        "adapter_sha256": None if rules is None else digest(rules), "target": target, "price": price,
         "fdr": fdr, **({"trust": True} if trust else {}), "seed": seed, "x64": bool(jax.config.read("jax_enable_x64")),
     }  # fmt: skip
     common = {
-        "adapter": None if adapter is None else str(Path(adapter).resolve()), "target": target, "fdr": fdr,
-        "seed": seed, "trust": trust,
+        "adapter": None if adapter is None else str(rules or adapter), "target": target, "fdr": fdr, "seed": seed,
+        "trust": trust,
     }  # fmt: skip
     with open_run(out, config, seed=seed) as run:
         if run.done:
