@@ -175,7 +175,8 @@ class Settings:
     )
 
     instrument_share: float = _number(
-        0.5, "structure's share of the remaining test variance, above which no instrument fault is named", "1",
+        0.5, "share of the remaining variance that is structure (of test rows), or behaves like a slope that the log "
+        "lacks (of training rows), above which no instrument fault, or no payload error either, is named", "1",
         "more structure than noise: the model's form is wrong",
     )  # fmt: skip
 

@@ -234,7 +234,9 @@ def test_an_effect_goes_whose_fitted_size_has_the_other_sign_than_its_test():
     assert own.beta[0] < 0
     assert own.p < SETTINGS.stays
     assert own.left_out_gain > 0
-    assert backward(rows, replace(state, fit=fit, found=(found_once,)), newest=True).ids == ()
+    less = backward(rows, replace(state, fit=fit, found=(found_once,)), newest=True)
+    assert less.ids == ()
+    assert less.removed["cornering"].kind is Kind.OPPOSITE
 
 
 def test_a_constant_load_that_ordinary_least_squares_alone_show_is_asked_before_a_load_that_begins():
@@ -328,3 +330,18 @@ def test_no_name_stays_whose_size_may_be_nothing_as_it_is_fitted():
     assert less.ids == ("auxiliary_power",)
     assert not less.fit.vehicle.has("mass_scale")
     assert "mass_scale" in less.barred
+
+
+def test_a_payload_is_not_named_from_a_log_without_slope_and_is_with_it(tmp_path):
+    def change(frame):
+        del frame["grade_rad"], frame["altitude_m"]
+
+    options = {"seed": 7302, "mode": "samples", "rows_per_trip": 200, "trips": 9}
+    library = {"mass_scale": MassScale, "auxiliary_power": LIBRARY["auxiliary_power"]}
+    for name, kept, names in (("without", change, []), ("whole", lambda frame: None, ["mass_scale"])):
+        (tmp_path / name).mkdir()
+        _, problem, split = opened(tmp_path / name, change=kept, **options)
+        result = diagnosed(changed(problem, MassScale(0.3)), split, library)
+        kinds = {c["id"]: c["kind"] for c in result.summary["candidates"]}
+        assert named(result) == names
+        assert kinds["mass_scale"] == (Kind.FOUND if names else Kind.MISSING_CHANNEL)

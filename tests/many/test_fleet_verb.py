@@ -204,7 +204,9 @@ def test_a_fleet_of_bad_logs_alone_is_refused(logs, tmp_path):
     assert "no column speed_mps" in said
 
 
-def test_an_adapter_is_a_file_or_the_name_of_a_preset(logs, tmp_path):
+def test_an_adapter_is_a_file_or_the_name_of_a_preset(logs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "torque").mkdir()  # a folder of that name is none of the two
     (tmp_path / "a.csv").write_text("Device Time,Speed (OBD)(km/h)\n2026-01-01 00:00:00,3\n2026-01-01 00:00:01,4\n")
     given = ("fleet", tmp_path / "a.csv", "--vehicles", logs / "truck.toml", "--out", tmp_path / "out")
     assert "no column speed_mps" in hdev(*given)[2]

@@ -133,7 +133,7 @@ def named_alone(training: Training, state: State) -> State:
     if not state.terms:
         return state
     alone = without(training, state, *(t.id for t in state.terms))
-    kept = decoded_again(training, backward(training, alone, newest=True))
+    kept = decoded_again(training, without_unclear(training, backward(training, alone, newest=True)))
     lost = [f for f in alone.found if f.id not in kept.ids]
     verdicts = tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
     return replace(kept, verdicts=(*verdicts, *state.verdicts))
@@ -161,7 +161,7 @@ def no_instrument_named(training: Training, state: State, share: float, missing:
     if not blamed:
         return state
     less = without(training, state, *(f.id for f in blamed))
-    kept = decoded_again(training, backward(training, less, newest=True))
+    kept = decoded_again(training, without_unclear(training, backward(training, less, newest=True)))
     lost = [f for f in less.found if f.id not in kept.ids]
     verdicts = _verdicts(blamed, why)
     verdicts += tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))

@@ -77,8 +77,8 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
 
 
 def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
-    """The candidates; where a load leads of which the rows are not certain, the constant load stands before it, and all
-    that are less significant than that one wait for the next try.
+    """The candidates; where a load leads of which the rows are not certain, it waits for the next try, as all loads do
+    that are less significant than the constant one, which stands in their place.
 
     Rows that are compared with their neighbours, as generalised least squares do, say little of a constant, and more of
     a load that begins, ends or grows: whatever is constant would be called that first.
@@ -98,7 +98,8 @@ def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
     constant = next((s for s in able if is_constant(s)), None)
     if constant is None or not is_load(able[0]) or p(able[0]) <= max(CERTAIN, p(constant)):
         return able
-    return [constant, *(s for s in able if not (is_load(s) and p(s) >= p(constant)))]
+    asked = [constant, *(s for s in able if not (is_load(s) and p(s) >= p(constant)))]
+    return sorted(asked, key=lambda s: (s.plain and s is not constant, -scores.worth(s)))
 
 
 def _plainest(round_: Round, able: Sequence[Score]) -> tuple[Score, set[str]]:

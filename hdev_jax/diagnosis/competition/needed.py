@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate
-from hdev_jax.diagnosis.competition.refit import gained, in_range, large_enough, without
+from hdev_jax.diagnosis.competition.refit import as_reported, gained, in_range, large_enough, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.gates.gates import alike
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
@@ -96,32 +96,35 @@ def backward(training: Training, state: State, *, newest: bool = False) -> State
     """
     while asked := [f for f in state.found if _has_columns(f)]:
         small = [f for f in asked if not large_enough(state.fit, f.score.candidate)]
-        drop = small[0] if small else _weakest(training, state, asked, newest=newest)
+        drop, turned = (small[0], False) if small else _weakest(training, state, asked, newest=newest)
         if drop is None:
             break
         beside = "a term without a name" if _beside_unnamed(state, drop) else "effects added later"
         state = without(training, state, drop.id)
         times = state.removed[drop.id].numbers["times"] + 1 if drop.id in state.removed else 1
         why = Rejection(Kind.SUPERFLUOUS, {"beside": beside, "times": times})
-        if small:
-            why = Rejection(Kind.IMPLAUSIBLE, {"times": times})
+        if small or turned:
+            why = Rejection(Kind.IMPLAUSIBLE if small else Kind.OPPOSITE, {"times": times})
         state = replace(state, removed={**state.removed, drop.id: why})
     return state
 
 
-def _weakest(training: Training, state: State, asked: Sequence[Found], *, newest: bool) -> Found | None:
-    """The effect that is least needed beside all others, None where each is needed."""
+def _weakest(
+    training: Training, state: State, asked: Sequence[Found], *, newest: bool
+) -> tuple[Found | None, bool]:  # fmt: skip
+    """The effect that is least needed beside all others, None where each is needed; and whether it is fitted with the
+    other sign than it has in its test."""
     settings = training.settings
     evidence = evidence_of(training.baseline(state.fit))
-    worst: tuple[tuple[float, bool], Found] | None = None
+    worst: tuple[tuple[float, bool], Found, bool] | None = None
     for f in asked:
-        p = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
+        p, turned = _p_beside(evidence, state, f, settings, old=newest or bool(state.terms) or f is not state.found[-1])
         strictly = _beside_unnamed(state, f) or _beside_cycle(state, f)
         allowed = settings.fdr / _tried(training, state) if strictly else settings.stays
         rank = (p / allowed, f.score.candidate.effect.stage == "sensors")
         if p > allowed and (worst is None or rank >= worst[0]):
-            worst = (rank, f)
-    return worst[1] if worst else None
+            worst = (rank, f, turned)
+    return worst[1:] if worst else (None, False)
 
 
 def without_idle_switches(training: Training, state: State, scores: Scores) -> State:
@@ -169,10 +172,10 @@ def without_far(training: Training, state: State, declared: Calibration) -> Stat
 
 
 def without_unclear(training: Training, state: State) -> State:
-    """The state without effects none of whose sizes is told from nothing by its 90 % interval as it is fitted. Asked at
-    the end, for that is what a report shows."""
+    """The state without effects none of whose sizes is distinguished from nothing by its 90 % interval as a report
+    would show it: by generalised least squares where these fit (all are significant then), else as it is fitted."""
     quantile = float(stats.t.ppf(0.95, max(training.clusters.count - 1, 1)))
-    while True:
+    while state.found and as_reported(training, state) is state.fit:
         unclear: dict[float, Found] = {}
         for f in [f for f in state.found if can_be_asked(f)]:
             at, c = _places(state.fit, f), f.score.candidate
@@ -181,26 +184,27 @@ def without_unclear(training: Training, state: State) -> State:
             if t < quantile:
                 unclear[t] = f
         if not unclear:
-            return state
+            break
         f = unclear[min(unclear)]
         why = Rejection(Kind.REFIT, {"times": 2})
         state = replace(without(training, state, f.id), removed={**state.removed, f.id: why})
+    return state
 
 
-def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> float:
-    """p-value of a found effect beside all others: 1 where it has the wrong sign beside them, is not confirmed by
-    cross-validation there, or is one of a class with one of them. The newest (not `old`) has been tested already but
-    for the last."""
+def _p_beside(evidence: Evidence, state: State, f: Found, settings: Settings, *, old: bool) -> tuple[float, bool]:
+    """p-value of a found effect beside all others, and whether it is fitted with the other sign than it has there: 1
+    then, where it is not confirmed by cross-validation there, or where it is one of a class with one of them. The
+    newest (not `old`) has been tested already but for the last."""
     if any(_doubles(evidence, state, f, g, settings) for g in state.found if g is not f):
-        return 1.0
+        return 1.0, False
     if not old:
-        return 0.0
+        return 0.0, False
     own = needed(evidence, state.fit, f)
     c = f.score.candidate
     now = state.fit.values[_places(state.fit, f)] - np.array([c.parameter(n).null for n in own.candidate.sizes])
-    turned = bool(np.all(now * own.beta < 0.0))  # as it is fitted it has the other sign
+    turned = bool(np.all(now * own.beta < 0.0))
     stands = own.left_out_gain > 0.0 and in_range(state.fit, c) and not turned
-    return own.p if stands else 1.0
+    return (own.p if stands else 1.0), turned and own.p <= settings.stays
 
 
 def _doubles(evidence: Evidence, state: State, f: Found, g: Found, settings: Settings) -> bool:

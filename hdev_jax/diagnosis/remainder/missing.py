@@ -36,21 +36,22 @@ def missing_slope(
     drift: Drift, settings: Settings,
 ) -> MissingSlope | None:  # fmt: skip
     """The slope that the residual of the training rows [W] behaves like, where the log has none: a force, in the means
-    over minutes (`drift`) or over `HILL_S`, with a share of the residual's variance. None where there is no sign of it.
+    over minutes (`drift`) or over `HILL_S`, whichever shows more of it, with a share of the residual's variance. None
+    where there is no sign of it.
     """
     s = problem.segments
     if problem.vehicle.entry != "road" or s.has("grade_rad"):
         return None
     seconds, trip, speed = np.asarray(s.duration_s), np.asarray(s.trip), np.asarray(s.speed_mps)
-    if drift.like != "force":
-        quick = Slow.of(residual_w, predicted_w, speed, seconds, trip, HILL_S)
-        drift = drift_of(quick.take(np.isin(quick.trip, split.train)), settings)
-    if drift.like != "force":
+    quick = Slow.of(residual_w, predicted_w, speed, seconds, trip, HILL_S)
+    quickly = drift_of(quick.take(np.isin(quick.trip, split.train)), settings)
+    sd = max((d.sd for d in (drift, quickly) if d.like == "force"), default=0.0)
+    if not sd > 0.0:
         return None
     rows = np.isin(trip, split.train)
-    share = drift.sd**2 * float(np.mean(speed[rows] ** 2)) / max(float(np.mean(residual_w[rows] ** 2)), 1e-300)
+    share = sd**2 * float(np.mean(speed[rows] ** 2)) / max(float(np.mean(residual_w[rows] ** 2)), 1e-300)
     if share <= settings.least_share:
         return None
     mass_kg = s.channels["mass_kg"] if s.has("mass_kg") else problem.vehicle.mass_kg
     weight_n = GRAVITY_MPS2 * float(np.mean(np.asarray(mass_kg)))
-    return MissingSlope(drift.sd / weight_n, min(float(np.sqrt(share)), 1.0))
+    return MissingSlope(sd / weight_n, min(float(np.sqrt(share)), 1.0))

@@ -26,6 +26,8 @@ def as_they_end(fit: Calibration, state: State, settings: Settings) -> dict[str,
     """The declared coefficients of the model with the effects, as in `baseline.parameters`; `absorbs` of one that is
     far from its table are the effects that it may stand for: those of plausible sizes, the best first."""
     declared = {k: v for k, v in baseline_block(fit, {}).items() if not k.startswith("effects.")}
+    if not state.found:  # what was searched is another model then
+        return {k: {**b, "absorbs": state.absorbs.get(k, []) if far(b, settings) else []} for k, b in declared.items()}
     able = [v for v in state.verdicts if v.rejection.kind is Kind.ABSORBED and v.rejection.numbers.get("plausible")]
     able.sort(key=lambda v: -(v.score or 0.0))
     for name, block in declared.items():

@@ -34,7 +34,7 @@ def fit_switching(
     for _ in range(rounds):
         new = _updated(model, rows, decoded, coloured)
         again = decode(new, rows)
-        if again.log_likelihood <= decoded.log_likelihood:
+        if not again.log_likelihood > decoded.log_likelihood:
             break
         model, decoded = new, again
     return model, decoded

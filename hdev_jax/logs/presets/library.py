@@ -24,7 +24,7 @@ def _read(name: str) -> tuple[Adapter, tuple[str, ...]]:
 
 def is_preset(adapter: str | Path) -> bool:
     """Whether an adapter is given by the name of a preset; a file of that name comes first."""
-    return str(adapter) in PRESETS and not Path(adapter).exists()
+    return str(adapter) in PRESETS and not Path(adapter).is_file()
 
 
 def preset(name: str, where: str = "adapter") -> Adapter:
