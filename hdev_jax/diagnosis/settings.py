@@ -182,6 +182,9 @@ class Settings:
 
     # notes
     far: float = _number(2.0, "|prior_z| above which a coefficient is flagged", "sd", "5 %, two-sided")
+    odd: float = _number(
+        0.2, "share of the declared model's squared error above which a single row is reported", "1", "a fifth"
+    )
     suspicious: float = _number(
         8.0, "gain above which an undecided candidate is reported", "log-likelihood", "odds of 3,000 to 1"
     )

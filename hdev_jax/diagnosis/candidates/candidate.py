@@ -86,6 +86,11 @@ class Candidate:
         """The effect's parameter of that name."""
         return next(p for p in self.effect.parameters if p.name == name)
 
+    @property
+    def constant(self) -> bool:
+        """Whether it adds the same in every row."""
+        return all(self.parameter(n).constant for n in self.sizes)
+
     def is_constant_load(self, sizes: Mapping[str, float]) -> bool:
         """Whether these sizes, by name and against their null, make it an instrument that reads a constant power too
         much: that is a constant load of the vehicle first, under another name."""

@@ -133,10 +133,7 @@ def named_alone(training: Training, state: State) -> State:
     if not state.terms:
         return state
     alone = without(training, state, *(t.id for t in state.terms))
-    kept = decoded_again(training, without_unclear(training, backward(training, alone, newest=True)))
-    lost = [f for f in alone.found if f.id not in kept.ids]
-    verdicts = tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
-    return replace(kept, verdicts=(*verdicts, *state.verdicts))
+    return _what_stands(training, alone)
 
 
 def none_named(state: State, declared: Calibration) -> State:
@@ -161,11 +158,16 @@ def no_instrument_named(training: Training, state: State, share: float, missing:
     if not blamed:
         return state
     less = without(training, state, *(f.id for f in blamed))
+    return _what_stands(training, replace(less, verdicts=(*_verdicts(blamed, why), *less.verdicts)))
+
+
+def _what_stands(training: Training, less: State) -> State:
+    """A state from which something was taken out, without what is no longer significant, and a verdict on each that
+    goes."""
     kept = decoded_again(training, without_unclear(training, backward(training, less, newest=True)))
     lost = [f for f in less.found if f.id not in kept.ids]
-    verdicts = _verdicts(blamed, why)
-    verdicts += tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
-    return replace(kept, verdicts=(*verdicts, *state.verdicts))
+    verdicts = tuple(v for f in lost for v in _verdicts([f], kept.removed[f.id]))
+    return replace(kept, verdicts=(*verdicts, *less.verdicts))
 
 
 def _verdicts(found: Sequence[Found], why: Rejection) -> tuple[Verdict, ...]:

@@ -77,11 +77,11 @@ def forward(round_: Round, *, skip: Collection[str] = (), only: Collection[str] 
 
 
 def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
-    """The candidates; where a load leads of which the rows are not certain, it waits for the next try, as all loads do
-    that are less significant than the constant one, which stands in their place.
+    """The candidates in their order; if a load leads whose p-value is not tiny, and a constant load has a smaller one,
+    without the loads that are less significant than the constant.
 
-    Rows that are compared with their neighbours, as generalised least squares do, say little of a constant, and more of
-    a load that begins, ends or grows: whatever is constant would be called that first.
+    Generalised least squares compare a row with its neighbours: they see little of a constant, and more of a load that
+    begins, ends or grows, by which name a constant would be found first.
     """
 
     def p(s: Score) -> float:
@@ -92,10 +92,7 @@ def _constant_first(scores: Scores, able: list[Score]) -> list[Score]:
         units = {s.candidate.parameter(n).unit for n in s.candidate.sizes}
         return units == {"W"} and effect.stage == "battery" and not effect.of_efficiency
 
-    def is_constant(s: Score) -> bool:
-        return is_load(s) and all(s.candidate.parameter(n).constant for n in s.candidate.sizes)
-
-    constant = next((s for s in able if is_constant(s)), None)
+    constant = next((s for s in able if is_load(s) and s.candidate.constant), None)
     if constant is None or not is_load(able[0]) or p(able[0]) <= max(CERTAIN, p(constant)):
         return able
     asked = [constant, *(s for s in able if not (is_load(s) and p(s) >= p(constant)))]

@@ -242,17 +242,13 @@ def _tried(training: Training, state: State) -> int:
     return max(1, sum(not unavailable(c, row, car.entry, car.stands_in) for c in training.library.values()))
 
 
-def _constant(f: Found) -> bool:
-    return all(f.score.candidate.parameter(size).constant for size in f.score.candidate.sizes)
-
-
 def _beside_cycle(state: State, f: Found) -> bool:
     """Whether it is a constant load beside a cycle: the cycle's mean is uncertain, as its duty is."""
-    return _constant(f) and any(g.score.candidate.effect.searched == "spectrum" for g in state.found)
+    return f.score.candidate.constant and any(g.score.candidate.effect.searched == "spectrum" for g in state.found)
 
 
 def _beside_unnamed(state: State, f: Found) -> bool:
-    if _constant(f):  # never gives way to a term without a name
+    if f.score.candidate.constant:  # never gives way to a term without a name
         return False
     c = f.score.candidate
     reads = c.effect.reads()

@@ -12,10 +12,10 @@ from hdev_jax.problem import Problem, metrics
 
 __all__ = ["by_trip", "known", "odd_rows", "of_last_vehicle", "warnings"]
 
-ODD_SHARE = 0.2
-
 
 def warnings(steps: list[Calibration], state: State, settings: Settings) -> list[str]:
+    """Fits that stopped early, and declared coefficients that are far from their tables: as they end, or as they began
+    where they came back."""
     out = []
     for fit, when in ((steps[0], "declared model"), (steps[-1], "model with the effects")):
         if not fit.converged:
@@ -69,13 +69,13 @@ def of_last_vehicle(problem: Problem, train: np.ndarray) -> list[str]:
     return [f"{StepChange.id} is tried within the last trips of {last} only; diagnose the other vehicles separately"]
 
 
-def odd_rows(problem: Problem, declared: np.ndarray) -> list[str]:
+def odd_rows(problem: Problem, declared: np.ndarray, settings: Settings) -> list[str]:
     """A note on a single outlier that has much of the log's squared error."""
     square = (problem.measured - declared) ** 2
     worst = int(np.argmax(square))
     share = square[worst] / max(float(np.sum(square)), 1e-300)
     size = np.sort(np.abs(problem.measured))
-    if len(square) < 100 or share < ODD_SHARE or abs(problem.measured[worst]) <= 3.0 * size[-2]:
+    if len(square) < 100 or share < settings.odd or abs(problem.measured[worst]) <= 3.0 * size[-2]:
         return []
     trip = problem.log.trip_names[int(problem.log.trip[worst])]
     at = float(np.asarray(problem.segments.time_s)[worst])

@@ -202,7 +202,7 @@ def summarise(
             *notes.known(problem, state, steps[-1], training, test, rmse[-1]),
             *notes.by_trip(problem, state),
             *(notes.of_last_vehicle(problem, train) if any(c["id"] == StepChange.id for c in candidates) else ()),
-            *notes.odd_rows(problem, predicted[0]),
+            *notes.odd_rows(problem, predicted[0], training.settings),
         ],
     }
 
