@@ -35,8 +35,7 @@ class Line(Strict):
 
 
 class Config(Strict):
-    """The study. A seed draws a vehicle and its trips; the same seeds serve every change, so that logs differ in it
-    alone."""
+    """The study. A seed draws a vehicle, its trips and the noise; every log has its own."""
 
     experiment: Literal["simulators.study"]
     lines: dict[str, Line]

@@ -6,6 +6,7 @@ and read as a customer's log, diagnosed, and given to the rivals. Its result kee
 Its error is compared with that of a refit that knows the cause (`refit`).
 """
 
+import itertools
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -39,14 +40,16 @@ SOURCES = (
 
 
 def tasks(config: Config) -> Iterator[dict[str, Any]]:
-    """One for each log: the first of every vehicle and change, then the second, so that a part has all of them."""
+    """One for each log: the first of every vehicle and change, then the second, so that a part has all of them. Each
+    has a vehicle, trips and noise of its own: what happens by chance counts once."""
+    seeds = itertools.count(config.seed)
     for k in range(max(line.logs for line in config.lines.values())):
         for key, line in config.lines.items():
-            for at, vehicle in enumerate(line.vehicles):
+            for vehicle in line.vehicles:
                 for plant in line.plants if k < line.logs else ():
                     yield {
                         "line": key, "simulator": line.simulator, "vehicle": vehicle, "plant": plant,
-                        "rows": line.rows, "measured": line.measured, "seed": config.seed + 100 * k + at,
+                        "rows": line.rows, "measured": line.measured, "seed": next(seeds),
                         "trips": config.trips, "seconds": config.seconds, "noise": config.noise,
                         "ar_coefficient": config.ar_coefficient, "fdr": config.fdr, "rivals": config.rivals,
                     }  # fmt: skip

@@ -38,10 +38,8 @@ NOTES = (
     "changed. Segments of 100 m average over what happens within them, for both fits",
     "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
     "split braking between motor and friction brakes, so regeneration that is lost is taken from the electric power",
-    "Logs of one vehicle and kind have the same drive and the same noise, whatever is changed: a false name by chance "
-    "counts in several of them",
-    "No log of these seeds was looked at while the method was changed; of others, with the same vehicles and changes, "
-    "some were",
+    "Each log has a drive, a vehicle and noise of its own. No log of these seeds was looked at while the method was "
+    "changed; of others, with the same vehicles and changes, some were",
     "Rivals get the declared model's residual and every effect's column. *Named* is over the logs whose change is an "
     "effect of the library, *nothing changed* over the logs without a change, all else over all n. A name is right if "
     "it is the change, and false if it is neither the change nor the form of the efficiency. LightGBM names nothing",

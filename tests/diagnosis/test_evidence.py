@@ -245,11 +245,12 @@ def test_weights_count_clusters():
     )
 
 
-def test_signs_flip_columns_by_cluster():
-    """Gram matrices of flipped columns are those of rows whose columns were flipped; one sign for all is no change."""
+@pytest.mark.parametrize("values", [(-1.0, 1.0), (0.0, 1.0)])
+def test_columns_are_weighted_by_cluster(values):
+    """Gram matrices of weighted columns are those of rows whose columns were; one sign for all is no change."""
     rows = Rows()
-    sign = np.random.default_rng(1).choice([-1.0, 1.0], 9)
-    flipped = rows.evidence().flipped(candidate(0, 2), sign)
+    sign = np.random.default_rng(1).choice(values, 9)
+    flipped = rows.evidence().weighted((0, 2), sign)
     rows.columns[:, [0, 2]] *= sign[rows.ids][:, None]
     every = np.arange(BASE + CANDIDATES + 1)
     for v in range(len(LEVELS)):
@@ -257,7 +258,7 @@ def test_signs_flip_columns_by_cluster():
         np.testing.assert_allclose(flip, there, rtol=1e-9, atol=1e-9)
     evidence = rows.evidence()
     for one in (-1.0, 1.0):
-        same = evidence.flipped(candidate(0), np.full(9, one))
+        same = evidence.weighted((0,), np.full(9, one))
         assert same.gain(same.totals(), (0,))[0] == pytest.approx(evidence.gain(evidence.totals(), (0,))[0])
 
 

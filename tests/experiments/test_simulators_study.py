@@ -164,15 +164,9 @@ def test_rivals_are_scored_by_the_same_rule():
     assert boosted["named"] is None
 
 
-def test_the_same_seeds_serve_every_change_and_what_cannot_act_is_refused():
+def test_every_log_has_a_seed_of_its_own_and_what_cannot_act_is_refused():
     every = list(tasks(typed(Config, resolve(STUDY), STUDY)))
-    seeds: dict[tuple[str, str, str], set[int]] = {}
-    for t in every:
-        seeds.setdefault((t["line"], t["vehicle"], t["plant"]), set()).add(t["seed"])
-    by_vehicle: dict[tuple[str, str], set[frozenset[int]]] = {}
-    for (line, vehicle, _), some in seeds.items():
-        by_vehicle.setdefault((line, vehicle), set()).add(frozenset(some))
-    assert all(len(x) == 1 for x in by_vehicle.values())
+    assert len({t["seed"] for t in every}) == len(every) > 400
     with pytest.raises(ValueError, match="drag changes nothing where force is measured"):
         Line(simulator="fastsim", vehicles=["zoe"], plants=["drag"], measured="force")
     with pytest.raises(ValueError, match="torque comes from FASTSim"):

@@ -173,23 +173,17 @@ class Evidence(NormalEquations):
         v, skip = int(np.argmax(likelihood)), self.base + len(other)
         return float(wald(x[v, skip:], self._jackknife(self._blocks(at, v))[:, skip:]))
 
-    def flipped(self, candidate: Candidate, sign: Float[np.ndarray, " cluster"]) -> "Evidence":
-        """The same evidence with the candidate's columns given a sign in each cluster."""
-        at = self.base + np.asarray(candidate.columns)
-        grams, levels = self.grams.copy(), self.levels.copy()
-        inner = grams[:, at[:, None], at[None, :]]
-        grams[:, :, at] *= sign[:, None, None]
-        grams[:, at, :] *= sign[:, None, None]
-        grams[:, at[:, None], at[None, :]] = inner
-        levels[:, at] *= sign[self.home][:, None]
+    def weighted(self, columns: Sequence[int], weight: Float[np.ndarray, " cluster"]) -> "Evidence":
+        """The same evidence with candidates' columns multiplied by a number in each cluster: 0 takes them out of it."""
+        grams, levels, at = self.grams.copy(), self.levels.copy(), self.base + np.asarray(columns)
+        grams[:, :, at] *= weight[:, None, None]
+        grams[:, at, :] *= weight[:, None, None]
+        levels[:, at] *= weight[self.home][:, None]
         return replace(self, grams=grams, levels=levels)
 
     def within(self, on: Float[np.ndarray, " cluster"]) -> "Evidence":
-        """The same evidence of candidates that act in the clusters `on` alone; without random intercepts."""
-        grams, k = self.grams.copy(), np.arange(self.base, self.grams.shape[-1] - 1)
-        grams[:, k, :] *= on[:, None, None]
-        grams[:, :, k] = np.swapaxes(grams[:, k, :], 1, 2)
-        return replace(self, grams=grams)
+        """The same evidence of candidates that act in the clusters `on` alone."""
+        return self.weighted(range(self.grams.shape[-1] - 1 - self.base), on)
 
     def left_out_gain_of_mode(self, on: Float[np.ndarray, " cluster"]) -> float:
         """Gain in log-likelihood, over clusters left out in turn, of one column that acts in the clusters `on` alone.
@@ -213,8 +207,8 @@ class Evidence(NormalEquations):
             sign = rng.choice([-1.0, 1.0], size=self.count)
             if abs(sign @ energy) > 0.98 * energy.sum():
                 continue
-            other = small.flipped(candidate, sign)
             columns = candidate.columns
+            other = small.weighted(columns, sign)
             out[i] = other.plain_gain(columns) if s.plain else other.gain(other.totals(), columns)[0]
         return out
 
