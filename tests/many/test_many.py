@@ -12,6 +12,7 @@ from hdev_jax.many.evidence import effects_of_types, families
 from hdev_jax.many.ledger import fleet_ledger
 from hdev_jax.many.pooling import cauchy, pooled, shrunk, without_each
 from hdev_jax.many.unlike import Weeks, change_point, equations
+from hdev_jax.report.many import fleet_text
 
 TRIPS, DAY_S = 40, 86_400.0
 
@@ -217,6 +218,19 @@ def test_a_changed_vehicle_is_named_once_with_its_date_and_cost_and_a_bad_log_is
     line = result.tables["fleet"].set_index("name").loc["bad"]
     assert (line["status"], line["message"]) == ("refused", "bad.csv: no column")
     assert fleet_result([*records, bad], fdr=0.05, seed=0).summary == result.summary
+
+
+@pytest.mark.usefixtures("_fewer_permutations")
+@pytest.mark.parametrize(("vehicles", "words"), [(3, "no vehicle changed;"), (12, "changed or differs from its type;")])
+def test_the_answer_says_what_was_compared_and_what_most_logs_name(vehicles, words):
+    rng = np.random.default_rng(11)
+    records = [record(rng, k) for k in range(vehicles)]
+    for k, r in enumerate(records):
+        ids = ["headwind", "tyre_warmup"][: 1 + (k == 0)]
+        r["effects"] = [{"id": id_, "q_value": 1e-12} for id_ in ids]
+    text = fleet_text(fleet_result(records, fdr=0.05, seed=0))
+    assert words in text
+    assert f"named most often from the vehicles' own logs: headwind ({vehicles}), tyre warm-up (1)" in text
 
 
 def files(folder, *names):

@@ -33,10 +33,10 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
     forms: dict[str, str] = {}
     for e in effects:  # the form that is clearest over the type, else in the vehicle
         forms.setdefault(e["id"], f"{e['id']}.{e['size']} {e['shapes']}".strip())
-    there = sorted((r for r in records if r.get("scan")), key=lambda r: (r["type"], r["name"]))
+    there = sorted((r for r in records if r.get("scan") or r.get("effects")), key=lambda r: (r["type"], r["name"]))
     strong: dict[str, float] = {}
     for r in there:
-        for s in r["scan"].values():
+        for s in (r.get("scan") or {}).values():
             strong[s["id"]] = max(strong.get(s["id"], 0.0), abs(_z(s)))
         for e in r["effects"]:
             strong[e["id"]] = np.inf
@@ -49,8 +49,9 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
     z = np.full((len(there), len(ids)), np.nan)
     for i, r in enumerate(there):
         for j, id_ in enumerate(ids):
-            own = [s for s in r["scan"].values() if s["id"] == id_]
-            s = r["scan"].get(forms.get(id_, "")) or max(own, key=lambda s: abs(_z(s)), default=None)
+            scan = r.get("scan") or {}
+            own = [s for s in scan.values() if s["id"] == id_]
+            s = scan.get(forms.get(id_, "")) or max(own, key=lambda s: abs(_z(s)), default=None)
             if s is not None:
                 z[i, j] = _z(s)
     fig = figure(WIDTH, 2.0 + 0.17 * len(there))
@@ -58,7 +59,8 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
     image = ax.imshow(z, cmap="RdBu_r", vmin=-STRONGEST, vmax=STRONGEST, aspect="auto", interpolation="nearest")
     dots = [(j, i) for i, r in enumerate(there) for j, k in enumerate(ids) if any(e["id"] == k for e in r["effects"])]
     if dots:
-        ax.plot(*np.array(dots).T, "o", color=INK, markersize=3.5, label="named by the vehicle's own diagnosis")
+        ax.plot(*np.array(dots).T, "o", markerfacecolor="white", markeredgecolor=INK, markersize=4,
+                label="named by the vehicle's own diagnosis")  # fmt: skip
         fig.legend(loc="outside lower left")
     ax.set_xticks(np.arange(len(ids)), [short(names.effect(k), 26) + (" ★" if k in of_type else "") for k in ids],
                   rotation=60, ha="right", rotation_mode="anchor", fontsize=7)  # fmt: skip

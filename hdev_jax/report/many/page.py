@@ -1,13 +1,16 @@
 """The page of a fleet: vehicles that differ, effects by type, the ledger, bad logs."""
 
 import datetime
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from hdev_jax.diagnosis.settings import FLEET_SETTINGS
 from hdev_jax.many import FleetResult
+from hdev_jax.many.evidence import by_type
 from hdev_jax.report import names, words
 from hdev_jax.report.energy.figures import by_week, label
 from hdev_jax.report.energy.flow import CAPTION as FLOW
@@ -18,6 +21,7 @@ from hdev_jax.report.many.figures import condition_curves, effects_map, time_lin
 __all__ = ["fleet_page", "fleet_pieces", "fleet_text"]
 
 MOST_LINES = 10  # of a list in the answer
+MOST_NAMED = 3  # effects that the answer gives with how many vehicles they were named in
 
 
 def fleet_pieces(result: FleetResult) -> list[tuple[str, bool]]:
@@ -43,10 +47,14 @@ def fleet_pieces(result: FleetResult) -> list[tuple[str, bool]]:
                        "others of the type", True))  # fmt: skip
         pieces.append((f" ({_few(differ)})", False))
     if not changed and not differ:
-        pieces.append(("no vehicle changed or differs from its type", True))
+        compared = any(len(v) >= FLEET_SETTINGS.least_vehicles for v in by_type(result.records).values())
+        pieces.append(("no vehicle changed" + (" or differs from its type" if compared else ""), True))
     if found:
         shown = list(dict.fromkeys(f"{names.effect(e['id'])} ({e['type']})" for e in found))
         pieces += [("; shown by a type's vehicles together: ", False), (_few(shown), True)]
+    if own := Counter(e["id"] for v in s["vehicles"] for e in v.get("effects", ()) if e["counts_in_fleet"]):
+        often = ", ".join(f"{names.effect(k)} ({n})" for k, n in own.most_common(MOST_NAMED))
+        pieces += [("; named most often from the vehicles' own logs: ", False), (often, True)]
     pieces.append((".", False))
     return pieces
 
@@ -106,7 +114,8 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
         Section(
             "Vehicles that differ from their type, or changed",
             "Each coefficient of a vehicle is compared with the prediction from the others of its type, and with its "
-            "own earlier value. What all of a type do alike in a week (a season) is removed first. Ranked by cost.",
+            "own earlier value. What all of a type do alike in a week (a season) is removed first. Ranked by cost."
+            + ("" if s["unlike"] else " None was found."),
             {"time_line": (lambda: time_line(done, s["unlike"]), "Coefficients of each vehicle week by week.",
                            "Estimates of each week alone; thick where a change was found.")},
             (_unlike(s["unlike"]),) if s["unlike"] else (),
@@ -115,7 +124,8 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
             "Effects, vehicle by vehicle",
             _bound(s["highest_q_in_vehicle"]),
             {"effects_map": (lambda: effects_map(done, s["effects"]), "A map of effects by vehicle.",
-                             "First-order size of each effect that the sheet does not declare, in standard errors.")},
+                             "First-order size of each effect that the sheet does not declare, in standard errors. "
+                             "White: not estimated; the log lacks what it needs, or the model has loads that switch.")},
             (_effects(s["effects"]),) if s["effects"] else (),
         ),
         Section(
@@ -134,10 +144,11 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
                             "Each dot is a trip; lines are means of as many trips each.")},
             (),
         ),
-        Section("Coefficients by type", "Each vehicle counts as one estimate, made without the sheet's prior.", {},
-                (_pooled(s["coefficients"]),) if s["coefficients"] else ()),
         Section("Every vehicle", "", {}, (_vehicles(result.tables["fleet"]),)),
     ]  # fmt: skip
+    if s["coefficients"]:
+        how = "Each vehicle counts as one estimate, made without the sheet's prior."
+        sections.insert(4, Section("Coefficients by type", how, {}, (_pooled(s["coefficients"]),)))
     bad = [v for v in s["vehicles"] if v["status"] != "done"]
     if bad:
         cells = [(v["name"], v["status"], v["message"]) for v in bad]
@@ -195,10 +206,11 @@ def _pooled(pooled: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _vehicles(frame: pd.DataFrame) -> Table:
-    columns = {"name": "Vehicle", "type": "Type", "status": "Status", "trips": "Trips", "km": "km",
-               "rmse_before": "RMSE before", "rmse_after": "after", "effects": "Effects"}  # fmt: skip
-    shown = frame.assign(type=frame["type"].fillna(""), effects=frame["effects"].fillna(""))
-    return table_of(shown, "Vehicles", columns, text=3, file="fleet.csv")
+    columns = {"name": "Vehicle", "type": "Type", "status": "Status", "effects": "Effects", "trips": "Trips",
+               "km": "km", "rmse_before": "RMSE before", "rmse_after": "after"}  # fmt: skip
+    effects = [", ".join(map(names.effect, ids.split())) for ids in frame["effects"].fillna("")]
+    shown = frame.assign(type=frame["type"].fillna(""), effects=effects)
+    return table_of(shown, "Vehicles", columns, text=4, file="fleet.csv")
 
 
 def _ledger(whole: pd.DataFrame, price: float | None) -> Table:
