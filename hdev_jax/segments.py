@@ -8,14 +8,22 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["ACCEL_SD", "GRADE_SD", "READING_ERRORS", "Column", "Ids", "Segments", "starts_of_runs", "trip_slices"]
+__all__ = [
+    "ACCEL_OF_WAY", "ACCEL_SD", "GRADE_SD", "NO_CAUSE", "READING_ERRORS", "SQUARE_SPEED", "WITHIN_ROWS", "Column",
+    "Ids", "Segments", "starts_of_runs", "trip_slices",
+]  # fmt: skip
 
 Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
 Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
 GRADE_SD, ACCEL_SD = "grade_sd_rad", "accel_sd_mps2"
 READING_ERRORS = (GRADE_SD, ACCEL_SD)
-"""Channels with the standard deviations of the slope and of the acceleration by speeds, where they matter: no cause of
-anything, and offered as none."""
+"""Channels with the standard deviations of the slope and of the acceleration by speeds, where they matter."""
+ACCEL_OF_WAY, SQUARE_SPEED = "accel_over_distance_mps2", "square_speed_m2ps2"
+WITHIN_ROWS = (ACCEL_OF_WAY, SQUARE_SPEED)
+"""Channels of rows that were put together from samples: means over distance of acceleration and of v², which the speeds
+at a row's ends do not tell."""
+NO_CAUSE = (*READING_ERRORS, *WITHIN_ROWS)
+"""Channels that are no cause of anything, and offered as none."""
 
 
 class Segments(eqx.Module):
@@ -91,6 +99,25 @@ class Segments(eqx.Module):
     def accel_mps2(self) -> Column:
         """(v_end − v_start) / duration [m/s²]; an accelerometer's reading is `channels["accel_mps2"]`."""
         return (self.speed_end_mps - self.speed_start_mps) / self.duration_s
+
+    @property
+    def accel_of_way_mps2(self) -> Column:
+        """Mean over the row's way [m/s²], so that m·a·Δs is Δ(½mv²); `accel_mps2` where only end speeds are known."""
+        return self.channels.get(ACCEL_OF_WAY, self.accel_mps2)
+
+    @property
+    def square_speed_m2ps2(self) -> Column:
+        """Mean of v² over the row's way [m²/s²]; (v_i² + v_f²)/2 (paper 1, equation 4) where only those are known."""
+        return self.channels.get(SQUARE_SPEED, 0.5 * (self.speed_start_mps**2 + self.speed_end_mps**2))
+
+    def faster(self, factor: Any) -> "Segments":
+        """The same rows with all speeds and distances so many times as large."""
+        lengths = ("distance_m", "speed_start_mps", "speed_end_mps")
+        within = {ACCEL_OF_WAY: factor, SQUARE_SPEED: factor**2}
+        moved = eqx.tree_at(
+            lambda s: [getattr(s, k) for k in lengths], self, [getattr(self, k) * factor for k in lengths]
+        )
+        return moved.with_channels(**{k: self.channels[k] * f for k, f in within.items() if k in self.channels})
 
     def __len__(self) -> int:
         return self.trip.shape[0]

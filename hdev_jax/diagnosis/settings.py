@@ -167,8 +167,7 @@ class Settings:
         "parameter is added to a found effect, or a cycle differs between trips", "1", "a test at 0.1 %",
     )  # fmt: skip
     least_share: float = _number(
-        0.02, "least share of the variance that a structure has to explain, or an effect where slope or speed have "
-        "known errors", "1", "1 % of the error",
+        0.02, "least share of the squared error that an effect or a structure has to explain", "1", "1 % of the error",
     )  # fmt: skip
     least_levels: float = _number(
         0.1, "least share of the variance that random intercepts of trips explain", "1", "chosen on seeds 1-99"

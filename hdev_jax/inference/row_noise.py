@@ -18,7 +18,7 @@ from jaxtyping import ArrayLike, Bool, Float
 from scipy.optimize import nnls
 
 from hdev_jax.physics import Vehicle
-from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
+from hdev_jax.segments import ACCEL_OF_WAY, ACCEL_SD, GRADE_SD, Segments
 
 __all__ = ["INSTRUMENTS", "believed", "row_noise", "shapes"]
 
@@ -68,6 +68,8 @@ def shifted(log: Segments, slope_rad: ArrayLike, change_mps: ArrayLike) -> Segme
     """The log with slopes and changes of speed higher by so much, a number or one for each row."""
     ends = log.speed_start_mps - 0.5 * change_mps, log.speed_end_mps + 0.5 * change_mps
     moved = eqx.tree_at(lambda s: (s.speed_start_mps, s.speed_end_mps), log, ends)
+    if log.has(ACCEL_OF_WAY):
+        moved = moved.with_channels(**{ACCEL_OF_WAY: log.channels[ACCEL_OF_WAY] + change_mps / log.duration_s})
     return moved.with_channels(grade_rad=log.get("grade_rad", np.zeros(len(log))) + slope_rad)
 
 

@@ -10,7 +10,7 @@ from hdev_jax.logs.intervals import starts
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import Log
 from hdev_jax.logs.repair import CIRCULAR
-from hdev_jax.segments import ACCEL_SD, GRADE_SD, Segments
+from hdev_jax.segments import ACCEL_OF_WAY, ACCEL_SD, GRADE_SD, SQUARE_SPEED, WITHIN_ROWS, Segments
 from hdev_jax.units import unit_of
 
 __all__ = ["HALT_S", "by_distance"]
@@ -19,7 +19,9 @@ HALT_S = 10.0  # a bus stop or a red light; shorter is stop-and-go, a part of dr
 # What a metre of road has or costs: m·g·sinθ·Δs, force·Δs. Torque is a force at the shaft.
 _OF_THE_ROAD = (
     "grade_rad", GRADE_SD, "altitude_m", "curvature_1pm", "wet_road", "mass_kg", "traction_force_n", "motor_torque_nm",
+    *WITHIN_ROWS,
 )  # fmt: skip
+_WITHIN = {ACCEL_OF_WAY: "accel_of_way_mps2", SQUARE_SPEED: "square_speed_m2ps2"}  # properties of the rows
 _STATES = ("gear", "road_surface")  # kinds, which have no mean
 _ROUNDING = 1e-6  # of a length: ten samples of 10 m are 100 m, whatever their sum is in binary
 
@@ -41,8 +43,9 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
     mean directions [0, 2π). Flags become the share of time. The gear, the kind of surface and other whole numbers
     without a unit take the value held longest (of two held equally long, the lower).
 
-    What varies inside a stretch is lost. The kernel knows only the speeds at its ends, so its acceleration work F·Δs is
-    Δ(½mv²) only where distance over duration is the mean of the two.
+    What varies inside a stretch is lost, but two means over distance become channels that the kernel uses: of the
+    acceleration, so that m·a·Δs stays Δ(½mv²), and of v², for the drag (`accel_over_distance_mps2`,
+    `square_speed_m2ps2`).
 
     **Arguments:** `log` of any rows (`[row]`, samples or intervals); `length_m` > 0 [m]; `halt_s` > 0 [s].
 
@@ -65,7 +68,8 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
     time, way = np.add.reduceat(duration, first), np.add.reduceat(distance, first)
     ledger = _cut_entries(log, length_m, halt_s, halts=int(halt[first].sum()), way=way, halt=halt[first])
     channels = {}
-    for name, column in s.channels.items():
+    by_way = np.where(way[row] > 0, distance, duration)
+    for name, column in (s.channels | {k: getattr(s, p) for k, p in _WITHIN.items()}).items():
         x = np.asarray(column, dtype=np.float64)
         if name in CIRCULAR:
             channels[name], how = _direction(x, duration, first), "mean direction over time"
@@ -76,8 +80,7 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
             spans = 2.0 if log.sampled else 1.0  # the rows between the readings of a row's acceleration
             channels[name], how = usual * np.minimum(spans / (last - first + 1), 1.0), "the error of the end speeds"
         elif name in _OF_THE_ROAD:
-            weight = np.where(way[row] > 0, distance, duration)
-            channels[name], how = _mean(x, weight, first, slope=name == "grade_rad"), "mean over distance"
+            channels[name], how = _mean(x, by_way, first, slope=name == "grade_rad"), "mean over distance"
         else:
             channels[name], how = _mean(x, duration, first), "mean over time"
         ledger = ledger.add("derived", f"{how} in each row", column=name)

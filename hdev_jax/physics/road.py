@@ -23,15 +23,9 @@ __all__ = [
     "Rolling",
     "RotatingMass",
     "density_of_weather",
-    "mean_square_speed",
 ]
 
 ROAD = ("road",)
-
-
-def mean_square_speed(row: Segments) -> Any:
-    """(v_i² + v_f²)/2 of paper 1, equation 4 [m²/s²]."""
-    return 0.5 * (row.speed_start_mps**2 + row.speed_end_mps**2)
 
 
 def _slope(row: Segments) -> Any:
@@ -59,7 +53,7 @@ class Inertia(Effect):
     rotating_mass_factor: Any
 
     def force(self, row: Row, car: Car) -> Real:
-        return self.rotating_mass_factor * car.mass(row) * row.accel_mps2
+        return self.rotating_mass_factor * car.mass(row) * row.accel_of_way_mps2
 
 
 class Grade(Effect):
@@ -107,7 +101,7 @@ class Aero(Effect):
     cda_m2: Any
 
     def force(self, row: Row, car: Car) -> Real:
-        return car.drag(row) * mean_square_speed(row)
+        return car.drag(row) * row.square_speed_m2ps2
 
 
 # --- air -------------------------------------------------------------------------------------------------------------
@@ -127,8 +121,8 @@ def _wind_along(row: Segments) -> Any:
 
 def _extra_drag(row: Segments, car: Car, wind_mps: Any) -> Any:
     """Drag at air speed v + w less drag at v, with the sign of the air speed: the mean of both ends, as in `Aero`."""
-    ends = [v + wind_mps for v in (row.speed_start_mps, row.speed_end_mps)]
-    return car.drag(row) * (0.5 * sum(air * jnp.abs(air) for air in ends) - mean_square_speed(row))
+    ends = (row.speed_start_mps, row.speed_end_mps)
+    return car.drag(row) * 0.5 * sum((v + wind_mps) * jnp.abs(v + wind_mps) - v**2 for v in ends)
 
 
 class ConstantHeadwind(Effect):
@@ -189,7 +183,7 @@ class AirDensity(Effect):
     scale: Any
 
     def force(self, row: Row, car: Car) -> Real:
-        return self.scale * (density_of_weather(row) / AIR_DENSITY_KGPM3 - 1.0) * car.drag(row) * mean_square_speed(row)
+        return self.scale * (density_of_weather(row) / AIR_DENSITY_KGPM3 - 1.0) * car.drag(row) * row.square_speed_m2ps2
 
 
 class Crosswind(Effect):
@@ -214,9 +208,9 @@ class Crosswind(Effect):
         delta = row.channels["wind_from_rad"] - row.channels["heading_rad"]
         side = row.channels["wind_speed_mps"] * jnp.sin(delta)
         # the speed that the drag has; the breath of 1 µm/s keeps the angle and its slope finite in still air
-        speed = jnp.sqrt(mean_square_speed(row) + 1e-12)
+        speed = jnp.sqrt(row.square_speed_m2ps2 + 1e-12)
         yaw = jnp.arctan2(jnp.abs(side), speed + row.channels["wind_speed_mps"] * jnp.cos(delta))
-        return self.drag_per_rad2 * yaw**2 * car.drag(row) * mean_square_speed(row)
+        return self.drag_per_rad2 * yaw**2 * car.drag(row) * row.square_speed_m2ps2
 
 
 class Drafting(Effect):
@@ -237,7 +231,7 @@ class Drafting(Effect):
 
     def force(self, row: Row, car: Car) -> Real:
         near = jnp.exp(-jnp.maximum(row.channels["gap_m"], 0.0) / 30.0)
-        return -self.reduction * near * car.drag(row) * mean_square_speed(row)
+        return -self.reduction * near * car.drag(row) * row.square_speed_m2ps2
 
 
 # --- mass and slope --------------------------------------------------------------------------------------------------
@@ -258,7 +252,7 @@ class RotatingMass(Effect):
     factor: Any
 
     def force(self, row: Row, car: Car) -> Real:
-        return self.factor * car.mass(row) * row.accel_mps2
+        return self.factor * car.mass(row) * row.accel_of_way_mps2
 
 
 class RoadGrade(Effect):

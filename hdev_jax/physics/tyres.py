@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.effect import Car, Effect, GoesWith, Names, Parameters, Real, Row, Stage
 from hdev_jax.physics.parameter import Shape, Size
-from hdev_jax.physics.road import ROAD, mean_square_speed, weight_on_road
+from hdev_jax.physics.road import ROAD, weight_on_road
 from hdev_jax.segments import Segments
 
 __all__ = ["Cornering", "RoadSurface", "RollingLinear", "RollingSpeed", "RollingTemperature", "TyreWarmup", "WetRoad"]
@@ -34,7 +34,7 @@ class RollingSpeed(Effect):
     per_mps2: Any
 
     def force(self, row: Row, car: Car) -> Real:
-        return self.per_mps2 * weight_on_road(row, car) * mean_square_speed(row)
+        return self.per_mps2 * weight_on_road(row, car) * row.square_speed_m2ps2
 
 
 class RollingLinear(Effect):
@@ -145,7 +145,7 @@ class WetRoad(Effect):
         # resistance of displaced water go with the tyres' width and the speed, not with their load.
         wet = row.channels["wet_road"]
         rolling = wet * self.excess * car.rolling() * weight_on_road(row, car)
-        return rolling, wet * self.spray * car.drag(row) * mean_square_speed(row)
+        return rolling, wet * self.spray * car.drag(row) * row.square_speed_m2ps2
 
 
 class RoadSurface(Effect):
@@ -186,5 +186,5 @@ class Cornering(Effect):
     coefficient: Any
 
     def force(self, row: Row, car: Car) -> Real:
-        lateral = mean_square_speed(row) * row.channels["curvature_1pm"]
+        lateral = row.square_speed_m2ps2 * row.channels["curvature_1pm"]
         return self.coefficient * car.mass(row) * lateral**2

@@ -12,7 +12,7 @@ from hdev_jax.physics.driveline import Driveline, EfficiencyMap
 from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.physics.parameter import as_array
-from hdev_jax.physics.road import mean_square_speed, weight_on_road
+from hdev_jax.physics.road import weight_on_road
 from hdev_jax.segments import ACCEL_SD, GRADE_SD, READING_ERRORS, Segments
 from hdev_jax.targets import Target, target_of
 from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2, J_PER_WH
@@ -327,7 +327,7 @@ def coefficients_that_hold(car: Vehicle, row: Segments) -> tuple[Real, Real]:
     parts = [e.split(row, car) for e in car.effects]
     weight: Any = sum(w for w, _ in parts)
     air: Any = sum(a for _, a in parts)
-    square = mean_square_speed(row)
+    square = row.square_speed_m2ps2
     moves = row.distance_m > 0
     fast = moves & (square > _SLOW_MPS**2)
     pressure = 0.5 * row.get("air_density_kgpm3", AIR_DENSITY_KGPM3) * jnp.where(fast, square, 1.0)

@@ -104,12 +104,10 @@ def _as(s: Segments, other: _Other) -> Segments:
     if other.name == "grade_rad":
         grade = np.arctan(np.clip(other.factor * np.tan(np.asarray(s.channels["grade_rad"])), -1.0, 1.0))
         return replace(s, channels={**s.channels, "grade_rad": grade})
-    k = other.factor
-    fields = {f: k * np.asarray(getattr(s, f)) for f in ("distance_m", "speed_start_mps", "speed_end_mps")}
-    channels = dict(s.channels)
-    if "grade_rad" in channels and "altitude_m" in channels:
-        channels["grade_rad"] = np.asarray(channels["grade_rad"]) / k
-    return replace(s, channels=channels, **fields)
+    faster = s.faster(other.factor)
+    if not s.has("grade_rad", "altitude_m"):
+        return faster
+    return faster.with_channels(grade_rad=np.asarray(s.channels["grade_rad"]) / other.factor)
 
 
 def _some_rows(problem: Problem, trips: tuple[int, ...] | None) -> tuple[Segments, np.ndarray]:

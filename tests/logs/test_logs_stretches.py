@@ -1,6 +1,7 @@
 """Logs by distance against a plain loop and by hand: where rows are cut, what is conserved, what channels become."""
 
 import math
+from dataclasses import replace
 
 import hypothesis.strategies as st
 import jax.numpy as jnp
@@ -132,10 +133,11 @@ def test_every_trip_keeps_its_time_distance_energy_and_climb(made, length):
     def totals(a: Log) -> np.ndarray:
         s = a.segments
         climb, work = s.distance_m * np.sin(s.channels["grade_rad"]), s.distance_m * s.channels["mass_kg"]
-        each = (s.duration_s, s.distance_m, a.target("energy_wh"), climb, work)
+        ways = (s.distance_m * s.accel_of_way_mps2, s.distance_m * s.square_speed_m2ps2)
+        each = (s.duration_s, s.distance_m, a.target("energy_wh"), climb, work, *ways)
         return np.array([np.bincount(s.trip, x, len(a.trip_names)) for x in each])
 
-    magnitude = np.abs(log.target("energy_wh")).sum() + log.segments.distance_m.sum() + 1.0
+    magnitude = np.abs(log.target("energy_wh")).sum() + 1e5 * log.segments.distance_m.sum() + 1.0
     np.testing.assert_allclose(totals(out), totals(log), rtol=1e-12, atol=1e-13 * magnitude)
     # a row begins at most one sample's way past a multiple of the length
     s = out.segments
@@ -210,24 +212,34 @@ def test_energy_that_the_log_measures_is_summed():
     assert out.default_target == "energy_wh"
 
 
-@pytest.mark.parametrize("slope", [-0.05, 0.0, 0.03])
-def test_the_kernel_asks_the_same_energy_of_samples_and_stretches(slope):
+@pytest.mark.parametrize(("slope", "swing", "efficiency"), [(-0.05, 0.0, 0.9), (0.03, 0.0, 0.9), (0.01, 8.0, 1.0)])
+def test_the_kernel_asks_the_same_energy_of_samples_and_stretches(slope, swing, efficiency):
+    """A steady speed, and one that varies inside the stretches where nothing is lost when power turns round."""
     n = 1000
     channels = {"grade_rad": np.full(n, slope), "mass_kg": np.full(n, 2e4)}
-    log = make(np.full(n, 11.0), np.arange(n) // 400, channels=channels)
+    log = make(11.0 + swing * np.sin(np.arange(n) / 3.0), np.arange(n) // 400, channels=channels)
     out = by_distance(log)
     assert len(out) < len(log) / 8
     car = Vehicle(
         (Inertia(1.0), Grade(), Rolling(0.008), Aero(6.0)),
         mass_kg=jnp.asarray(0.0),
-        driveline=Driveline(0.95),
-        machine=Machine(0.9, 0.8),
+        driveline=Driveline(0.95 if efficiency < 1.0 else 1.0),
+        machine=Machine(efficiency, 0.8 if efficiency < 1.0 else 1.0),
     )
     parts, whole = car.breakdown(log.segments), car.breakdown(out.segments)
     assert parts.keys() == whole.keys()
     for name, x in parts.items():
         each = np.bincount(log.segments.trip, np.asarray(x)), np.bincount(out.segments.trip, np.asarray(whole[name]))
         np.testing.assert_allclose(each[1], each[0], rtol=1e-11, atol=1e-9)
+
+
+def test_stretches_of_a_faster_log_are_the_faster_stretches():
+    log = make(11.0 + 8.0 * np.sin(np.arange(300) / 3.0))
+    made = by_distance(replace(log, segments=log.segments.faster(1.25)), 125.0).segments
+    scaled = by_distance(log, 100.0).segments.faster(1.25)
+    for name in ("distance_m", "speed_start_mps", "speed_end_mps", "accel_of_way_mps2", "square_speed_m2ps2"):
+        np.testing.assert_allclose(getattr(made, name), getattr(scaled, name), rtol=1e-12, atol=1e-12)
+    assert not np.allclose(scaled.accel_of_way_mps2, scaled.accel_mps2, atol=0.1)
 
 
 @pytest.mark.parametrize("length", [0.0, -100.0, math.nan, math.inf])

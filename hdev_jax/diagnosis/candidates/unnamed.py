@@ -20,7 +20,7 @@ from jaxtyping import Array
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.physics import Effect, Size, Vehicle
 from hdev_jax.physics.effect import Car, Names, Parameters, Point, Real, Row, Stage
-from hdev_jax.segments import READING_ERRORS, Segments
+from hdev_jax.segments import NO_CAUSE, Segments
 from hdev_jax.targets import TARGETS, TargetName
 from hdev_jax.units import registry, unit_of
 
@@ -155,7 +155,7 @@ def words_of(factors: Sequence[Factor]) -> str:
 
 def monomials(segments: Segments, rows: int) -> list[tuple[Factor, ...]]:
     """Every monomial that the log can tell: powers of motion, each channel, its square, with speed, above quantiles."""
-    logged = segments.without(*READING_ERRORS).channels
+    logged = segments.without(*NO_CAUSE).channels
     values = {k: np.asarray(v, dtype=float)[:rows] for k, v in logged.items() if ":" not in k}
     values = {k: v for k, v in values.items() if np.ptp(v) > 0}
     centred = {k: float(f"{np.median(v):.3g}") for k, v in values.items() if unit_of(k) == "degree_Celsius"}

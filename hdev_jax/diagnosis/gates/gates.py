@@ -92,15 +92,14 @@ def _agreed(a: Asked) -> Rejection | None:
     return Rejection(Kind.CONTRADICTED, {"share": share})
 
 
-def _beyond_readings(a: Asked) -> Rejection | None:
-    """Where slope or speed were read with errors, what they were given the readings is known up to the form of their
-    distribution: a small gain from a change of that form is no cause."""
-    if not a.scores.inexact:
-        return None
-    plain, columns = a.scores.plain, a.score.candidate.columns
-    share = plain.gain(plain.totals(), columns)[0] / max(plain.misfit(), 1e-300)
-    least = a.scores.settings.least_share
-    return Rejection(Kind.READINGS, {"share": float(share), "least": least}) if share < least else None
+def _worth_naming(a: Asked) -> Rejection | None:
+    """What explains less than a hundredth of the error, by ordinary and by generalised least squares, is not named:
+    forms of effects are not exact, and a long log makes anything significant. Where slope or speed were read with
+    errors, ordinary ones decide: the form of those errors' distribution is a part of what the others see."""
+    looks = (a.scores.plain,) if a.scores.inexact else (a.scores.plain, a.scores.white)
+    columns, least = a.score.candidate.columns, a.scores.settings.least_share
+    share = max(e.gain(e.totals(), columns)[0] / max(e.misfit(), 1e-300) for e in looks)
+    return Rejection(Kind.SMALL, {"share": float(share), "least": least}) if share < least else None
 
 
 def _worthwhile(a: Asked) -> Rejection | None:
@@ -151,7 +150,7 @@ SCORE_GATES: tuple[Gate, ...] = (
     _confirmed,
     _significant,
     _agreed,
-    _beyond_readings,
+    _worth_naming,
     _worthwhile,
 )
 DRAWN_GATES: tuple[Gate, ...] = (_beats_placebos, _stable)
@@ -200,7 +199,7 @@ def _stability(a: Asked) -> float:
     rivals = [
         s for s in scores.best.values()
         if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in {*scores.absorbed_by, *a.out}
-        and plausible(s, settings) and _beyond_readings(replace(a, score=s)) is None
+        and plausible(s, settings) and _worth_naming(replace(a, score=s)) is None
     ]  # fmt: skip
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]
     # one with more numbers that the chosen one does as well as (a limit at 0 W, with a share) is no rival of it

@@ -19,7 +19,7 @@ class Kind(StrEnum):
     NOT_CONFIRMED = "not_confirmed"
     NOT_SIGNIFICANT = "not_significant"
     CONTRADICTED = "contradicted"
-    READINGS = "readings"
+    SMALL = "small"
     OUTSCORED = "outscored"
     REFIT = "refit"
     OPPOSITE = "opposite_signs"
@@ -60,7 +60,7 @@ SENTENCES = {
         "its generalised least-squares estimate is significantly smaller than {share:.0%} of its ordinary "
         "least-squares estimate"
     ),
-    Kind.READINGS: "explains {share:.1%} of the error; errors of the readings can explain as much",
+    Kind.SMALL: "explains {share:.1%} of the squared error, less than the {least:.0%} that a name has to",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
     Kind.OPPOSITE: "its generalised and its ordinary least-squares estimate are significant with opposite signs",

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from hdev_jax.inference import Clusters, cluster_rows
 from hdev_jax.physics.across import distance_since_start
 from hdev_jax.problem import Problem
-from hdev_jax.segments import READING_ERRORS
+from hdev_jax.segments import NO_CAUSE
 
 __all__ = ["Rows", "features", "side"]
 
@@ -48,7 +48,7 @@ def features(problem: Problem, predicted: np.ndarray, declared: np.ndarray) -> t
         "duration_s": np.asarray(s.duration_s),
         "predicted": predicted,
         "declared": declared,
-        **{k: np.asarray(v, dtype=float) for k, v in s.without(*READING_ERRORS).channels.items()},
+        **{k: np.asarray(v, dtype=float) for k, v in s.without(*NO_CAUSE).channels.items()},
     }
     names = [k for k, v in columns.items() if np.ptp(v) > 0]
     return np.stack([columns[k] for k in names], axis=1), names

@@ -16,7 +16,7 @@ from hdev_jax.diagnosis.competition.state import State
 from hdev_jax.inference import Fit, jacobian, padded
 from hdev_jax.physics import Effect
 from hdev_jax.problem import Problem
-from hdev_jax.segments import Segments
+from hdev_jax.segments import WITHIN_ROWS, Segments
 from hdev_jax.units import GRAVITY_MPS2
 
 __all__ = ["DRIVES", "Advice", "advise"]
@@ -97,7 +97,7 @@ def simulate(parts: Sequence[Part], problem: Problem) -> Segments:
         which.append(np.full(n, k))
     start, end, at = np.concatenate(v0), np.concatenate(v1), np.concatenate(which)
     n, duration = len(at), np.full(len(at), step)
-    median = {k: float(np.median(np.asarray(v, dtype=float))) for k, v in s.channels.items()}
+    median = {k: float(np.median(np.asarray(v, dtype=float))) for k, v in s.without(*WITHIN_ROWS).channels.items()}
     channels: dict[str, Any] = {k: np.full(n, m) for k, m in median.items()}
 
     def vary(name: str, values: list[float | None], usual: float) -> None:

@@ -18,7 +18,6 @@ from hdev_jax.errors import InputError
 from hdev_jax.physics import Driveline, Effect, Vehicle
 from hdev_jax.physics.across import DISTANCE_SINCE_START, distance_since_start
 from hdev_jax.physics.driveline import WHEEL_RADIUS_M
-from hdev_jax.physics.road import mean_square_speed
 from hdev_jax.segments import Column, Ids, Segments
 from hdev_jax.units import GRAVITY_MPS2
 
@@ -221,7 +220,7 @@ def _feature(name: str, s: Segments, vehicle: Vehicle, sheet: Mapping[str, np.nd
         raise InputError(f"no feature {name!r}; they are {', '.join(known)}")
     one = np.ones(len(s))
     mass = _mass(s, vehicle)
-    square = np.asarray(mean_square_speed(s))
+    square = np.asarray(s.square_speed_m2ps2)
     weight = mass * GRAVITY_MPS2
     unit = GRAVITY_MPS2 * _REFERENCE_M
     cda, c_rr = float(vehicle.effect("aero").cda_m2), float(vehicle.effect("rolling").c_rr)
