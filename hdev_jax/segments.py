@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 __all__ = [
-    "ACCEL_OF_WAY", "ACCEL_SD", "GRADE_SD", "NO_CAUSE", "READING_ERRORS", "SQUARE_SPEED", "WITHIN_ROWS", "Column",
-    "Ids", "Segments", "starts_of_runs", "trip_slices",
+    "ACCEL_OF_WAY", "ACCEL_SD", "GRADE_SD", "NO_CAUSE", "READING_ERRORS", "SPREAD", "SQUARE_SPEED", "WITHIN_ROWS",
+    "Column", "Ids", "Segments", "starts_of_runs", "trip_slices",
 ]  # fmt: skip
 
 Column = Float[Array, "*row"] | Float[np.ndarray, "*row"]
@@ -18,10 +18,10 @@ Ids = Int[Array, "*row"] | Int[np.ndarray, "*row"]
 GRADE_SD, ACCEL_SD = "grade_sd_rad", "accel_sd_mps2"
 READING_ERRORS = (GRADE_SD, ACCEL_SD)
 """Channels with the standard deviations of the slope and of the acceleration by speeds, where they matter."""
-ACCEL_OF_WAY, SQUARE_SPEED = "accel_over_distance_mps2", "square_speed_m2ps2"
-WITHIN_ROWS = (ACCEL_OF_WAY, SQUARE_SPEED)
-"""Channels of rows that were put together from samples: means over distance of acceleration and of v², which the speeds
-at a row's ends do not tell."""
+ACCEL_OF_WAY, SQUARE_SPEED, SPREAD = "accel_over_distance_mps2", "square_speed_m2ps2", "accel_spread_mps2"
+WITHIN_ROWS = (ACCEL_OF_WAY, SQUARE_SPEED, SPREAD)
+"""Channels of rows that were put together from samples: means over distance of the acceleration and of v², and the
+standard deviation over distance of a + g·sin θ, which the speeds at a row's ends do not tell."""
 NO_CAUSE = (*READING_ERRORS, *WITHIN_ROWS)
 """Channels that are no cause of anything, and offered as none."""
 
@@ -113,7 +113,7 @@ class Segments(eqx.Module):
     def faster(self, factor: Any) -> "Segments":
         """The same rows with all speeds and distances so many times as large."""
         lengths = ("distance_m", "speed_start_mps", "speed_end_mps")
-        within = {ACCEL_OF_WAY: factor, SQUARE_SPEED: factor**2}
+        within = {ACCEL_OF_WAY: factor, SQUARE_SPEED: factor**2, SPREAD: factor}
         moved = eqx.tree_at(
             lambda s: [getattr(s, k) for k in lengths], self, [getattr(self, k) * factor for k in lengths]
         )

@@ -10,8 +10,8 @@ from hdev_jax.logs.intervals import starts
 from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import Log
 from hdev_jax.logs.repair import CIRCULAR
-from hdev_jax.segments import ACCEL_OF_WAY, ACCEL_SD, GRADE_SD, SQUARE_SPEED, WITHIN_ROWS, Segments
-from hdev_jax.units import unit_of
+from hdev_jax.segments import ACCEL_OF_WAY, ACCEL_SD, GRADE_SD, SPREAD, SQUARE_SPEED, Segments
+from hdev_jax.units import GRAVITY_MPS2, unit_of
 
 __all__ = ["HALT_S", "by_distance"]
 
@@ -19,7 +19,7 @@ HALT_S = 10.0  # a bus stop or a red light; shorter is stop-and-go, a part of dr
 # What a metre of road has or costs: m·g·sinθ·Δs, force·Δs. Torque is a force at the shaft.
 _OF_THE_ROAD = (
     "grade_rad", GRADE_SD, "altitude_m", "curvature_1pm", "wet_road", "mass_kg", "traction_force_n", "motor_torque_nm",
-    *WITHIN_ROWS,
+    ACCEL_OF_WAY, SQUARE_SPEED,
 )  # fmt: skip
 _WITHIN = {ACCEL_OF_WAY: "accel_of_way_mps2", SQUARE_SPEED: "square_speed_m2ps2"}  # properties of the rows
 _STATES = ("gear", "road_surface")  # kinds, which have no mean
@@ -43,9 +43,10 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
     mean directions [0, 2π). Flags become the share of time. The gear, the kind of surface and other whole numbers
     without a unit take the value held longest (of two held equally long, the lower).
 
-    What varies inside a stretch is lost, but two means over distance become channels that the kernel uses: of the
+    What varies inside a stretch is lost, but for three channels that the kernel uses: means over distance of the
     acceleration, so that m·a·Δs stays Δ(½mv²), and of v², for the drag (`accel_over_distance_mps2`,
-    `square_speed_m2ps2`).
+    `square_speed_m2ps2`), and the standard deviation over distance of a + g·sin θ (`accel_spread_mps2`): a stretch that
+    is driven and braked has losses in both directions.
 
     **Arguments:** `log` of any rows (`[row]`, samples or intervals); `length_m` > 0 [m]; `halt_s` > 0 [s].
 
@@ -69,7 +70,7 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
     ledger = _cut_entries(log, length_m, halt_s, halts=int(halt[first].sum()), way=way, halt=halt[first])
     channels = {}
     by_way = np.where(way[row] > 0, distance, duration)
-    for name, column in (s.channels | {k: getattr(s, p) for k, p in _WITHIN.items()}).items():
+    for name, column in (s.without(SPREAD).channels | {k: getattr(s, p) for k, p in _WITHIN.items()}).items():
         x = np.asarray(column, dtype=np.float64)
         if name in CIRCULAR:
             channels[name], how = _direction(x, duration, first), "mean direction over time"
@@ -84,6 +85,8 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
         else:
             channels[name], how = _mean(x, duration, first), "mean over time"
         ledger = ledger.add("derived", f"{how} in each row", column=name)
+    channels[SPREAD] = _spread(s, by_way, first)
+    ledger = ledger.add("derived", "standard deviation over distance in each row", column=SPREAD)
     measured = {}
     for name, y in log.measured.items():
         total = name == "energy_wh"
@@ -156,6 +159,15 @@ def _mean(x: np.ndarray, weight: np.ndarray, first: np.ndarray, *, slope: bool =
     else:
         mean = np.add.reduceat(x * weight, first) / total
     return np.clip(mean, np.minimum.reduceat(x, first), np.maximum.reduceat(x, first))
+
+
+def _spread(s: Segments, weight: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Standard deviation of a + g·sin θ in each row, with what was inside the rows before [m/s²]."""
+    x = np.asarray(s.accel_of_way_mps2) + GRAVITY_MPS2 * np.sin(np.asarray(s.get("grade_rad", np.zeros(len(s)))))
+    mean, total = _mean(x, weight, first), np.add.reduceat(weight, first)
+    away = x - np.repeat(mean, np.diff(np.r_[first, len(x)]))
+    inside = away**2 + np.asarray(s.get(SPREAD, np.zeros(len(s)))) ** 2
+    return np.sqrt(np.add.reduceat(inside * weight, first) / total)
 
 
 def _direction(x: np.ndarray, weight: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from hdev_jax.physics.effect import STAGES, Effect, Point, Real, resolve
 from hdev_jax.physics.machine import Machine, switch
 from hdev_jax.physics.parameter import as_array
 from hdev_jax.physics.road import weight_on_road
-from hdev_jax.segments import ACCEL_SD, GRADE_SD, READING_ERRORS, Segments
+from hdev_jax.segments import ACCEL_OF_WAY, ACCEL_SD, GRADE_SD, READING_ERRORS, SPREAD, Segments
 from hdev_jax.targets import Target, target_of
 from hdev_jax.units import AIR_DENSITY_KGPM3, GRAVITY_MPS2, J_PER_WH
 
@@ -207,14 +207,19 @@ class Vehicle(eqx.Module):
         def column(row: Segments) -> Any:
             return of(self._chain(self._sensed(row)), row)
 
-        if self.entry != "road" or not any(segments.has(k) for k in READING_ERRORS):
+        if self.entry != "road" or not any(segments.has(k) for k in (SPREAD, *READING_ERRORS)):
             return jax.vmap(column)(segments)
-        # The expectation over what slope and acceleration may be, by the two points that have the mean and variance of
-        # their force: where power changes its sign the chain bends, and such an error costs energy on average.
+        # The expectation over what slope and acceleration may be, and over what they are inside a row, by the two
+        # points that have the mean and variance of their force: where power changes its sign the chain bends, and such
+        # a spread costs energy on average.
         level = jnp.zeros_like(segments.duration_s)
         sd = jnp.hypot(segments.get(GRADE_SD, level), segments.get(ACCEL_SD, level) / GRAVITY_MPS2)
-        grade = segments.get("grade_rad", level)
-        sides = [jax.vmap(column)(segments.with_channels(grade_rad=grade + e)) for e in (sd, -sd)]
+        if segments.has(SPREAD):  # as large as accelerations are: such a slope would lift the weight off the road
+            sd = jnp.hypot(GRAVITY_MPS2 * sd, segments.channels[SPREAD])
+            name, middle = ACCEL_OF_WAY, segments.accel_of_way_mps2
+        else:
+            name, middle = "grade_rad", segments.get("grade_rad", level)
+        sides = [jax.vmap(column)(segments.with_channels(**{name: middle + e})) for e in (sd, -sd)]
         return jax.tree.map(lambda a, b: 0.5 * (a + b), *sides)
 
     # --- a target in three steps: they can be compiled apart ----------------------------------------------------------

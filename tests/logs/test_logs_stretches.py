@@ -14,7 +14,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.logs import Log, by_distance
 from hdev_jax.physics import Driveline, Machine, Vehicle
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
-from hdev_jax.segments import Segments, trip_slices
+from hdev_jax.segments import SPREAD, Segments, trip_slices
 
 
 def make(speed, trip=None, dt=1.0, channels=None, power=None) -> Log:
@@ -231,6 +231,25 @@ def test_the_kernel_asks_the_same_energy_of_samples_and_stretches(slope, swing, 
     for name, x in parts.items():
         each = np.bincount(log.segments.trip, np.asarray(x)), np.bincount(out.segments.trip, np.asarray(whole[name]))
         np.testing.assert_allclose(each[1], each[0], rtol=1e-11, atol=1e-9)
+
+
+def test_a_stretch_that_is_driven_and_braked_has_losses_in_both_directions():
+    """Of a stretch whose ends have one speed the mean force is small; what its samples lose is not."""
+    n = 2000
+    log = make(11.0 + 3.0 * np.sin(np.arange(n) / 2.0), channels={"mass_kg": np.full(n, 2e4)})
+    car = Vehicle(
+        (Inertia(1.0), Rolling(0.006), Aero(6.0)), mass_kg=jnp.asarray(0.0), driveline=Driveline(0.9),
+        machine=Machine(0.9, 0.8),
+    )  # fmt: skip
+    stretches = by_distance(log).segments
+    samples, rows, without = (
+        float(np.sum(car.predict(s, "energy_wh"))) for s in (log.segments, stretches, stretches.without(SPREAD))
+    )
+    assert abs(rows / samples - 1.0) < 0.1 < 0.3 < abs(without / samples - 1.0)
+    # put together once more it is what it would have been at once
+    twice, at_once = by_distance(by_distance(log, 100.0), 500.0).segments, by_distance(log, 500.0).segments
+    inside = [float(np.sqrt(np.average(s.channels[SPREAD] ** 2, weights=s.distance_m))) for s in (twice, at_once)]
+    assert inside[0] == pytest.approx(inside[1], rel=0.02)
 
 
 def test_stretches_of_a_faster_log_are_the_faster_stretches():
