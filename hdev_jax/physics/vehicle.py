@@ -209,16 +209,14 @@ class Vehicle(eqx.Module):
 
         if self.entry != "road" or not any(segments.has(k) for k in (SPREAD, *READING_ERRORS)):
             return jax.vmap(column)(segments)
-        # The expectation over what slope and acceleration may be, and over what they are inside a row, by the two
-        # points that have the mean and variance of their force: where power changes its sign the chain bends, and such
-        # a spread costs energy on average.
+        # The expectation over what slope and acceleration may be, or are inside a row, by the two points that have the
+        # mean and variance of their force: where power changes its sign the chain bends, which costs energy on average.
         level = jnp.zeros_like(segments.duration_s)
         sd = jnp.hypot(segments.get(GRADE_SD, level), segments.get(ACCEL_SD, level) / GRAVITY_MPS2)
+        name, middle = "grade_rad", segments.get("grade_rad", level)
         if segments.has(SPREAD):  # as large as accelerations are: such a slope would lift the weight off the road
-            sd = jnp.hypot(GRAVITY_MPS2 * sd, segments.channels[SPREAD])
             name, middle = ACCEL_OF_WAY, segments.accel_of_way_mps2
-        else:
-            name, middle = "grade_rad", segments.get("grade_rad", level)
+            sd = jnp.hypot(GRAVITY_MPS2 * sd, segments.channels[SPREAD])
         sides = [jax.vmap(column)(segments.with_channels(**{name: middle + e})) for e in (sd, -sd)]
         return jax.tree.map(lambda a, b: 0.5 * (a + b), *sides)
 
