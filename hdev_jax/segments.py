@@ -21,7 +21,7 @@ READING_ERRORS = (GRADE_SD, ACCEL_SD)
 ACCEL_OF_WAY, SQUARE_SPEED, SPREAD = "accel_over_distance_mps2", "square_speed_m2ps2", "accel_spread_mps2"
 WITHIN_ROWS = (ACCEL_OF_WAY, SQUARE_SPEED, SPREAD)
 """Channels of rows that were put together from samples: means over distance of the acceleration and of v², and the
-standard deviation over distance of a + g·sin θ, which the speeds at a row's ends do not tell."""
+standard deviation over distance of the acceleration, which the speeds at a row's ends do not tell."""
 NO_CAUSE = (*READING_ERRORS, *WITHIN_ROWS)
 """Channels that are no cause of anything, and offered as none."""
 

@@ -27,7 +27,7 @@ from hdev_jax.fleet.truth import wheel_force_n
 from hdev_jax.physics.road import AirDensity
 from hdev_jax.physics.tyres import TyreWarmup
 from hdev_jax.rundir import Run
-from hdev_jax.segments import Segments, trip_slices
+from hdev_jax.segments import WITHIN_ROWS, Segments, trip_slices
 from hdev_jax.units import GRAVITY_MPS2
 from hdev_jax.verbs.energy.result import EnergyResult
 
@@ -230,7 +230,7 @@ def _true_force(v: FleetVehicle, mass_kg: float, *, cold: bool) -> list[float]:
     passing = [e.id for e in v.true.effects
                if e.id == AirDensity.id or e.acts_across_rows() or e.overrides("sense")]  # fmt: skip
     speed, s = np.array(SHOWN_KMH) / 3.6, v.segments
-    channels = {k: STILL.get(k, float(np.median(np.asarray(x)))) for k, x in s.channels.items()}
+    channels = {k: STILL.get(k, float(np.median(np.asarray(x)))) for k, x in s.without(*WITHIN_ROWS).channels.items()}
     channels |= {"mass_kg": mass_kg, "gear": float(len(v.variant.gear_ratios))}
     rows = Segments.from_arrays(duration_s=np.ones(len(speed)), speed_start_mps=speed, speed_end_mps=speed, **channels)
     force = np.asarray(v.true.minus(*passing).force(rows))

@@ -35,7 +35,8 @@ NOTES = (
     "efficiency, calibrated on the same training trips. The ratio of test RMSEs is the median over logs with a slope, "
     "because that fit knows the slope (in the table of rivals: over all logs). Covered: share of 90 % intervals "
     "that contain the true size. Coefficients covered: the same for rolling resistance and drag area, whatever was "
-    "changed. Segments of 100 m keep means over distance and one spread of what happens within them, for both fits",
+    "changed. Rows of 100 m hold means over distance and the standard deviation of the acceleration inside; both "
+    "fits use them",
     "Neither simulator has wind, so a headwind is driven as the slope with the same force. FASTSim does not "
     "split braking between motor and friction brakes, so regeneration that is lost is taken from the electric power",
     "Each log has a drive, a vehicle and noise of its own. No log of these seeds was looked at while the method was "

@@ -19,7 +19,7 @@ from hdev_jax.logs.log import KINEMATICS
 from hdev_jax.physics import EfficiencyMap, Grouped, Vehicle
 from hdev_jax.physics.loads import Auxiliary
 from hdev_jax.problem import Problem
-from hdev_jax.segments import Segments
+from hdev_jax.segments import NO_CAUSE, Segments
 
 __all__ = ["Changed", "Step", "changed", "idle", "parse_changes"]
 
@@ -32,7 +32,8 @@ _CHANNELS = {  # ranges of channels, where a number beyond is in another unit or
     "wind_speed_mps": Key("number", "m/s", 0.0, MAX_SPEED_MPS),
     "soc": Key("number", "1", 0.0, 1.0),
 }
-_MEASURED = ("motor_torque_nm", "motor_speed_radps", "traction_force_n", "accel_mps2", "current_a", "brake_pressure_pa")
+_MEASURED = ("motor_torque_nm", "motor_speed_radps", "traction_force_n", "accel_mps2", "current_a", "brake_pressure_pa",
+             *NO_CAUSE)  # fmt: skip
 
 
 @dataclass(frozen=True)

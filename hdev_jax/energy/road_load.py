@@ -20,7 +20,7 @@ from hdev_jax.physics.loads import HvacPower
 from hdev_jax.physics.road import AirDensity, Crosswind, Headwind
 from hdev_jax.physics.tyres import REFERENCE_TEMP_C, RollingLinear, RollingTemperature
 from hdev_jax.problem import Problem
-from hdev_jax.segments import Segments
+from hdev_jax.segments import WITHIN_ROWS, Segments
 from hdev_jax.targets import TARGETS
 from hdev_jax.units import GRAVITY_MPS2
 
@@ -180,7 +180,7 @@ def replace_mass(vehicle: Vehicle, mass_kg: float) -> Vehicle:
 
 def _steady(problem: Problem, v: np.ndarray, mass_kg: float) -> Segments:
     """A row of a second at each speed, every channel of the log at its neutral value, else at its median."""
-    logged = problem.segments.channels
+    logged = problem.segments.without(*WITHIN_ROWS).channels  # a steady speed varies inside no row
     channels = {k: STILL.get(k, float(np.median(np.asarray(x)))) for k, x in logged.items()}
     channels = {k: x for k, x in channels.items() if k != "air_density_kgpm3"}
     if "mass_kg" in logged:

@@ -11,7 +11,7 @@ from hdev_jax.logs.ledger import Ledger
 from hdev_jax.logs.log import Log
 from hdev_jax.logs.repair import CIRCULAR
 from hdev_jax.segments import ACCEL_OF_WAY, ACCEL_SD, GRADE_SD, SPREAD, SQUARE_SPEED, Segments
-from hdev_jax.units import GRAVITY_MPS2, unit_of
+from hdev_jax.units import unit_of
 
 __all__ = ["HALT_S", "by_distance"]
 
@@ -45,8 +45,9 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
 
     What varies inside a stretch is lost, but for three channels that the kernel uses: means over distance of the
     acceleration, so that m·a·Δs stays Δ(½mv²), and of v², for the drag (`accel_over_distance_mps2`,
-    `square_speed_m2ps2`), and the standard deviation over distance of a + g·sin θ (`accel_spread_mps2`): a stretch that
-    is driven and braked has losses in both directions.
+    `square_speed_m2ps2`), and the standard deviation over distance of the acceleration (`accel_spread_mps2`): a stretch
+    that is driven and braked has losses in both directions. Where force or torque is logged the kernel starts from its
+    mean, and such losses cancel.
 
     **Arguments:** `log` of any rows (`[row]`, samples or intervals); `length_m` > 0 [m]; `halt_s` > 0 [s].
 
@@ -74,7 +75,7 @@ def by_distance(log: Log, length_m: float = 100.0, *, halt_s: float = HALT_S) ->
         x = np.asarray(column, dtype=np.float64)
         if name in CIRCULAR:
             channels[name], how = _direction(x, duration, first), "mean direction over time"
-        elif _is_state(name, x):
+        elif name not in _WITHIN and _is_state(name, x):
             channels[name], how = _held_longest(x, duration, row), "the value held longest"
         elif name == ACCEL_SD:  # of the difference of a stretch's end speeds, whatever lies between
             usual = _mean(x, duration, first)
@@ -162,11 +163,12 @@ def _mean(x: np.ndarray, weight: np.ndarray, first: np.ndarray, *, slope: bool =
 
 
 def _spread(s: Segments, weight: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Standard deviation of a + g·sin θ in each row, with what was inside the rows before [m/s²]."""
-    x = np.asarray(s.accel_of_way_mps2) + GRAVITY_MPS2 * np.sin(np.asarray(s.get("grade_rad", np.zeros(len(s)))))
+    """Standard deviation of the acceleration in each row, with what it may be, or was, inside the rows before [m/s²].
+    (Not of the slope: a logged one varies by its noise more than a road does in 100 m.)"""
+    x = np.asarray(s.accel_of_way_mps2)
     mean, total = _mean(x, weight, first), np.add.reduceat(weight, first)
     away = x - np.repeat(mean, np.diff(np.r_[first, len(x)]))
-    inside = away**2 + np.asarray(s.get(SPREAD, np.zeros(len(s)))) ** 2
+    inside = away**2 + sum(np.asarray(s.get(k, np.zeros(len(s)))) ** 2 for k in (SPREAD, ACCEL_SD))
     return np.sqrt(np.add.reduceat(inside * weight, first) / total)
 
 

@@ -79,6 +79,9 @@ def test_what_explains_little_of_the_error_is_not_named(inexact, log, scores):
         why = first_rejection(a, SCORE_GATES)
         assert (why is None) is passes
         assert why is None or (why.kind, why.numbers["least"]) == (Kind.SMALL, least)
+    scores.settings = replace(scores.settings, least_share=2.0)
+    constant = first_rejection(asked(log, scores, "auxiliary_power", p_model=0.0, p_cluster=0.0, gain=1e3), SCORE_GATES)
+    assert (constant is not None and constant.kind is Kind.SMALL) is inexact
 
 
 def test_what_a_coefficient_takes_up_is_said_first(log, scores):

@@ -1,5 +1,7 @@
 """A, B and C: of a vehicle exactly, from driving, and from coast-downs with wind and slope."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from hdev_jax.fleet import synthetic_log
 from hdev_jax.inference.sheet import sheet_of_sections
 from hdev_jax.logs import Log
 from hdev_jax.problem import prepare
-from hdev_jax.segments import Segments
+from hdev_jax.segments import WITHIN_ROWS, Segments
 
 SHEET = {
     "mass_kg": 29e3,
@@ -129,8 +131,13 @@ def problem_of(seed: int, sheet: dict):
     return log, prepare(Log.from_frame(log.frame), opened)
 
 
-def test_the_load_of_a_vehicle_is_its_coefficients():
+@pytest.mark.parametrize("by_distance", [False, True])
+def test_the_load_of_a_vehicle_is_its_coefficients(by_distance):
+    """At a steady speed, whatever varied inside rows that were put together by distance."""
     _, problem = problem_of(3, {**SHEET, "road": {**SHEET["road"], "b_n_per_mps": 12.0}})
+    if by_distance:
+        inside = {k: np.linspace(1.0, 200.0, len(problem.segments)) for k in WITHIN_ROWS}
+        problem = replace(problem, segments=problem.segments.with_channels(**inside))
     known = Fitted(problem, problem.vehicle, 1e-18 * np.eye(len(problem.table.free)), 200.0, None, "known")
     load = in_service(known, 20e3)
     np.testing.assert_allclose(load.abc, [0.006 * 20e3 * G, 12.0, 0.5 * RHO * 5.6], rtol=1e-9)

@@ -256,6 +256,7 @@ def test_stretches_of_a_faster_log_are_the_faster_stretches():
     log = make(11.0 + 8.0 * np.sin(np.arange(300) / 3.0))
     made = by_distance(replace(log, segments=log.segments.faster(1.25)), 125.0).segments
     scaled = by_distance(log, 100.0).segments.faster(1.25)
+    np.testing.assert_allclose(made.channels[SPREAD], scaled.channels[SPREAD], rtol=1e-12)
     for name in ("distance_m", "speed_start_mps", "speed_end_mps", "accel_of_way_mps2", "square_speed_m2ps2"):
         np.testing.assert_allclose(getattr(made, name), getattr(scaled, name), rtol=1e-12, atol=1e-12)
     assert not np.allclose(scaled.accel_of_way_mps2, scaled.accel_mps2, atol=0.1)

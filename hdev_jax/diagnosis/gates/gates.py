@@ -93,9 +93,12 @@ def _agreed(a: Asked) -> Rejection | None:
 
 
 def _worth_naming(a: Asked) -> Rejection | None:
-    """What explains less than a hundredth of the error, by ordinary and by generalised least squares, is not named:
-    forms of effects are not exact, and a long log makes anything significant. Where slope or speed were read with
-    errors, ordinary ones decide: the form of those errors' distribution is a part of what the others see."""
+    """What lowers the RMSE by less than 1 % is not named, by ordinary or by generalised least squares, whichever is
+    more: forms of effects are not exact, and a long log makes anything significant. Where slope or speed were read with
+    errors, ordinary ones alone decide: the form of those errors' distribution is a part of what the others see. A
+    constant load is asked for none: it costs energy all the time, and no variance."""
+    if a.score.candidate.constant and not a.scores.inexact:
+        return None
     looks = (a.scores.plain,) if a.scores.inexact else (a.scores.plain, a.scores.white)
     columns, least = a.score.candidate.columns, a.scores.settings.least_share
     share = max(e.gain(e.totals(), columns)[0] / max(e.misfit(), 1e-300) for e in looks)

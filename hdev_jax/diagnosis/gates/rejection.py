@@ -60,7 +60,7 @@ SENTENCES = {
         "its generalised least-squares estimate is significantly smaller than {share:.0%} of its ordinary "
         "least-squares estimate"
     ),
-    Kind.SMALL: "explains {share:.1%} of the squared error, less than the {least:.0%} that a name has to",
+    Kind.SMALL: "explains {share:.1%} of the squared error; a name needs {least:.0%}",
     Kind.OUTSCORED: "explains less than the chosen effects, or too little for its number of coefficients",
     Kind.REFIT: "out of range or not significant in the joint refit",
     Kind.OPPOSITE: "its generalised and its ordinary least-squares estimate are significant with opposite signs",

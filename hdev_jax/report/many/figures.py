@@ -30,6 +30,8 @@ _CONDITIONS = {
 def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]]) -> Any | None:
     """A cell for each vehicle and effect: its first-order size in standard errors; a dot where the vehicle's own
     diagnosis named it, a star above what its type shows. Vehicles by type; None where nothing was searched."""
+    from matplotlib import colormaps
+
     forms: dict[str, str] = {}
     for e in effects:  # the form that is clearest over the type, else in the vehicle
         forms.setdefault(e["id"], f"{e['id']}.{e['size']} {e['shapes']}".strip())
@@ -56,7 +58,8 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
                 z[i, j] = _z(s)
     fig = figure(WIDTH, 2.0 + 0.17 * len(there))
     ax = fig.add_subplot()
-    image = ax.imshow(z, cmap="RdBu_r", vmin=-STRONGEST, vmax=STRONGEST, aspect="auto", interpolation="nearest")
+    colours = colormaps["RdBu_r"].with_extremes(bad="0.8")
+    image = ax.imshow(z, cmap=colours, vmin=-STRONGEST, vmax=STRONGEST, aspect="auto", interpolation="nearest")
     dots = [(j, i) for i, r in enumerate(there) for j, k in enumerate(ids) if any(e["id"] == k for e in r["effects"])]
     if dots:
         ax.plot(*np.array(dots).T, "o", markerfacecolor="white", markeredgecolor=INK, markersize=4,

@@ -48,7 +48,8 @@ def fleet_pieces(result: FleetResult) -> list[tuple[str, bool]]:
         pieces.append((f" ({_few(differ)})", False))
     if not changed and not differ:
         compared = any(len(v) >= FLEET_SETTINGS.least_vehicles for v in by_type(result.records).values())
-        pieces.append(("no vehicle changed" + (" or differs from its type" if compared else ""), True))
+        none = "no vehicle changed" + (" or differs from its type" if compared else "")
+        pieces.append((none if s["tested"]["vehicles_times_coefficients"] else "changes were not looked for", True))
     if found:
         shown = list(dict.fromkeys(f"{names.effect(e['id'])} ({e['type']})" for e in found))
         pieces += [("; shown by a type's vehicles together: ", False), (_few(shown), True)]
@@ -115,7 +116,7 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
             "Vehicles that differ from their type, or changed",
             "Each coefficient of a vehicle is compared with the prediction from the others of its type, and with its "
             "own earlier value. What all of a type do alike in a week (a season) is removed first. Ranked by cost."
-            + ("" if s["unlike"] else " None was found."),
+            + _none(s),
             {"time_line": (lambda: time_line(done, s["unlike"]), "Coefficients of each vehicle week by week.",
                            "Estimates of each week alone; thick where a change was found.")},
             (_unlike(s["unlike"]),) if s["unlike"] else (),
@@ -125,7 +126,7 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
             _bound(s["highest_q_in_vehicle"]),
             {"effects_map": (lambda: effects_map(done, s["effects"]), "A map of effects by vehicle.",
                              "First-order size of each effect that the sheet does not declare, in standard errors. "
-                             "White: not estimated; the log lacks what it needs, or the model has loads that switch.")},
+                             "Grey: not estimated; the log lacks what it needs, or the model has loads that switch.")},
             (_effects(s["effects"]),) if s["effects"] else (),
         ),
         Section(
@@ -165,6 +166,13 @@ def fleet_page(result: FleetResult, command: str, *, price: float | None = None,
         tiles.append(("Cost", words.number(price * kwh, 4), f"at {price:g} a kWh"))
     return Page("fleet", words.count(len(records), "vehicle"), "a fleet", synthetic, fleet_pieces(result), tiles,
                 sections, s["notes"], command, "each calibrated and diagnosed on its own log")  # fmt: skip
+
+
+def _none(s: Mapping[str, Any]) -> str:
+    """What is said where no vehicle is in the table."""
+    if s["unlike"]:
+        return ""
+    return " None was found." if s["tested"]["vehicles_times_coefficients"] else " No log was long enough for a test."
 
 
 def _bound(q: float) -> str:
