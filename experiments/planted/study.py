@@ -93,7 +93,8 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     else:
         return {"skipped": f"{MOST_DRAWS} draws: {', '.join(planted)} in fewer than {LEAST_TRIPS} training trips"}
     started = time.perf_counter()
-    result = diagnose(problem, split, LIBRARY, settings=Settings(**{"fdr": task["fdr"], **task["settings"]}), seed=0)
+    settings = Settings(**{"fdr": task["fdr"], **task["settings"]})
+    result = diagnose(problem, split, LIBRARY, settings=settings, seed=0, next_drives=False)
     seconds = time.perf_counter() - started
     summary = result.summary
     parameters = summary["baseline"]["parameters"]

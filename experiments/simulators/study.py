@@ -67,7 +67,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     missing = PLANTS[task["plant"]].missing
     problem, split = _read(task["rows"], made.frame.drop(columns=missing or []), made.sheet)
     started = time.perf_counter()
-    outcome = diagnose(problem, split, LIBRARY, settings=Settings(fdr=task["fdr"]), seed=0)
+    outcome = diagnose(problem, split, LIBRARY, settings=Settings(fdr=task["fdr"]), seed=0, next_drives=False)
     seconds = time.perf_counter() - started
     summary = outcome.summary
     return {

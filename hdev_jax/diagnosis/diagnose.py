@@ -60,6 +60,7 @@ def diagnose(
     *,
     settings: Settings = SETTINGS,
     seed: int = 0,
+    next_drives: bool = True,
     tell: Tell = lambda _: None,
     checkpoint: Checkpoint = lambda _, compute: compute(),
 ) -> Outcome:
@@ -67,13 +68,14 @@ def diagnose(
     contradict the model.
 
     **Arguments:** `library`, the candidates by id; `settings`, the numbers that decide; `seed` of placebos,
-    resampling and the flexible learner; `checkpoint(name, compute)` keeps plain values of each stage.
+    resampling and the flexible learner; `next_drives`, whether to look for drives that separate the members of a
+    class; `checkpoint(name, compute)` keeps plain values of each stage.
 
     **Returns:** an `Outcome`; its `summary` keeps contract §4. Raises `InputError` where the target is not finite.
     """
     # Products of a few hundred rows: more threads than one only wait for each other, long where cores are shared
     with _blas().limit(limits=1, user_api="blas"):
-        return _diagnosed(problem, split, library, settings, seed, tell, checkpoint)
+        return _diagnosed(problem, split, library, settings, seed, next_drives, tell, checkpoint)
 
 
 @cache
@@ -82,8 +84,8 @@ def _blas() -> ThreadpoolController:
 
 
 def _diagnosed(
-    problem: Problem, split: Split, library: Mapping[str, type[Effect]], settings: Settings, seed: int, tell: Tell,
-    checkpoint: Checkpoint,
+    problem: Problem, split: Split, library: Mapping[str, type[Effect]], settings: Settings, seed: int,
+    next_drives: bool, tell: Tell, checkpoint: Checkpoint,
 ) -> Outcome:  # fmt: skip
     # 1. The training rows, and the effects that could act on this target
     training, excluded = training_of(problem, split, library, settings)
@@ -124,7 +126,7 @@ def _diagnosed(
     summary = summarise(problem, split, named, steps, predicted, left, leeway, training, given)
     summary["excluded"] = excluded
     twins = [(f.id, library[t]) for f in named.found for t in f.alike[:MOST_IN_CLASS] if t in library]
-    if twins:
+    if twins and next_drives:
         tell("what to measure next: drives that separate the members of a class")
         drives = checkpoint("next", lambda: [asdict(a) for a in advise(problem, named, training.rows, twins)])
         summary["next_drives"] = drives

@@ -103,8 +103,8 @@ def _analysed(task: Mapping[str, Any]) -> dict[str, Any]:
     problem, split = _opened(task, sheet)
     log = problem.log
     doubts = () if task["trust"] else implausible(problem, split.train)
-    settings = Settings(fdr=task["fdr"])
-    outcome = diagnose(problem, split, {} if doubts else LIBRARY, settings=settings, seed=task["seed"])
+    library, settings = {} if doubts else LIBRARY, Settings(fdr=task["fdr"])
+    outcome = diagnose(problem, split, library, settings=settings, seed=task["seed"], next_drives=False)
     summary = outcome.summary
     notes, energy = list(summary.get("notes", ())), None
     if TARGETS[problem.target].of_battery:

@@ -46,6 +46,7 @@ def add_stages(
         library,
         settings=settings,
         seed=seed,
+        next_drives=False,
         tell=tell,
         checkpoint=lambda n, f: checkpoint(f"road-{n}", f),
     )  # fmt: skip
