@@ -49,7 +49,8 @@ def fleet_result(
             e["counts_in_fleet"] = e["q_value"] <= bound
     effects = effects_of_types(each, settings, again)
     pooled = pooled_coefficients(each, settings)
-    unlike = [*levels(each, settings), *changes(each, settings, seed)]
+    apart, changed = levels(each, settings), changes(each, settings, seed)
+    unlike = [*apart, *changed]
     named = [e for e in unlike if e["found"]]
     named.sort(key=lambda e: (-abs(e["kwh_per_day"] or 0.0), e["q"], e["vehicle"]))
     rows, about = fleet_ledger(each, price=price)
@@ -72,7 +73,8 @@ def fleet_result(
         "effects": effects,
         "coefficients": pooled,
         "unlike": named,
-        "tested": {"types_times_effects": len(effects), "vehicles_times_coefficients": len(unlike)},
+        "tested": {"types_times_effects": len(effects), "vehicles_times_coefficients": len(unlike),
+                   "against_type": len(apart), "for_a_change": len(changed)},
         "ledger": [r for r in rows.to_dict("records") if r["level"] in ("fleet", "type")],
         "notes": said,
     }  # fmt: skip

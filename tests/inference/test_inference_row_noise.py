@@ -10,7 +10,7 @@ from hdev_jax.inference.row_noise import INSTRUMENTS, believed, row_noise
 from hdev_jax.inference.row_noise import shapes as shapes_of
 from hdev_jax.physics import Driveline, EfficiencyMap, Machine, Vehicle
 from hdev_jax.physics.road import Aero, Grade, Inertia, Rolling
-from hdev_jax.segments import Segments
+from hdev_jax.segments import ACCEL_OF_WAY, Segments
 
 MASS, ETA = 2e4, 0.8
 MAP = EfficiencyMap(jnp.array([1.0]), jnp.array([0.0, 1e4]), jnp.array([-1e5, 1e5]), jnp.full((1, 2, 2), ETA))
@@ -137,3 +137,11 @@ def test_an_instrument_as_large_as_its_readings_spread_believes_half_of_them():
     logs = believed(rows, np.array([0.0, 0.0, 2.0 * read.std(), 0.0]), np.ones(50, bool))
     half = np.mean([x.channels["grade_rad"] for x in logs], axis=0)
     np.testing.assert_allclose(half, 0.5 * (read + read.mean()), atol=1e-12)
+
+
+@pytest.mark.parametrize("of_way", [False, True])
+def test_a_change_of_speed_is_kinetic_energy_also_where_rows_have_their_own_mean_of_acceleration(of_way):
+    rows = log(2000)
+    rows = rows.with_channels(**{ACCEL_OF_WAY: np.full(len(rows), 0.3)}) if of_way else rows
+    kick = shapes(rows, energies(rows))[:, INSTRUMENTS.index("speed_mps")]
+    np.testing.assert_allclose(kick * 3600.0, MASS * np.asarray(rows.speed_mps) / ETA, rtol=0.02)

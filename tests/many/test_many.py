@@ -13,6 +13,7 @@ from hdev_jax.many.ledger import fleet_ledger
 from hdev_jax.many.pooling import cauchy, pooled, shrunk, without_each
 from hdev_jax.many.unlike import Weeks, change_point, equations
 from hdev_jax.report.many import fleet_text
+from hdev_jax.report.many.figures import effects_map
 
 TRIPS, DAY_S = 40, 86_400.0
 
@@ -231,6 +232,21 @@ def test_the_answer_says_what_was_compared_and_what_most_logs_name(vehicles, wor
     text = fleet_text(fleet_result(records, fdr=0.05, seed=0))
     assert words in text
     assert f"named most often from the vehicles' own logs: headwind ({vehicles}), tyre warm-up (1)" in text
+
+
+def test_short_logs_are_not_called_unchanged_and_what_was_not_estimated_is_grey_in_the_map():
+    rng = np.random.default_rng(12)
+    records = [record(rng, k) for k in range(2)]
+    for r in records:
+        r["course"]["coefficients"] = None
+        r |= {"scan": {}, "effects": []}
+    records[0]["effects"] = [{"id": "headwind", "q_value": 1e-12}]
+    result = fleet_result(records, fdr=0.05, seed=0)
+    assert "; changes were not looked for;" in fleet_text(result)
+    shown = effects_map(records, result.summary["effects"]).axes[0]
+    assert np.all(np.ma.getmaskarray(shown.images[0].get_array()))
+    assert [len(line.get_xdata()) for line in shown.lines if line.get_marker() == "o"] == [1]
+    assert effects_map([{**r, "effects": []} for r in records], []) is None
 
 
 def files(folder, *names):

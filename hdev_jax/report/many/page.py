@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hdev_jax.diagnosis.settings import FLEET_SETTINGS
 from hdev_jax.many import FleetResult
-from hdev_jax.many.evidence import by_type
 from hdev_jax.report import names, words
 from hdev_jax.report.energy.figures import by_week, label
 from hdev_jax.report.energy.flow import CAPTION as FLOW
@@ -47,9 +45,9 @@ def fleet_pieces(result: FleetResult) -> list[tuple[str, bool]]:
                        "others of the type", True))  # fmt: skip
         pieces.append((f" ({_few(differ)})", False))
     if not changed and not differ:
-        compared = any(len(v) >= FLEET_SETTINGS.least_vehicles for v in by_type(result.records).values())
-        none = "no vehicle changed" + (" or differs from its type" if compared else "")
-        pieces.append((none if s["tested"]["vehicles_times_coefficients"] else "changes were not looked for", True))
+        asked = {"for_a_change": "changed", "against_type": "differs from its type"}
+        none = " or ".join(what for k, what in asked.items() if s["tested"][k])
+        pieces.append((f"no vehicle {none}" if none else "changes were not looked for", True))
     if found:
         shown = list(dict.fromkeys(f"{names.effect(e['id'])} ({e['type']})" for e in found))
         pieces += [("; shown by a type's vehicles together: ", False), (_few(shown), True)]
