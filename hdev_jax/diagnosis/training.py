@@ -112,9 +112,4 @@ class Training:
         """The same rows with one channel more; 0 where they are padded."""
         padded = np.zeros(len(self.rows.segments))
         padded[: self.rows.rows] = column
-        return replace(self, rows=replace_segments(self.rows, name, padded))
-
-
-def replace_segments(rows: Fit, name: str, column: Float[np.ndarray, " padded"]) -> Fit:
-    """Padded rows with a channel added or replaced."""
-    return Fit(rows.segments.with_channels(**{name: column}), rows.measured, rows.weight, rows.rows)
+        return replace(self, rows=replace(self.rows, segments=self.rows.segments.with_channels(**{name: padded})))

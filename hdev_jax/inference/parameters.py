@@ -89,9 +89,10 @@ class ParameterTable:
         """The table with more rows."""
         return ParameterTable((*self.rows, *rows))
 
-    def minus(self, effect_id: str) -> "ParameterTable":
-        """The table without an effect's rows."""
-        return ParameterTable(tuple(c for c in self.rows if not c.path.startswith(f"effects.{effect_id}.")))
+    def minus(self, *effect_ids: str) -> "ParameterTable":
+        """The table without these effects' rows."""
+        heads = tuple(f"effects.{k}." for k in effect_ids)
+        return ParameterTable(tuple(c for c in self.rows if not c.path.startswith(heads)))
 
     def with_free(self, **free: bool) -> "ParameterTable":
         """The table with rows held or freed, by name."""

@@ -12,7 +12,7 @@ from scipy import stats
 from hdev_jax.diagnosis.candidates.candidate import Candidate
 from hdev_jax.diagnosis.competition import cycle
 from hdev_jax.diagnosis.competition.cycle import _fitted, _left_out_gain, _Rows, add_cycle
-from hdev_jax.diagnosis.competition.mode import LASTING, _against, _alone, _p, _split, _stability, add_mode
+from hdev_jax.diagnosis.competition.mode import LASTING, _against, _p, _split, _stability, add_mode
 from hdev_jax.diagnosis.gates.rejection import Kind
 from hdev_jax.diagnosis.noise.noise import Noise
 from hdev_jax.diagnosis.result.modes import mode_block
@@ -57,7 +57,7 @@ def _score(grams, z) -> Score:
     d = grams.shape[-1]
     nothing = np.zeros((0, d)), np.zeros(0), np.zeros(0, dtype=int), np.zeros(1)
     evidence = Evidence(grams, *nothing, d - 2, np.zeros(d - 2), np.zeros(d - 2))
-    return _alone(evidence, 0).within(z).score(Candidate(ModeChange, ("regeneration",), (None,), (), "size", (0,)))
+    return evidence.within(z).score(Candidate(ModeChange, ("regeneration",), (None,), (), "size", (0,)))
 
 
 def test_trips_are_split_where_their_sizes_differ():

@@ -10,7 +10,7 @@ from hdev_jax.diagnosis.competition.forward import Round, forward
 from hdev_jax.diagnosis.competition.state import Verdict
 from hdev_jax.diagnosis.competition.verdicts import verdicts_of
 from hdev_jax.diagnosis.gates.gates import DRAWN_GATES, SCORE_GATES, Asked, first_rejection, of_class
-from hdev_jax.diagnosis.gates.rejection import Kind, Rejection, sentence
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.remainder.remainder import Remainder
 from hdev_jax.diagnosis.result.summary import _not_decidable
 from hdev_jax.diagnosis.scores.scores import score_all
@@ -142,13 +142,12 @@ NUMBERS = {
 
 @pytest.mark.parametrize("kind", Kind)
 def test_every_kind_is_worded(kind):
-    said = sentence(Rejection(kind, NUMBERS))
+    said = str(Rejection(kind, NUMBERS))
     assert said
     assert not set("{}") & set(said)
-    assert said == str(Rejection(kind, NUMBERS))
-    stretches = sentence(Rejection(kind, {**NUMBERS, "unit": "stretches of driving"}))
+    stretches = str(Rejection(kind, {**NUMBERS, "unit": "stretches of driving"}))
     assert stretches.replace("stretches of driving", "trips") == said
-    assert sentence(Rejection(kind, {"detail": "special to one effect"})) == "special to one effect"
+    assert str(Rejection(kind, {"detail": "special to one effect"})) == "special to one effect"
 
 
 def test_every_setting_is_described():
@@ -189,7 +188,7 @@ def test_only_trips_tell_what_lives_between_them(kind, log):
 
 
 def test_between_trips_a_log_knows_no_more_than_it_has_trips():
-    left = Remainder(False, 0.1, 1.0, (), "", 0.0, trips_differ=True)  # suspected is enough
+    left = Remainder(False, 0.1, 1.0, (), "", trips_differ=True)  # suspected is enough
     why = Rejection(Kind.NOT_SIGNIFICANT, {"q": 1.0})
     hinted = Verdict("hvac_power", 2.0, 1.0, why, needed=40, between=True)
     inside = Verdict("headwind", 2.0, 1.0, why, needed=30)

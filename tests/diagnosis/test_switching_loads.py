@@ -250,7 +250,7 @@ def test_a_load_that_was_decoded_is_kept_with_its_states(short):
     assert state is not None
     plain = to_plain(state)
     again = to_plain(from_plain(plain, problem.vehicle, rows))
-    assert again["hidden"]["ids"] == plain["hidden"]["ids"] == ["switching_load"]
+    assert again["hidden"]["ids"] == plain["hidden"]["ids"] == ("switching_load",)
     np.testing.assert_array_equal(again["hidden"]["on"], plain["hidden"]["on"])
     np.testing.assert_array_equal(again["hidden"]["model"]["power_w"], plain["hidden"]["model"]["power_w"])
     assert again["hidden"]["model"]["freedom"] == plain["hidden"]["model"]["freedom"]

@@ -2,54 +2,23 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hdev_jax.diagnosis.candidates.candidate import Candidate, Grids, own_shapes, ways_of
 from hdev_jax.diagnosis.candidates.facts import Facts, facts_of
-from hdev_jax.diagnosis.candidates.programs import Program, Recipe, written
+from hdev_jax.diagnosis.candidates.programs import Program, Recipe, computed
 from hdev_jax.diagnosis.candidates.shared import SharedKernel, absent, apart, of_library
+from hdev_jax.diagnosis.candidates.unnamed import Terms
 from hdev_jax.physics import Effect, Switch, Vehicle, unavailable
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
-__all__ = ["Column", "Plan", "Source", "columns", "plan_of"]
+__all__ = ["Plan", "Source", "columns", "plan_of"]
 
 TOGETHER = 6  # effects in one program of a long log: more of them run slower, fewer take longer to compile
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column to compute: an effect's size (and group) at given shapes, or the difference a limit makes."""
-
-    effect_id: str
-    name: str
-    group: int | None
-    shapes: tuple[tuple[str, float], ...]
-    kind: str
-
-
-@runtime_checkable
-class Source(Protocol):
-    """What makes candidates' columns of any rows: the library's `Plan`, or the terms of a formula.
-
-    `candidates` hold places among `width` columns; `left_out` says by id why other effects are no candidates.
-    """
-
-    @property
-    def candidates(self) -> Sequence[Candidate]: ...
-
-    @property
-    def left_out(self) -> Mapping[str, str]: ...
-
-    @property
-    def width(self) -> int: ...
-
-    def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
-        """Write the columns `at` (all by default) of padded segments into `out` [row, column]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,8 +39,14 @@ class Plan:
         return len(self.recipes)
 
     def write(self, out: np.ndarray, segments: Segments, at: Sequence[int] | None = None) -> None:
-        """Write the columns `at` (all by default) of padded segments into `out` [row, column], in the target's unit."""
-        written(out, [self.recipes[k] for k in (range(self.width) if at is None else at)], segments, self.target)
+        """Write the columns `at` (all by default) of padded segments into `out` [row, column], in the target's unit;
+        what is no number counts as 0."""
+        recipes = [self.recipes[k] for k in (range(self.width) if at is None else at)]
+        for k, column in computed(recipes, segments, self.target):
+            out[:, k] = np.nan_to_num(column, posinf=0.0, neginf=0.0)
+
+
+Source = Plan | Terms  # what makes candidates' columns of any rows
 
 
 def plan_of(
@@ -102,19 +77,18 @@ def plan_of(
     groups += [g for e in nulls if not of_library(type(e)) for g in _separate(vehicle, [e], [type(e)])]
 
     found: list[Candidate] = []
-    place: dict[Column, int] = {}
+    place: dict[tuple[Any, ...], int] = {}
     recipes: list[Recipe] = []
     for g in groups:
         for e in g.effects:
             for sizes, subs, shapes, kind in ways_of(type(e), facts, grids or {}):
                 if g.sizes is not None and sizes != g.sizes:
                     continue
-                keys = [Column(e.id, s, k, own_shapes(e, s, shapes), kind) for s, k in zip(sizes, subs, strict=True)]
+                keys = [(e.id, s, k, own_shapes(e, s, shapes), kind) for s, k in zip(sizes, subs, strict=True)]
                 for key in keys:
                     if key not in place:
                         place[key] = len(recipes)
-                        size = None if kind == "limit" else (key.name, key.group)
-                        recipes.append(g.program.recipe(e.id, shapes, size))
+                        recipes.append(g.program.recipe(e.id, shapes, None if kind == "limit" else key[1:3]))
                 found.append(Candidate(type(e), sizes, subs, shapes, kind, tuple(place[k] for k in keys)))
     return Plan(tuple(found), left_out, target, tuple(recipes))
 
@@ -151,9 +125,12 @@ def _shared(vehicle: Vehicle, nulls: Sequence[Effect], kernel: SharedKernel) -> 
 
 
 def _variants(effect: Effect) -> Iterator[tuple[Effect, tuple[str, ...]]]:
-    """An effect across rows by the sizes that are tried together: what of it is idle is not cheap."""
+    """An effect across rows by the sizes that are tried together, without its other limits: what is idle is not
+    cheap."""
     for sizes in type(effect).variants or (tuple(p.name for p in effect.parameters if p.has_column),):
-        yield _only(effect, sizes), sizes
+        idle = {p.name for p in effect.parameters if isinstance(p, Switch) and p.name not in sizes}
+        kept = {p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters}
+        yield type(effect)(**kept), sizes
 
 
 def columns(
@@ -172,9 +149,3 @@ def columns(
     out = np.zeros((len(segments), plan.width))
     plan.write(out, segments)
     return list(plan.candidates), out[:rows], dict(plan.left_out)
-
-
-def _only(effect: Effect, sizes: tuple[str, ...]) -> Effect:
-    """The effect with the limits that are not among `sizes` taken out: what acts across rows is not cheap."""
-    idle = {p.name for p in effect.parameters if isinstance(p, Switch) and p.name not in sizes}
-    return type(effect)(**{p.name: None if p.name in idle else getattr(effect, p.name) for p in effect.parameters})

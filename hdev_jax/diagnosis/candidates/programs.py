@@ -16,7 +16,7 @@ from hdev_jax.physics import Effect, Grouped, Size, Vehicle
 from hdev_jax.segments import Segments
 from hdev_jax.targets import TargetName
 
-__all__ = ["PER_PASS", "SIDE_BY_SIDE", "Place", "Program", "Recipe", "computed", "written"]
+__all__ = ["PER_PASS", "SIDE_BY_SIDE", "Place", "Program", "Recipe", "computed"]
 
 Place = tuple[str, int | None]  # a coefficient's path, and its group
 Structure = tuple[tuple[str, int | None, float, float], ...]
@@ -183,21 +183,12 @@ class _Pass:
     program: Program
     values: Float[np.ndarray, " parameter"]
     claimed: Bool[np.ndarray, " parameter"]
-    places: list[int]
-    sizes: list[int]
+    places: list[tuple[int, int]]  # among the recipes, and of the size
 
     def takes(self, r: Recipe) -> bool:
         """Whether the recipe's shapes agree with those that are here."""
-        if r.program is not self.program or len(self.places) == PER_PASS:
-            return False
-        return not np.any((self.claimed & r.own) & (self.values != r.values))
-
-    def add(self, place: int, r: Recipe, size: int) -> None:
-        """One derivative more; `place` among the recipes."""
-        self.values = np.where(r.own, r.values, self.values)
-        self.claimed = self.claimed | r.own
-        self.places.append(place)
-        self.sizes.append(size)
+        there = r.program is self.program and len(self.places) < PER_PASS
+        return there and not np.any(self.claimed & r.own & (self.values != r.values))
 
 
 def computed(
@@ -216,21 +207,16 @@ def computed(
             continue
         fits = next((x for x in passes if x.takes(r)), None)
         if fits is None:
-            fits = _Pass(p, p.null, np.zeros(len(p.null), bool), [], [])
-            passes.append(fits)
-        fits.add(k, r, r.size)
+            passes.append(fits := _Pass(p, p.null, np.zeros(len(p.null), bool), []))
+        fits.values, fits.claimed = np.where(r.own, r.values, fits.values), fits.claimed | r.own
+        fits.places.append((k, r.size))
     for x in passes:
-        slopes = x.program.linearised(segments, target, x.values, x.sizes, lanes=PER_PASS)[1]
-        for column, k, size in zip(slopes.T, x.places, x.sizes, strict=True):
+        sizes = [size for _, size in x.places]
+        slopes = x.program.linearised(segments, target, x.values, sizes, lanes=PER_PASS)[1]
+        for column, (k, size) in zip(slopes.T, x.places, strict=True):
             if not np.all(np.isfinite(column)):  # perhaps for another's shape
                 column = x.program.linearised(segments, target, recipes[k].values, [size], lanes=PER_PASS)[1][:, 0]
             yield k, column
-
-
-def written(out: np.ndarray, recipes: Sequence[Recipe], segments: Segments, target: TargetName) -> None:
-    """Write the recipes' columns of padded segments into `out` [row, column]; what is no number counts as 0."""
-    for k, column in computed(recipes, segments, target):
-        out[:, k] = np.nan_to_num(column, posinf=0.0, neginf=0.0)
 
 
 # not `eqx.filter_jit`: every leaf is an array, and sorting them out takes longer than the column of a short log

@@ -55,12 +55,6 @@ class SharedKernel:
         base, found, rest = self._completed(vehicle)
         return Program.of(base, {**rest, **{e.id: e for e in more}}.values(), found, declared)
 
-    def _own_program(self, vehicle: Vehicle, declared: Sequence[Place]) -> Program:
-        """The vehicle alone, with the parameters of its effects as arguments: for a log that shared programs do not
-        serve. In one piece, every derivative passes through the corrections across rows, which few coefficients change;
-        in parts they take a third of the time."""
-        return Program.of(vehicle, (), [e.id for e in vehicle.effects if type(e) not in DECLARED], declared)
-
     def serves(self, vehicle: Vehicle, target: TargetName) -> bool:
         """Whether the shared programs serve this search: not on a long log, where what is absent costs more than a new
         program, nor where a reading leaves an absent effect without a finite value (NaN in a channel that the vehicle
@@ -152,8 +146,10 @@ class SharedKernel:
         forms = tuple((jax.tree.structure(e), *map(np.shape, jax.tree.leaves(e))) for e in own)
         key = shared, tuple(i for i, e in beside.items() if apart(e)), forms, tuple(others), held
         if key not in self._programs:
-            whole = self.program(vehicle, declared=others) if shared else self._own_program(vehicle, others)
-            self._programs[key] = whole
+            # alone it is in parts too: in one piece every derivative passes through the corrections across rows, which
+            # few coefficients change, and takes three times as long
+            alone = Program.of(vehicle, (), [*beside], others) if not shared else None
+            self._programs[key] = alone or self.program(vehicle, declared=others)
         program, values, place = self._programs[key], [], {}
         for k, (path, group, _, _) in enumerate(program.structure):
             leaf = leaf_of(vehicle, path) if not path.startswith(heads) else self._leaf(beside, *path.split(".")[1:])

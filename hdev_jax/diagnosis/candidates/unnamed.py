@@ -26,7 +26,7 @@ from hdev_jax.units import registry, unit_of
 
 __all__ = [
     "TERM", "Described", "DescribedForce", "Factor", "Term", "described_by", "describing", "formula", "monomials",
-    "product", "thresholds", "words_of",
+    "product", "thresholds",
 ]  # fmt: skip
 
 MOST_ROWS = 60_000  # above it products of two channels are left out: hundreds of columns
@@ -137,20 +137,13 @@ def _coefficient_unit(factors: Sequence[Factor], of: str) -> str:
 def formula(term: Term, value: float, sd: float, target: TargetName) -> str:
     """`(2.5 ± 0.1) W · [humidity_pct > 70]`."""
     unit = _coefficient_unit(term.factors, describing(target).parameters[0].unit)
-    return f"({value / term.scale:.3g} ± {sd / term.scale:.2g}) {unit} · {words_of(term.factors)}"
+    words = "·".join(f.words() for f in term.factors)  # as `humidity_pct·speed_mps`
+    return f"({value / term.scale:.3g} ± {sd / term.scale:.2g}) {unit} · {words}"
 
 
 def product(factors: Sequence[Factor], segments: Segments) -> np.ndarray:
     """The monomial on every row, in SI units."""
-    out = np.ones(len(segments))
-    for f in factors:
-        out = out * f(segments)
-    return out
-
-
-def words_of(factors: Sequence[Factor]) -> str:
-    """A monomial as it is written: `humidity_pct·speed_mps`."""
-    return "·".join(f.words() for f in factors)
+    return np.prod([f(segments) for f in factors], axis=0)
 
 
 def monomials(segments: Segments, rows: int) -> list[tuple[Factor, ...]]:

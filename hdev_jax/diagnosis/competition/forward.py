@@ -167,7 +167,6 @@ def _taken(round_: Round, s: Score, came: Refit, gain: float) -> State | None:
         asked.stability,
         of_class(asked),
         float(gain),
-        scores.between(s.candidate),
     )  # fmt: skip
     round_.tell(f"added {id_}")
     return replace(state, fit=came.fit, found=(*state.found, found))

@@ -19,7 +19,7 @@ from hdev_jax.diagnosis.competition.refit import joined
 from hdev_jax.diagnosis.competition.state import Found, State, Verdict
 from hdev_jax.diagnosis.gates.gates import RESAMPLES
 from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
-from hdev_jax.diagnosis.scores.evidence import Evidence, Score
+from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.passes import evidence_of
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
@@ -67,7 +67,7 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
         out[:, -1] = np.nan_to_num(training.kernel.predict(state.fit.vehicle, chunk.segments, training.target))
 
     evidence = evidence_of(baseline, plan.width + 1, write)
-    every = np.stack([_alone(evidence, c.columns[0]).grams for c in plan.candidates])
+    every = np.stack([evidence.only([c])[0].grams for c in plan.candidates])
     prior, level = (np.diag(evidence.precision), evidence.pull), settings.fdr / len(training.library)
     lasting = [set(c.sizes) <= LASTING for c in plan.candidates]
     best = _best(every, *prior, settings)
@@ -78,10 +78,10 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
     q = min(1.0, p * len(training.library))
     if (why := _against(best[1], lasting[k], len(every), level, settings)) is not None:
         return no(Kind.NOT_SIGNIFICANT, why, gain, q)
-    column = replace(c, columns=(0,))
-    alone = _alone(evidence, c.columns[0])
+    alone, (column,) = evidence.only([c])
     in_mode = alone.within(z).score(column)
-    if _alone(evidence, plan.width).within(z).score(column).gain > in_mode.gain - settings.ahead:
+    power, (gain_of_it,) = evidence.only([replace(c, columns=(plan.width,))])
+    if power.within(z).score(gain_of_it).gain > in_mode.gain - settings.ahead:
         why = "in those trips a gain of the whole power explains as much as this coefficient"
         return no(Kind.OUTSCORED, why, gain, q)
     left_out = alone.left_out_gain_of_mode(z)
@@ -103,24 +103,11 @@ def add_mode(training: Training, state: State, rng: np.random.Generator) -> tupl
     return replace(state, fit=fit, found=(*state.found, found)), None
 
 
-def _alone(evidence: Evidence, column: int) -> Evidence:
-    """The evidence of one column alone."""
-    at = np.r_[np.arange(evidence.base), evidence.base + column, evidence.grams.shape[-1] - 1]
-    return replace(evidence, grams=evidence.grams[:, at[:, None], at[None, :]], levels=evidence.levels[:, at])
-
-
 def _solved(a: np.ndarray, b: np.ndarray) -> tuple[float, np.ndarray]:
     """Gain in log-likelihood and coefficients of normal equations that may be singular."""
     d = np.sqrt(np.maximum(np.diag(a), 1e-300))
     x = np.linalg.pinv(a / np.outer(d, d), rcond=1e-9, hermitian=True) @ (b / d) / d
     return 0.5 * float(b @ x), x
-
-
-def _with_mode(
-    a: np.ndarray, b: np.ndarray, cross: np.ndarray, square: float, moment: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations of the common coefficients and one more column."""
-    return np.block([[a, cross[:, None]], [cross[None], np.array([[square]])]]), np.r_[b, moment]
 
 
 def _p(gain: float, trips: int, coefficients: int) -> float:
@@ -148,7 +135,8 @@ def _against(split: Split, lasting: bool, coefficients: int, level: float, setti
         return f"trips do not form two groups (p = {p:.2g})"
     if stats.chi2.sf(2.0 * left, len(z) - 2) < settings.mode_enough or over_levels < settings.ahead:
         return "trips differ, but by more than two values"
-    return "a permanent change from one trip on explains as much" if lasting and _ordered(z) else None
+    stays = lasting and np.count_nonzero(np.diff(z)) <= 1  # all trips from one on, or all before it
+    return "a permanent change from one trip on explains as much" if stays else None
 
 
 def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray, settings: Settings) -> Split | None:
@@ -169,7 +157,8 @@ def _split(grams: Grams, precision: np.ndarray, pull: np.ndarray, settings: Sett
     for k in range(settings.mode_side, n - settings.mode_side + 1):
         z = np.zeros(n)
         z[order[k:] if n - k <= k else order[:k]] = 1.0  # the rarer mode is the second
-        gain, y = _solved(*_with_mode(a, b, z @ cross, z @ square, z @ moment))  # pyright: ignore[reportArgumentType]
+        c = (z @ cross)[:, None]  # of one more column beside the common coefficients
+        gain, y = _solved(np.block([[a, c], [c.T, np.array([[z @ square]])]]), np.r_[b, z @ moment])
         if best is None or gain > best[0]:
             best = gain, z, float(y[-1])
     assert best is not None
@@ -189,11 +178,6 @@ def _over_levels(x: np.ndarray, precision: np.ndarray, z: np.ndarray) -> float:
     two = likelihood(z > 0, 0.0) + likelihood(z == 0, 0.0) - len(z) * float(np.log(2.0))
     spread = float(np.var(x)) + 1e-300
     return two - max(likelihood(z >= 0, v * spread) for v in RANDOM)
-
-
-def _ordered(z: np.ndarray) -> bool:
-    """Whether the second mode is all trips from one on, or all before it."""
-    return int(np.count_nonzero(np.diff(z))) <= 1
 
 
 def _stability(

@@ -147,10 +147,7 @@ def _crossed(fit: Calibration) -> set[str]:
 
 def without(training: Training, state: State, *ids: str) -> State:
     """The state with effects taken out and the rest refitted."""
-    table = state.fit.table
-    for id_ in ids:
-        table = table.minus(id_)
-    fit = fitted(training, state.fit, state.fit.vehicle.minus(*ids), table)
+    fit = fitted(training, state.fit, state.fit.vehicle.minus(*ids), state.fit.table.minus(*ids))
     found = tuple(f for f in state.found if f.id not in ids)
     return replace(state, fit=fit, found=found, terms=tuple(t for t in state.terms if t.id not in ids))
 
@@ -269,7 +266,7 @@ def _coefficients(candidate: Candidate, effect: Effect, *, shapes: bool = True) 
     """The table's rows of a candidate: its sizes and shapes free, shapes of sizes that it does not have held."""
     groups = [str(g) for g in candidate.groups if g is not None]
     rows = effect_coefficients(effect, candidate.sizes, groups=groups, shapes=shapes)
-    return tuple(replace(r, free=False) if _idle(candidate, r.path) else r for r in rows)
+    return tuple(replace(r, free=False) if _idle_shape(candidate, r.path.rpartition(".")[2]) else r for r in rows)
 
 
 def _stands(fit: Calibration, candidate: Candidate, settings: Settings) -> bool:
@@ -298,12 +295,8 @@ def _sizes(fit: Calibration, c: Candidate) -> Float[np.ndarray, " k"]:
     return np.array([by[f"effects.{c.id}.{n}", g] - c.parameter(n).null for n, g in each])
 
 
-def _idle(candidate: Candidate, path: str) -> bool:
-    """A shape that belongs to a size this candidate does not have."""
-    return _idle_shape(candidate, path.rpartition(".")[2])
-
-
 def _idle_shape(candidate: Candidate, name: str) -> bool:
+    """A shape that belongs to a size this candidate does not have."""
     return name not in candidate.sizes and all(name != n for n, _ in candidate.shapes)
 
 

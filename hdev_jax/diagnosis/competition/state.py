@@ -19,7 +19,7 @@ __all__ = ["Found", "Hidden", "State", "Verdict"]
 class Found:
     """An effect that was added, and on what evidence.
 
-    `alike`: its class, the best first; `between`: it hardly changes inside a trip.
+    `alike`: its class, the best first.
     """
 
     id: str
@@ -28,7 +28,6 @@ class Found:
     stability: float
     alike: tuple[str, ...]
     gain: float
-    between: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
-__all__ = ["SENTENCES", "UNTRIED", "Kind", "Rejection", "sentence"]
+__all__ = ["SENTENCES", "UNTRIED", "Kind", "Rejection"]
 
 
 class Kind(StrEnum):
@@ -45,7 +45,10 @@ class Rejection:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return sentence(self)
+        """In words; `detail` among its numbers replaces them where an effect has tests of its own."""
+        if detail := self.numbers.get("detail"):
+            return str(detail)
+        return SENTENCES[self.kind].format(**{"unit": "trips"} | dict(self.numbers))
 
 
 SENTENCES = {
@@ -77,10 +80,3 @@ SENTENCES = {
     Kind.FOUND: "found",
     Kind.DECLARED: "declared in the sheet",
 }
-
-
-def sentence(rejection: Rejection) -> str:
-    """The rejection in words; `detail` among its numbers replaces it where an effect has tests of its own."""
-    if detail := rejection.numbers.get("detail"):
-        return str(detail)
-    return SENTENCES[rejection.kind].format(**{"unit": "trips"} | dict(rejection.numbers))

@@ -1,7 +1,6 @@
 """The noise of a log: its colour, the level of each trip, the scale of each trip; and what makes it white."""
 
 import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +8,7 @@ from jaxtyping import Float, Int
 
 from hdev_jax.segments import trip_slices
 
-__all__ = ["Noise", "estimate_noise", "log_likelihood_of_trip", "whiten", "without_level"]
+__all__ = ["Noise", "estimate_noise", "log_likelihood_of_trip", "whiten"]
 
 MAX_ORDER = 24
 PIECE = 64  # rows at a time: one product of small matrices in place of a pass for each lag
@@ -94,14 +93,6 @@ def _autocovariance(x: np.ndarray, slices: list[slice], order: int) -> np.ndarra
     return acov / (pairs if longest < 50 * order else pairs[0])
 
 
-def _less_levels(residual: np.ndarray, slices: list[slice]) -> np.ndarray:
-    """The residual less each trip's own mean."""
-    out = residual.copy()
-    for s in slices:
-        out[s] -= np.mean(out[s])
-    return out
-
-
 def estimate_noise(
     residual: Float[np.ndarray, " row"],
     trip: Int[np.ndarray, " row"],
@@ -123,7 +114,7 @@ def estimate_noise(
     acov = _autocovariance(residual / common, slices, order)
     levels = levels and len(slices) >= 4
     tried = [(share, acov - share * acov[0]) for share in (LEVEL_SHARES if levels else (0.0,))]
-    inside = _less_levels(residual, slices) / common
+    inside = np.concatenate([residual[s] - np.mean(residual[s]) for s in slices]) / common
     if (between := 1.0 - float(np.mean(inside**2))) > LARGE_SHARE:
         colour = _autocovariance(inside, slices, order)
         tried += [(0.0, colour + between), *([(between, colour)] if levels else [])]
@@ -237,13 +228,3 @@ def log_likelihood_of_trip(white: Float[np.ndarray, "row column"], level_sd: flo
     left, level = white[:, :-1], white[:, -1]
     shared = level_sd**2 * (level @ left) ** 2 / (1.0 + level_sd**2 * float(level @ level))
     return -0.5 * (np.sum(left**2, axis=0) - shared)
-
-
-def without_level(
-    columns: Float[np.ndarray, "row k"], level: Float[np.ndarray, " row"], slices: Iterable[slice]
-) -> Float[np.ndarray, "row k"]:
-    """Whitened columns with a fixed intercept of each trip taken out; `level` is the column of an intercept of 1."""
-    out = columns.copy()
-    for s in slices:
-        out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
-    return out

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import special, stats
 
-from hdev_jax.diagnosis.noise.noise import Noise, whiten, without_level
+from hdev_jax.diagnosis.noise.noise import Noise, whiten
 from hdev_jax.segments import trip_slices
 
 __all__ = ["Clocked", "Period", "strongest_period"]
@@ -60,9 +60,12 @@ class Clocked:
         return [s for _, s in trip_slices(self.trip)]
 
     def whitened(self, columns: Float[np.ndarray, "row k"]) -> Float[np.ndarray, "row k"]:
-        """Columns for generalised least squares, without the intercept of each trip."""
+        """Columns for generalised least squares, with a fixed intercept of each trip taken out."""
         both = whiten(np.column_stack([columns, self.worth]), self.noise, self.trip, self.duration_s)
-        return without_level(both[:, :-2], both[:, -2], self.slices)
+        out, level = both[:, :-2].copy(), both[:, -2]
+        for s in self.slices:
+            out[s] -= np.outer(level[s], level[s] @ out[s]) / max(float(level[s] @ level[s]), 1e-300)
+        return out
 
 
 def strongest_period(residual: Float[np.ndarray, " row"], rows: Clocked) -> Period | None:

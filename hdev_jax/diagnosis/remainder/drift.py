@@ -18,11 +18,10 @@ from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.inference.states import course
 from hdev_jax.segments import starts_of_runs, trip_slices
 
-__all__ = ["LIKE", "Drift", "Slow", "drift_of"]
+__all__ = ["Drift", "Slow", "drift_of"]
 
 MINUTE_S = 60.0
 LEAST_BLOCKS = 30
-LIKE = ("load", "force", "gain", "none")
 LONGEST = 60  # minutes between two means, at most
 
 

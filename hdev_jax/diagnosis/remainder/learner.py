@@ -17,31 +17,27 @@ MOST_ROWS = 30_000  # that the learner is trained on
 LEANS = 0.15  # of the total importance, for a feature that is named
 
 
-def learn(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[np.ndarray, float, float, tuple[str, ...]]:
-    """Correction on test rows, the share that it predicts in cross-validation over training clusters and its p, and the
-    most important features."""
+def learn(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[np.ndarray, float, tuple[str, ...]]:
+    """Correction on test rows, its p in cross-validation over training clusters, and the most important features."""
     import lightgbm as lgb
 
     every = max(1, len(train.residual) // MOST_ROWS)  # neighbouring rows are alike: enough of them
-    train = Rows(
-        train.features[::every], train.residual[::every], replace(train.clusters, ids=train.clusters.ids[::every]),
-        train.trip[::every], train.duration_s[::every], train.worth[::every], train.cycle_unit, train.weight[::every],
-        {k: x[::every] for k, x in train.amounts.items()},
-    )  # fmt: skip
+    x, y = train.features[::every], train.residual[::every]
+    clusters = replace(train.clusters, ids=train.clusters.ids[::every])
     rng = np.random.default_rng(seed)
-    fold = rng.permutation(np.arange(train.clusters.count) % 4)[train.clusters.ids]
-    rows = len(train.residual)
+    fold = rng.permutation(np.arange(clusters.count) % 4)[clusters.ids]
+    rows = len(y)
     parameters = {
         "objective": "regression", "learning_rate": 0.05, "num_leaves": 15, "verbosity": -1, "num_threads": 1,
         "min_data_in_leaf": int(max(20, rows // 200)), "lambda_l2": 10.0, "feature_fraction": 0.8, "seed": seed,
         "deterministic": True, "force_row_wise": True, "max_bin": 127,
     }  # fmt: skip
-    scale = float(np.std(train.residual)) + 1e-300
+    scale = float(np.std(y)) + 1e-300
 
     safe = [f"f{i}" for i in range(len(names))]
 
     def part(at: np.ndarray, **options: Any) -> Any:
-        return lgb.Dataset(train.features[at], train.residual[at] / scale, feature_name=safe, **options)
+        return lgb.Dataset(x[at], y[at] / scale, feature_name=safe, **options)
 
     out_of_fold, steps = np.zeros(rows), []
     folds = np.unique(fold)
@@ -52,12 +48,12 @@ def learn(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[np.
         stop = [lgb.early_stopping(20, verbose=False)]
         steps.append(max(lgb.train(parameters, data, ROUNDS, valid_sets=[check], callbacks=stop).best_iteration, 0))
         booster = lgb.train(parameters, part(fold != k), max(steps[-1], 1))
-        out_of_fold[fold == k] = np.asarray(booster.predict(train.features[fold == k])) * scale
+        out_of_fold[fold == k] = np.asarray(booster.predict(x[fold == k])) * scale
     rounds = int(np.median(steps)) if steps else 0
     if rounds < 2:
-        return np.zeros(len(test.residual)), 0.0, 1.0, ()
-    gain = train.clusters.sums(train.residual**2 - (train.residual - out_of_fold) ** 2)
-    size = train.clusters.sums(train.residual**2)
+        return np.zeros(len(test.residual)), 1.0, ()
+    gain = clusters.sums(y**2 - (y - out_of_fold) ** 2)
+    size = clusters.sums(y**2)
     relative = gain / np.mean(size)
     t = np.mean(relative) / (np.std(relative, ddof=1) / np.sqrt(len(relative)) + 1e-300)
     p = float(stats.t.sf(t, len(relative) - 1))
@@ -66,7 +62,7 @@ def learn(train: Rows, test: Rows, names: Sequence[str], seed: int) -> tuple[np.
     importance = booster.feature_importance("gain")
     first = np.argsort(-importance)[:3]
     leading = tuple(str(names[int(i)]) for i in first if importance[i] > LEANS * importance.sum())
-    return correction, share_of(train.residual, out_of_fold), p, leading
+    return correction, p, leading
 
 
 def share_of(residual: np.ndarray, predicted: np.ndarray) -> float:

@@ -15,12 +15,10 @@ from hdev_jax.diagnosis.remainder.structure import (
     GROWS_AS,
     change_point,
     colour,
-    cycle_rms,
     levels_of,
     period_of,
     scales_with,
     shared_offset,
-    shift_rms,
 )
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.problem import Problem, Split
@@ -43,7 +41,6 @@ class Remainder:
     noise_floor_rmse: float
     depends_on: tuple[str, ...]
     signature: str
-    rms: float  # of the structure found on training rows, in the target's unit; 0 where there is none
     trips_differ: bool = False
     scales_with: str | None = None
     correction: Mapping[str, Any] | None = None  # `channel`, its values `at`, what is added there [`unit`]
@@ -75,7 +72,7 @@ def remainder(
 
     The learner (LightGBM) is trained on training rows; its share is what it predicts of the test residual. It counts
     only where cross-validation over training clusters confirms it. The others are tests against coloured noise. What
-    is reported is measured on test rows; `rms` is of training rows alone.
+    is reported is measured on test rows.
 
     **Arguments:** predictions of the model with the found effects and of the declared one on every row of the log, and
     `given` the decoded states of its loads, of which the residual is (the first where it has none).
@@ -83,7 +80,7 @@ def remainder(
     columns, names = features(problem, predicted, declared)
     train, test = (side(problem, problem.rows(trips), given, columns) for trips in (split.train, split.test))
     tell("what remains: a flexible learner, validated by trip")
-    correction, share_train, p_learner, order = learn(train, test, names, seed)
+    correction, p_learner, order = learn(train, test, names, seed)
     share = share_of(test.residual, correction)
     learned = p_learner < settings.level and share > settings.least_share
     tell("what remains: periods, change points, random intercepts of trips")
@@ -98,7 +95,6 @@ def remainder(
     floor = rmse * float(np.sqrt(1.0 - (share if learned else 0.0)))
     parts: list[str] = []
     depends: list[str] = []
-    sizes = [0.0]
     after = rmse
     if formula is not None:
         after = float(np.sqrt(np.mean((problem.measured - formula.predicted)[problem.rows(split.test)] ** 2)))
@@ -106,26 +102,20 @@ def remainder(
     if formula is not None:
         floor = min(floor, after)
         depends += formula.channels
-        added = (formula.predicted - given)[problem.rows(split.train)]
-        sizes.append(float(np.sqrt(np.mean(added**2))))
         error = f"test RMSE {rmse:.4g} → {after:.4g} {problem.unit}"
         parts.append(f"it follows {formula.words}, which is no effect of the library ({error})")
-    if p_learner < settings.level and share_train > settings.least_share:
-        sizes.append(float(np.sqrt(share_train * np.mean(train.residual**2))))
     if learned:
         depends += list(order)
         how = f"{100 * share:.0f} % of its variance depends on {', '.join(order) or 'several channels'}"
         parts.append(f"{how} in a form that no effect of the library has")
     if period is not None:
         seconds, amplitude = period.period_s, period.amplitude
-        sizes.append(cycle_rms(train, amplitude))
         depends.append("time_s")
         clock = f"{seconds / 60:.0f}-minute" if seconds >= 120 else f"{seconds:.0f}-second"
         parts.append(f"a {clock} cycle of about {amplitude:.3g} {train.cycle_unit}")
     if change is not None:
         where, row = change
         before = (train.trip == where) & (np.arange(len(train.trip)) <= row)
-        sizes.append(shift_rms(train.residual, before, (train.trip == where) & ~before))
         depends.append("time_s")
         minutes = float(np.sum(train.duration_s[before]) / 60.0)
         parts.append(f"a change inside trip {problem.log.trip_names[where]} after {minutes:.0f} min")
@@ -134,12 +124,10 @@ def remainder(
     apart[np.abs(apart) < 1e-9 * abs(mean)] = 0.0  # rounding is no difference between trips
     differing = levels_of(train, apart, settings) if mean else levels
     if differing is not None and differing.significant:
-        sizes.append(differing.sd)
         depends.append("trip_id")
         worst = f"{problem.log.trip_names[differing.worst]} ({differing.level:+.2g} {problem.unit})"
         parts.append(f"random intercepts by trip, sd about {differing.sd:.2g} {problem.unit}, largest in {worst}")
     elif mean and levels is not None and levels.significant:
-        sizes.append(abs(mean))
         parts.append(f"an offset of about {mean:+.2g} {problem.unit} that all trips share")
     floor = float(np.sqrt(floor**2 + max(hidden, 0.0)))
     grows = scales_with(train, settings) if parts else None
@@ -147,7 +135,6 @@ def remainder(
         parts.append(f"from trip to trip it grows with {grows}, as {GROWS_AS[grows]} does")
     drift, course, slope = _drift(problem, split, given, settings)
     if slope:
-        sizes.append(slope.rms * float(np.sqrt(np.mean(train.residual**2))))
         parts.insert(0, slope.words)
     if drift.words:
         found = "; ".join(parts) or f"no channel of the log explains it, and it is {colour(noise)}"
@@ -157,7 +144,7 @@ def remainder(
     else:
         signature = "What is left looks like noise: " + colour(noise)
     return Remainder(
-        bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", max(sizes), differing is not None,
+        bool(parts), share, floor, tuple(dict.fromkeys(depends)), signature + ".", differing is not None,
         scales_with=grows,
         correction=curve(correction, test, list(names), order[0], problem.unit) if learned and order else None,
         behaves_like=drift.like, sd=drift.sd if np.isfinite(drift.sd) else None, memory_s=drift.memory_s or None,

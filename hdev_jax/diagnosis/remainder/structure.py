@@ -13,7 +13,7 @@ from hdev_jax.segments import trip_slices
 
 __all__ = [
     "GROWS_AS", "Levels", "change_point", "colour", "cycle_rms", "levels_of", "period_of", "scales_with",
-    "shared_offset", "shift_rms",
+    "shared_offset",
 ]  # fmt: skip
 
 OFFSET_LEVEL = 0.01  # of a mean over trips, once it is known that something is there
@@ -89,15 +89,6 @@ def change_point(white: np.ndarray, trip: np.ndarray, settings: Settings) -> tup
     if best is None or stats.kstwobign.sf(best[0]) * len(slices) > settings.level / 10:
         return None
     return best[1:]
-
-
-def shift_rms(residual: np.ndarray, before: np.ndarray, after: np.ndarray) -> float:
-    """Root mean square, over all rows, of what the means of a trip's two parts differ from the trip's own by."""
-    n, m = int(before.sum()), int(after.sum())
-    if not n or not m:
-        return 0.0
-    step = float(np.mean(residual[after]) - np.mean(residual[before]))
-    return abs(step) * float(np.sqrt(n * m / (n + m) / len(residual)))
 
 
 def _of_some_length(trip: np.ndarray) -> dict[int, slice]:

@@ -29,11 +29,11 @@ from hdev_jax.inference.states import (
     shares_of,
 )  # fmt: skip
 from hdev_jax.physics.states import KNOTS_C, state_channel
-from hdev_jax.problem import Problem, Split, metrics
+from hdev_jax.problem import Problem, Split
 from hdev_jax.segments import Segments, trip_slices
 from hdev_jax.targets import TARGETS, as_watts
 
-__all__ = ["Given", "errors_by_knowledge", "given_states", "state_block"]
+__all__ = ["Given", "given_states", "state_block"]
 
 DRAWS = 40
 # quantiles between so few draws lie further inside than those of the distribution: of a normal by so much
@@ -164,18 +164,3 @@ def _shares(rows: Any, on: np.ndarray, share: float) -> list[list[float]]:
         if np.sum(rows.duration_s[np.abs(rows.temp_c - c) <= NEAR_C]) >= LEAST_S:
             out.append([c, float(x), float(max(x - h, 0.0)), float(min(x + h, 1.0))])
     return out
-
-
-def errors_by_knowledge(problem: Problem, split: Split, given: Given) -> dict[str, dict[str, Any]]:
-    """METRICS on the held-out test trips one step ahead and given the states."""
-    y, weight = problem.measured, problem.weight()
-
-    def of(predicted: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
-        return metrics(y[rows], predicted[rows], weight[rows])
-
-    test, trips = problem.rows(split.test), {problem.log.trip_names[i]: problem.rows([i]) for i in split.test}
-    return {
-        "one_step": of(given.ahead, test),
-        "given_states": of(given.predicted, test),
-        "given_states_by_trip": {name: of(given.predicted, rows) for name, rows in trips.items()},
-    }

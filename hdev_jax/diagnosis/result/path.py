@@ -18,10 +18,7 @@ def path(training: Training, problem: Problem, state: State) -> list[Calibration
     fits = [training.calibrate(problem.vehicle, problem.table)]
     for k in range(1, len(state.found)):
         later = state.ids[k:]
-        table = state.fit.table
-        for id_ in later:
-            table = table.minus(id_)
-        vehicle = state.fit.vehicle.minus(*later)
+        table, vehicle = state.fit.table.minus(*later), state.fit.vehicle.minus(*later)
         values = state.trail.get(",".join(state.ids[:k]))
         if values is not None:  # fitted when it was found
             fits.append(replace(fits[0], vehicle=table.insert(vehicle, jnp.asarray(values)), table=table))

@@ -12,7 +12,7 @@ from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.remainder.remainder import Remainder
 from hdev_jax.diagnosis.result import notes
 from hdev_jax.diagnosis.result.coefficients import as_they_end, baseline_block
-from hdev_jax.diagnosis.result.hidden import Given, errors_by_knowledge, state_block
+from hdev_jax.diagnosis.result.hidden import Given, state_block
 from hdev_jax.diagnosis.result.intervals import Open
 from hdev_jax.diagnosis.result.modes import mode_block
 from hdev_jax.diagnosis.settings import Settings
@@ -137,6 +137,11 @@ def summarise(
             "test_by_trip": {k: metrics(y[m], p[m], weight[m]) for k, m in at.items()},
         }
 
+    after = block(predicted[-1])
+    if given:  # one step ahead, and given the decoded states
+        seen = block(given.predicted)
+        after |= {"one_step": metrics(y[test], given.ahead[test], weight[test]), "given_states": seen["test"],
+                  "given_states_by_trip": seen["test_by_trip"]}  # fmt: skip
     rmse = [metrics(y[test], p[test], weight[test])["rmse"] for p in predicted]
     clusters = cluster_rows(problem.segments.take(train))
     effects = [
@@ -170,7 +175,7 @@ def summarise(
             "unused_trips": split.names(split.unused),
         },
         "before": block(predicted[0]),
-        "after": {**block(predicted[-1]), **(errors_by_knowledge(problem, split, given) if given else {})},
+        "after": after,
         "baseline": {"parameters": baseline_block(steps[0], state.absorbs)},
         "coefficients": as_they_end(steps[-1], state, training.settings),
         "effects": effects,

@@ -1,7 +1,7 @@
 """Normal equations by cluster of [Jacobian | candidates | residual], with random intercepts of trips: the algebra.
 
-Everything is whitened (`whiten.py`), so a cluster's rows enter only through its Gram matrix. Fits, refits without each
-cluster in turn, what candidates gain and what they share with the Jacobian need no second look at the rows.
+Everything is whitened (`noise.whiten`), so a cluster's rows enter only through its Gram matrix. Fits, refits without
+each cluster in turn, what candidates gain and what they share with the Jacobian need no second look at the rows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -10,8 +10,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from hdev_jax.diagnosis.scores.significance import wald
 
 __all__ = ["NormalEquations", "solved"]
 
@@ -201,13 +199,6 @@ class NormalEquations:
         error = np.maximum(own, np.sqrt((g - 1) / g * np.sum((left_out - x[v]) ** 2, axis=0)))
         scale = np.divide(error, own, out=np.ones_like(own), where=own > 0)
         return x[v], model * np.outer(scale, scale)
-
-    def present(self, at: Sequence[int], values: Float[np.ndarray, " k"]) -> float:
-        """p of base columns against being taken out: their values against zero with jackknifed clusters."""
-        none, index = np.empty(0, int), np.asarray(at)
-        likelihood, x = self._fit(self.totals(), none)
-        v = int(np.argmax(likelihood))
-        return float(wald(x[v, index] + values, self._jackknife(self._blocks(none, v))[:, index] + values))
 
     def _blocks(self, at: np.ndarray, v: int) -> Float[np.ndarray, "cluster *way m m"]:
         """`by_cluster` of the base columns, those at `at` [*way k] and the residual."""

@@ -190,7 +190,9 @@ def best_of(
     ranked: dict[str, list[tuple[float, Candidate]]] = {}
     for c, gain in zip(every, white.gains(totals, [c.columns for c in every]), strict=True):
         ranked.setdefault(c.id, []).append((worth(float(gain), c, settings), c))
-    leading = {id_: [c for _, c in _leading(entries)] for id_, entries in ranked.items()}
+    leading = {
+        id_: [c for _, c in sorted(entries, key=lambda e: -_rounded(e[0]))[:LEADING]] for id_, entries in ranked.items()
+    }
     steady = {
         id_: [c for _, c in entries if c.kind == "size" and slow[list(c.columns)].all()]
         for id_, entries in ranked.items()
@@ -227,10 +229,6 @@ def _all_inside(
     """Each of one effect's scores `inside`, by worth again where any of them has changed."""
     left = [inside(s, again) for s in scores]
     return left if all(new is old for new, old in zip(left, scores, strict=True)) else _in_order(left, settings)
-
-
-def _leading(entries: list[tuple[float, Candidate]]) -> list[tuple[float, Candidate]]:
-    return sorted(entries, key=lambda e: -_rounded(e[0]))[:LEADING]
 
 
 def _in_order(scores: Sequence[Score], settings: Settings) -> list[Score]:
