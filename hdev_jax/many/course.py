@@ -13,7 +13,7 @@ from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.noise.noise import estimate_noise, whiten
 from hdev_jax.energy.saved import conditions
 from hdev_jax.inference import padded
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import Effect
 from hdev_jax.targets import TARGETS
 
 __all__ = ["CONDITIONS", "course_of"]
@@ -49,7 +49,7 @@ def course_of(outcome: Outcome) -> dict[str, Any]:
         if words in CONDITIONS:
             out[CONDITIONS[words]] = x[there].tolist()
     vehicle, table, predicted = outcome.fit.vehicle, outcome.fit.table, outcome.predicted_after
-    if outcome.given is not None or any(_compares_trips(e) for e in outcome.found):
+    if outcome.given is not None or any(_compares_trips(outcome.training.library[e]) for e in outcome.found):
         vehicle, table, predicted = outcome.before, problem.table, outcome.predicted_before
     if not table.free:
         return {**out, "coefficients": None}
@@ -71,7 +71,6 @@ def course_of(outcome: Outcome) -> dict[str, Any]:
     }}  # fmt: skip
 
 
-def _compares_trips(id_: str) -> bool:
+def _compares_trips(effect: type[Effect]) -> bool:
     """Whether an effect is a difference between trips itself: what changed is then not left to be found."""
-    effect = LIBRARY[id_]
     return bool(effect.searched) or any(p.name == "at_trip" for p in effect.parameters)

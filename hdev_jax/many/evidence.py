@@ -9,7 +9,7 @@ from scipy import stats
 from hdev_jax.diagnosis.settings import SETTINGS, FleetSettings
 from hdev_jax.many.pooling import cauchy, pooled
 from hdev_jax.many.scan import FOUND
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import LIBRARY, Effect
 
 __all__ = ["Again", "beside", "by_type", "effects_of_types", "families", "heavier"]
 
@@ -29,8 +29,9 @@ def by_type(records: Sequence[Record]) -> dict[str, list[Record]]:
 
 
 def effects_of_types(
-    records: Sequence[Record], settings: FleetSettings, again: Again | None = None
-) -> list[dict[str, Any]]:
+    records: Sequence[Record], settings: FleetSettings, again: Again | None = None,
+    library: Mapping[str, type[Effect]] = LIBRARY,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Every effect in every type with enough vehicles: its pooled size where it is clearest, with its p-value.
 
     The forms of an effect (shapes on a grid) are one hypothesis: their p-values are combined (`cauchy`). They are
@@ -41,7 +42,7 @@ def effects_of_types(
     models of its vehicles, `again` scans them anew, and so on until no other is left.
 
     **Arguments:** `again(records, effect by vehicle)`: returns scans by vehicle's name, with the vehicle's own effects
-    and these in its model.
+    and these in its model. `library`: the effects that were searched, a user's own among them.
 
     **Returns:** `type`, `id`, `size` with its `unit`, `shapes`, `value`, `sd`, `between` (sd over vehicles),
     `vehicles`, `named_in` (by their own diagnoses), `p`, `q`, `found`.
@@ -49,7 +50,7 @@ def effects_of_types(
     groups = {k: v for k, v in by_type(records).items() if len(v) >= settings.least_vehicles}
     scans = {k: {r["name"]: dict(r["scan"]) for r in v} for k, v in groups.items()}
     shown: dict[str, dict[str, dict[str, Any]]] = {k: {} for k in groups}
-    out = _tested(groups, scans, shown, settings)
+    out = _tested(groups, scans, shown, settings, library)
     for _ in range(settings.most_effects if again is not None else 0):
         new = {k: [e for e in out if e["type"] == k and e["found"] and e["id"] not in shown[k]] for k in groups}
         todo = {k: v for k, v in new.items() if len(v) > 1}
@@ -58,16 +59,16 @@ def effects_of_types(
         for kind, found in todo.items():
             best = min(found, key=lambda e: e["p"])
             shown[kind][best["id"]] = best
-            for name, scan in again(groups[kind], {e["id"]: beside(e) for e in shown[kind].values()}).items():
+            for name, scan in again(groups[kind], {e["id"]: beside(e, library) for e in shown[kind].values()}).items():
                 own = {k: s for k, s in scans[kind][name].items() if k.endswith(f" {FOUND}")}
                 scans[kind][name] = {**scan, **own}
-        out = _tested(groups, scans, shown, settings)
+        out = _tested(groups, scans, shown, settings, library)
     return sorted(out, key=lambda e: (not e["found"], e["q"], e["type"], e["id"]))
 
 
-def beside(effect: Mapping[str, Any]) -> dict[str, list[float]]:
+def beside(effect: Mapping[str, Any], library: Mapping[str, type[Effect]] = LIBRARY) -> dict[str, list[float]]:
     """An effect of a type as a vehicle's sheet has it: its size to be fitted anew, shapes and all else known."""
-    own = LIBRARY[effect["id"]]
+    own = library[effect["id"]]
     shapes = dict(x.split("=") for x in effect["shapes"].split())
     out: dict[str, list[float]] = {}
     for p in own.parameters:
@@ -82,14 +83,14 @@ def beside(effect: Mapping[str, Any]) -> dict[str, list[float]]:
 
 def _tested(
     groups: Mapping[str, Sequence[Record]], scans: Mapping[str, Mapping[str, Any]],
-    shown: Mapping[str, Mapping[str, dict[str, Any]]], settings: FleetSettings,
+    shown: Mapping[str, Mapping[str, dict[str, Any]]], settings: FleetSettings, library: Mapping[str, type[Effect]],
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Every effect of every type; those that are `shown` already as they were."""
     out = []
     for kind, each in groups.items():
         out += list(shown[kind].values())
         for id_ in sorted({s["id"] for scan in scans[kind].values() for s in scan.values()} - set(shown[kind])):
-            if (best := _effect([scans[kind][r["name"]] for r in each], id_, settings)) is not None:
+            if (best := _effect([scans[kind][r["name"]] for r in each], library[id_], settings)) is not None:
                 named = sum(any(e["id"] == id_ for e in r["effects"]) for r in each)
                 out.append({"type": kind, **best, "named_in": named})
     if out:
@@ -99,7 +100,8 @@ def _tested(
     return out
 
 
-def _effect(scans: Sequence[Mapping[str, Any]], id_: str, settings: FleetSettings) -> dict[str, Any] | None:
+def _effect(scans: Sequence[Mapping[str, Any]], effect: type[Effect], settings: FleetSettings) -> dict[str, Any] | None:
+    id_ = effect.id
     forms = sorted({k for scan in scans for k, s in scan.items() if s["id"] == id_ and not k.endswith(f" {FOUND}")})
     if not forms:  # every vehicle names it by itself
         forms = sorted({k.split(" ")[0] for scan in scans for k, s in scan.items() if s["id"] == id_})
@@ -119,7 +121,7 @@ def _effect(scans: Sequence[Mapping[str, Any]], id_: str, settings: FleetSetting
         return None
     _, form, pool, kind = min(tried, key=lambda x: x[0])
     size, _, shapes = form.partition(" ")
-    parameter = next(x for x in LIBRARY[id_].parameters if x.name == size.rpartition(".")[2])
+    parameter = next(x for x in effect.parameters if x.name == size.rpartition(".")[2])
     if kind == "size":
         inside = parameter.lower <= float(parameter.null) + pool.mean <= parameter.upper
         plausible = inside and abs(pool.mean) >= parameter.least

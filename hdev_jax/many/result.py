@@ -12,6 +12,7 @@ from hdev_jax.many.evidence import Again, by_type, effects_of_types, families
 from hdev_jax.many.ledger import fleet_ledger
 from hdev_jax.many.unlike import changes, levels, pooled_coefficients
 from hdev_jax.many.vehicle import plain
+from hdev_jax.physics import LIBRARY, Effect
 
 __all__ = ["FleetResult", "fleet_result"]
 
@@ -30,12 +31,12 @@ class FleetResult:
 
 def fleet_result(
     records: Sequence[Mapping[str, Any]], *, fdr: float, seed: int, price: float | None = None,
-    notes: Sequence[str] = (), again: Again | None = None,
+    notes: Sequence[str] = (), again: Again | None = None, library: Mapping[str, type[Effect]] = LIBRARY,
 ) -> FleetResult:  # fmt: skip
     """The result of a fleet from the records of its vehicles, in the order of the vehicles' names.
 
     **Arguments:** `records`: a `vehicle_record` of each vehicle. `fdr`: the highest adjusted p-value. `price`: of a
-    kWh. `notes`: what was left out. `again`: as in `effects_of_types`.
+    kWh. `notes`: what was left out. `again`, `library`: as in `effects_of_types`.
 
     **Returns:** a `FleetResult`. Its summary has `vehicles` (a short record of each), `counts` by status, `effects` by
     type, `coefficients` pooled by type, `unlike` (vehicles that differ from the others of their type, or changed, by
@@ -47,7 +48,7 @@ def fleet_result(
     for r in each:
         for e in r.get("effects", ()):
             e["counts_in_fleet"] = e["q_value"] <= bound
-    effects = effects_of_types(each, settings, again)
+    effects = effects_of_types(each, settings, again, library)
     pooled = pooled_coefficients(each, settings)
     apart, changed = levels(each, settings), changes(each, settings, seed)
     unlike = [*apart, *changed]

@@ -5,6 +5,7 @@ its standard error is a jackknife over trips (`hdev_jax.diagnosis.scores`). Effe
 named are in the model, with their fitted sizes. Candidates with several sizes are not pooled.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.diagnosis.training import Training
 from hdev_jax.inference import ParameterTable
-from hdev_jax.physics import LIBRARY, Vehicle
+from hdev_jax.physics import Effect, Vehicle
 from hdev_jax.problem import Problem, Split
 
 __all__ = ["FOUND", "key_of", "scan_beside", "scan_of"]
@@ -43,7 +44,7 @@ def scan_of(outcome: Outcome) -> dict[str, dict[str, Any]]:
     out = _scanned(outcome.training, vehicle, table)
     for id_, parameters in outcome.found.items():
         for name, (value, sd, _) in parameters.items():
-            p = next((p for p in LIBRARY[id_].parameters if p.name == name), None)
+            p = next((p for p in outcome.training.library[id_].parameters if p.name == name), None)
             if p is not None and p.has_column and sd > 0 and np.isfinite(p.null):
                 away = value - float(p.null)
                 out[f"{id_}.{name} {FOUND}"] = {
@@ -52,9 +53,11 @@ def scan_of(outcome: Outcome) -> dict[str, dict[str, Any]]:
     return out
 
 
-def scan_beside(problem: Problem, split: Split, settings: Settings) -> dict[str, dict[str, Any]]:
+def scan_beside(
+    problem: Problem, split: Split, library: Mapping[str, type[Effect]], settings: Settings
+) -> dict[str, dict[str, Any]]:
     """As `scan_of`, for a sheet that has the effects in it; it is calibrated with them."""
-    training, _ = training_of(problem, split, LIBRARY, settings)
+    training, _ = training_of(problem, split, library, settings)
     return _scanned(training, problem.vehicle, problem.table)
 
 

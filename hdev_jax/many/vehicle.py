@@ -5,12 +5,14 @@ import time
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from hdev_jax.diagnosis.candidates.own import known_effects, tried
 from hdev_jax.diagnosis.diagnose import Outcome, diagnose
 from hdev_jax.diagnosis.settings import Settings
 from hdev_jax.energy.fitted import Fitted
@@ -21,7 +23,7 @@ from hdev_jax.inference.sheet import Sheet, augmented_sheet, read_sheet
 from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.many.course import course_of
 from hdev_jax.many.scan import scan_beside, scan_of
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import LIBRARY, Effect
 from hdev_jax.problem import Problem, Split, implausible, prepare, split_trips, without_harmful_slope
 from hdev_jax.targets import TARGETS
 
@@ -34,7 +36,7 @@ def vehicle_record(task: Mapping[str, Any]) -> dict[str, Any]:
     """The diagnosis of one vehicle's log, as plain values for JSON. It raises nothing: a bad log gives a message.
 
     **Arguments:** `task`, plain values: `name`, `files`, `whole`, `sheet`, `kind` and `missing` of its `Source`;
-    `adapter`, `target`, `fdr`, `seed`, `trust`.
+    `adapter`, `target`, `fdr`, `seed`, `trust`; `effects`, if given, a file of a user's own.
 
     **Returns:** `name`, `type`, `status`, `message`, `seconds`. The status is "done", "suspect" (a unit or a sign is in
     doubt, and no effect was searched), "refused" (the input is at fault) or "failed" (a fault of this program). A
@@ -85,12 +87,24 @@ def scanned_again(task: Mapping[str, Any]) -> dict[str, Any]:
         return {"name": task["name"], "scan": {}, "message": " ".join(f"{type(e).__name__}: {e}".split())[:300]}
 
 
+def _library(task: Mapping[str, Any]) -> Mapping[str, type[Effect]]:
+    """The library, with the user's own effects."""
+    own = task.get("effects")
+    return LIBRARY if own is None else _with_own(own, Path(own).stat().st_mtime_ns)
+
+
+@cache  # the same classes for all vehicles, which share what was compiled with them; read again where it was changed
+def _with_own(file: str, _changed: int) -> Mapping[str, type[Effect]]:
+    return known_effects(file)
+
+
 def _beside(task: Mapping[str, Any]) -> dict[str, Any]:
-    sheet = read_sheet(task["sheet"], library=LIBRARY)
+    library = _library(task)
+    sheet = read_sheet(task["sheet"], library=library)
     more = {e: {n: (v, sd, "") for n, (v, sd) in ps.items()} for e, ps in task["beside"].items()}
     text = tomllib.loads(augmented_sheet(sheet, {}, more))
-    problem, split = _opened(task, Sheet(library=LIBRARY, path=task["sheet"], **text))
-    return scan_beside(problem, split, Settings(fdr=task["fdr"]))
+    problem, split = _opened(task, Sheet(library=library, path=task["sheet"], **text))
+    return scan_beside(problem, split, library, Settings(fdr=task["fdr"]))
 
 
 def _opened(task: Mapping[str, Any], sheet: Sheet) -> tuple[Problem, Split]:
@@ -99,12 +113,15 @@ def _opened(task: Mapping[str, Any], sheet: Sheet) -> tuple[Problem, Split]:
 
 
 def _analysed(task: Mapping[str, Any]) -> dict[str, Any]:
-    sheet = read_sheet(task["sheet"], library=LIBRARY)
+    library = _library(task)
+    sheet = read_sheet(task["sheet"], library=library)
     problem, split = _opened(task, sheet)
+    tried(problem, library, task.get("effects"), *library)
     log = problem.log
     doubts = () if task["trust"] else implausible(problem, split.train)
-    library, settings = {} if doubts else LIBRARY, Settings(fdr=task["fdr"])
-    outcome = diagnose(problem, split, library, settings=settings, seed=task["seed"], next_drives=False)
+    settings = Settings(fdr=task["fdr"])
+    outcome = diagnose(problem, split, {} if doubts else library, settings=settings, seed=task["seed"],
+                       next_drives=False)  # fmt: skip
     summary = outcome.summary
     notes, energy = list(summary.get("notes", ())), None
     if TARGETS[problem.target].of_battery:

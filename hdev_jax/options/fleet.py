@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hdev_jax.options.common import file_argument, out_options, share, target_option
+from hdev_jax.options.common import effects_option, file_argument, out_options, share, target_option
 
 __all__ = ["fleet_parser"]
 
@@ -30,6 +30,7 @@ def fleet_parser(verbs: Any) -> None:
     )  # fmt: skip
     file_argument(fleet, "--adapter", "A.toml", "how to read files whose columns have other names or units")
     target_option(fleet)
+    effects_option(fleet)
     fleet.add_argument("--price", type=float, metavar="P", help="price of a kWh, in any currency")
     fleet.add_argument(
         "--fdr", type=share, default=0.05, metavar="Q",

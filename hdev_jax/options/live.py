@@ -63,3 +63,4 @@ def live_parsers(verbs: Any) -> None:
     serve.add_argument(
         "--no-watch", dest="watch", action="store_false", help="do not look for effects that the sheets lack"
     )
+    effects_option(serve)

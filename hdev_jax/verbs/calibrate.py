@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects
 from hdev_jax.diagnosis.result.coefficients import baseline_block
 from hdev_jax.errors import InputError
 from hdev_jax.inference import cluster_rows, padded
@@ -17,7 +18,7 @@ from hdev_jax.logs.checks import COASTING
 from hdev_jax.problem import Problem, Split, implausible, metrics
 from hdev_jax.report.build import report_data
 from hdev_jax.rundir import Run, open_run
-from hdev_jax.verbs.opening import Effects, Logs, Opening, Vehicles, command_line, known_effects, opened
+from hdev_jax.verbs.opening import Logs, Opening, Vehicles, command_line, opened
 from hdev_jax.verbs.predict import predictive_of, sheet_digest
 from hdev_jax.verbs.result import CalibrationResult
 

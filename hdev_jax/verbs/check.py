@@ -4,12 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects
 from hdev_jax.logs import write_adapter_skeleton
 from hdev_jax.logs.checks import suspicions
 from hdev_jax.logs.read import adapter_of
 from hdev_jax.problem import implausible, prepare
 from hdev_jax.targets import TARGETS
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of
+from hdev_jax.verbs.opening import Logs, Vehicles, log_of, sheet_of
 
 __all__ = ["check"]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects
 from hdev_jax.diagnosis.diagnose import Outcome
 from hdev_jax.diagnosis.diagnose import diagnose as run_method
 from hdev_jax.diagnosis.result.stages import add_stages
@@ -19,16 +20,7 @@ from hdev_jax.problem import implausible
 from hdev_jax.report.build import answer_text, of_diagnosis
 from hdev_jax.rundir import Run, open_run
 from hdev_jax.verbs.arguments import names_of
-from hdev_jax.verbs.opening import (
-    Effects,
-    Logs,
-    Opening,
-    Vehicles,
-    chosen_effects,
-    command_line,
-    known_effects,
-    opened,
-)  # fmt: skip
+from hdev_jax.verbs.opening import Logs, Opening, Vehicles, chosen_effects, command_line, opened
 from hdev_jax.verbs.predict import predictive_of, sheet_digest
 from hdev_jax.verbs.result import Diagnosis
 from hdev_jax.verbs.states import states_of

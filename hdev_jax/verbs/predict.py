@@ -9,13 +9,14 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects, tried
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Calibration, Spread, covariance_root, jacobian, left_out, padded, spread_of, sums_of
 from hdev_jax.problem import Problem, Split, derivable, prepare
 from hdev_jax.rundir import atomic_file
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.beside import beside_sheet, covariance_of
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, log_of, sheet_of, tried
+from hdev_jax.verbs.opening import Logs, Vehicles, log_of, sheet_of
 from hdev_jax.verbs.result import PREDICTIVE, Prediction, Result
 from hdev_jax.verbs.states import one_step_ahead
 

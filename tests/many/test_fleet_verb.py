@@ -81,6 +81,28 @@ def same(a, b, where=""):
         assert a == b, where
 
 
+# What it adds is linear in the time since the start of the trip, which nothing in the library is.
+OWN = '''
+from typing import Any, ClassVar
+
+from hdev_jax.physics import Effect, Size
+
+
+class SlowDrift(Effect):
+    """A load that grows with the time since the start."""
+
+    id: ClassVar = "slow_drift"
+    label: ClassVar = "slow drift"
+    stage: ClassVar = "battery"
+    equation: ClassVar = "k·t"
+    parameters: ClassVar = (Size("w_per_s", "W/s", 0.0, 1.0, 0.0, 200.0),)
+    w_per_s: Any
+
+    def power(self, row, car, point):
+        return self.w_per_s * row.time_s
+'''
+
+
 def read(out: Path) -> dict:
     return json.loads((out / "fleet.json").read_text())
 
@@ -217,3 +239,31 @@ def test_an_adapter_is_a_file_or_the_name_of_a_preset(logs, tmp_path, monkeypatc
     status, _, said = hdev(*given, "--adapter", "torqe")
     assert status == 2
     assert "no such file, and no preset; there are carscanner, " in said
+
+
+def test_effects_of_ones_own_are_searched_declared_and_pooled(logs, tmp_path):
+    """Four vehicles have it, one of a fifth's own type declares it."""
+    (tmp_path / "mine.py").write_text(OWN)
+    (tmp_path / "logs").mkdir()
+    sheet = (logs / "truck.toml").read_text()
+    for name in "ABCDE":
+        made = synthetic_log(seed=50 + ord(name), trips=9, rows_per_trip=60)
+        frame = made.frame.drop(columns="vehicle_id")
+        frame["energy_wh"] += 100.0 * frame["time_s"] * frame["duration_s"] / 3600.0
+        frame.to_csv(tmp_path / "logs" / f"{name}.csv", index=False)
+        declared = "\n[effects.slow_drift]\nw_per_s = 100.0\n" if name == "E" else ""
+        (tmp_path / f"{name}.toml").write_text(sheet + declared)
+    lines = [f"{name},{name}.toml,{'other' if name == 'E' else 'truck'}\n" for name in "ABCDE"]
+    (tmp_path / "vehicles.csv").write_text("vehicle,sheet,type\n" + "".join(lines))
+    argv = ["fleet", tmp_path / "logs", "--vehicles", tmp_path / "vehicles.csv"]
+    status, _, said = hdev(*argv, "--effects", tmp_path / "none.py", "--out", tmp_path / "no")
+    assert (status, said) == (2, f"hdev: --effects {tmp_path / 'none.py'}: no such Python file")
+    assert hdev(*argv, "--effects", tmp_path / "mine.py", "--out", tmp_path / "out")[0] == 0
+    found = read(tmp_path / "out")
+    named = {v["name"]: {e["id"]: e for e in v["effects"]} for v in found["vehicles"]}
+    assert {k for k, v in named.items() if "slow_drift" in v} == {*"ABCD"}
+    (pooled,) = [e for e in found["effects"] if e["id"] == "slow_drift"]
+    assert pooled["found"]
+    assert (pooled["type"], pooled["named_in"], pooled["unit"]) == ("truck", 4, "W/s")
+    assert abs(pooled["value"] - 100.0) < 4 * pooled["sd"] < 40.0
+    assert "--effects" in (tmp_path / "out" / "report.html").read_text()

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from hdev_jax.fleet import demo_log
 from hdev_jax.online.service import Fleet, Journal, RefusedError, UnavailableError, sheets_in
 from hdev_jax.online.service.given import checked
 from hdev_jax.online.service.journal import postgresql
+from hdev_jax.physics import Effect, Size, library
+from hdev_jax.physics.effect import Car, Parameters, Point, Row, Stage
 
 pytest.importorskip("fastapi", reason="fastapi is in the extra serve")
 from fastapi.testclient import TestClient
@@ -405,3 +408,34 @@ def test_brakes_that_drag_let_go_on_the_rest_of_the_trip(tmp_path, sheets, rows)
     assert told == late, "times of rows to come are their durations added up"
     dragged = fleet.ahead("a", "T1", ahead[:2])["energy_wh"] * 30.0
     assert told < 0.95 * dragged
+
+
+def test_a_sheet_may_declare_an_effect_of_ones_own(sheets, rows, tmp_path):
+    class Lamp(Effect):
+        """A load of so much all the time."""
+
+        id: ClassVar[str] = "lamp"
+        label: ClassVar[str] = "lamp"
+        stage: ClassVar[Stage] = "battery"
+        equation: ClassVar[str] = "P"
+        parameters: ClassVar[Parameters] = (Size("power_w", "W", 0.0, 100.0, 0.0, 1e5),)
+        power_w: Any
+
+        def power(self, row: Row, car: Car, point: Point) -> Any:
+            return self.power_w
+
+    (tmp_path / "own").mkdir()
+    default = (sheets / "default.toml").read_text()
+    (tmp_path / "own" / "plain.toml").write_text(default)
+    (tmp_path / "own" / "lit.toml").write_text(f"{default}\n[effects.lamp]\npower_w = 36000.0\n")
+    with pytest.raises(InputError, match="lamp"):
+        sheets_in(tmp_path / "own")
+    client = TestClient(
+        app_of(Fleet(Journal(":memory:"), sheets_in(tmp_path / "own", library([Lamp])), watch=False), TOKENS)
+    )
+    for vehicle in ("plain", "lit"):
+        sent = client.post("/v1/rows", json={"rows": named(rows[:20], vehicle)}, headers=A)
+        assert sent.status_code == 200, sent.text
+    # of the first row: no error before it is known, which the next one's prediction takes up
+    seen = {v: client.get(f"/v1/vehicles/{v}", headers=A).json()["recent"][0]["predicted"] for v in ("plain", "lit")}
+    assert seen["lit"] - seen["plain"] == pytest.approx(36000.0 * rows[0]["duration_s"] / 3600.0)

@@ -16,10 +16,11 @@ import pandas as pd
 import pytest
 
 from hdev_jax import cli
+from hdev_jax.diagnosis.candidates.own import known_effects
 from hdev_jax.fleet import SyntheticLog, synthetic_log
 from hdev_jax.physics import LIBRARY
 from hdev_jax.rundir import Run
-from hdev_jax.verbs.opening import known_effects, opened
+from hdev_jax.verbs.opening import opened
 from hdev_jax.verbs.predict import strongly_correlated
 
 CHECKER = Path(__file__).parents[3] / "shared" / "check_diagnosis.py"

@@ -1,11 +1,12 @@
 """What the service is given: rows of a request, and the sheets of its vehicles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, read_sheet
+from hdev_jax.physics import LIBRARY, Effect
 
 __all__ = ["RefusedError", "checked", "sheets_in"]
 
@@ -55,12 +56,13 @@ def checked(rows: Any) -> list[tuple[str, str, float, dict[str, Any]]]:
     return out
 
 
-def sheets_in(folder: str | Path) -> Callable[[str, str], Sheet]:
-    """The sheet of a vehicle: FOLDER/FLEET/VEHICLE.toml, FOLDER/VEHICLE.toml, or `default.toml` in place of it."""
+def sheets_in(folder: str | Path, library: Mapping[str, type[Effect]] = LIBRARY) -> Callable[[str, str], Sheet]:
+    """The sheet of a vehicle: FOLDER/FLEET/VEHICLE.toml, FOLDER/VEHICLE.toml, or `default.toml` in place of it;
+    `library`: the effects that sheets may declare and that are watched."""
     root = Path(folder).resolve()
     if not root.is_dir():
         raise InputError(f"--sheets {folder}: no such folder")
-    there = {p.relative_to(root).as_posix(): read_sheet(p) for p in sorted(root.rglob("*.toml"))}
+    there = {p.relative_to(root).as_posix(): read_sheet(p, library=library) for p in sorted(root.rglob("*.toml"))}
     if not there:
         raise InputError(f"--sheets {folder}: holds no .toml; a sheet for each vehicle, or default.toml, is expected")
 

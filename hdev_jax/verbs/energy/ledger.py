@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hdev_jax.diagnosis.candidates.own import Effects
 from hdev_jax.energy.fitted import Fitted, calibrated_on
 from hdev_jax.energy.ledger import TOTAL, UNEXPLAINED, Ledger, ledger_of
 from hdev_jax.energy.saved import conditions
@@ -21,7 +22,7 @@ from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles
+from hdev_jax.verbs.opening import Logs, Vehicles
 
 __all__ = ["ledger"]
 

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects, tried
 from hdev_jax.energy.fitted import Fitted, calibrated_on
 from hdev_jax.errors import InputError
 from hdev_jax.inference import Spread
@@ -20,19 +21,7 @@ from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.arguments import seed_of
 from hdev_jax.verbs.beside import beside_sheet, covariance_of
 from hdev_jax.verbs.energy.result import EnergyResult
-from hdev_jax.verbs.opening import (
-    Effects,
-    Logs,
-    Vehicles,
-    digest,
-    digest_of_effects,
-    digest_of_vehicle,
-    known_effects,
-    log_of,
-    named,
-    sheet_of,
-    tried,
-)
+from hdev_jax.verbs.opening import Logs, Vehicles, digest, digest_of_effects, digest_of_vehicle, log_of, named, sheet_of
 from hdev_jax.verbs.result import PREDICTIVE, Result
 from hdev_jax.verbs.states import given_states
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from hdev_jax.diagnosis.candidates.own import Effects
 from hdev_jax.energy.coastdown import coast_down, is_coast_down
 from hdev_jax.energy.fitted import calibrated_on
 from hdev_jax.energy.road_load import NAMES, SHOWN_KMH, UNITS, RoadLoad, in_service, open_sheet
@@ -18,7 +19,7 @@ from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.targets import TARGETS
 from hdev_jax.verbs.energy.opening import Asked, answered, synthetic
 from hdev_jax.verbs.energy.result import EnergyResult, records
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles
+from hdev_jax.verbs.opening import Logs, Vehicles
 
 __all__ = ["roadload"]
 

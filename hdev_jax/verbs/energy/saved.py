@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects, tried
 from hdev_jax.energy.fitted import Fitted, calibrated_on, forgotten
 from hdev_jax.energy.saved import LEAST_TRIPS, Saving, circumstances, saving, trips_of
 from hdev_jax.errors import InputError
@@ -15,7 +16,7 @@ from hdev_jax.report.energy.figures import trip_intervals
 from hdev_jax.report.energy.page import Page, Section, span, table_of
 from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles, known_effects, tried
+from hdev_jax.verbs.opening import Logs, Vehicles
 
 __all__ = ["saved"]
 

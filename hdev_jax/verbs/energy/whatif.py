@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hdev_jax.diagnosis.candidates.own import Effects
 from hdev_jax.energy.change import Changed, Step, changed, idle, parse_changes
 from hdev_jax.energy.fitted import Fitted, interval
 from hdev_jax.energy.ledger import SUM
@@ -17,7 +18,7 @@ from hdev_jax.report.energy.figures import differences, label, trip_intervals
 from hdev_jax.report.energy.page import Page, Section, Table, span, table_of
 from hdev_jax.verbs.energy.opening import Asked, answered, battery_target, fitted_for, problem_for, synthetic, trusted
 from hdev_jax.verbs.energy.result import EnergyResult, records
-from hdev_jax.verbs.opening import Effects, Logs, Vehicles
+from hdev_jax.verbs.opening import Logs, Vehicles
 
 __all__ = ["whatif"]
 

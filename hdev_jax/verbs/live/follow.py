@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import Sheet, augmented_sheet
 from hdev_jax.logs.adapter import Adapter
@@ -20,7 +21,7 @@ from hdev_jax.online.live import keep, kept
 from hdev_jax.online.stream import Arrived
 from hdev_jax.verbs.live.lines import Batch, Records, batches, opened
 from hdev_jax.verbs.live.mqtt import Topic, subscribed
-from hdev_jax.verbs.opening import Effects, Vehicles, known_effects, sheet_of
+from hdev_jax.verbs.opening import Vehicles, sheet_of
 from hdev_jax.verbs.predict import sheet_digest
 
 __all__ = ["follow"]

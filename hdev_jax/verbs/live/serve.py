@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.own import known_effects
 from hdev_jax.errors import InputError
 from hdev_jax.online.service import Fleet, Journal, sheets_in
 
@@ -20,6 +21,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8000,
     watch: bool = True,
+    effects: str | Path | None = None,
 ) -> None:
     """Take rows of many vehicles over HTTP and return estimates, alarms and forecasts. Runs until it is stopped.
 
@@ -30,6 +32,7 @@ def serve(
     - `tokens`: a TOML file with a line `fleet = "SHA-256 of its token"` for each fleet. Without it there is one fleet,
       and only this machine may call.
     - `watch`: name effects of the library that a sheet lacks.
+    - `effects`: a Python file of your own effects, which are watched too and which a sheet may declare.
 
     **Raises:** `InputError`.
     """
@@ -42,7 +45,7 @@ def serve(
     if tokens is None and host not in HERE:
         raise InputError(f"--host {host}: other machines may call only where --tokens says which fleets there are")
     digests = None if tokens is None else _tokens(Path(tokens))
-    sheet_for = sheets_in(sheets)
+    sheet_for = sheets_in(sheets) if effects is None else sheets_in(sheets, known_effects(effects))
     with _bound(host, port) as at:  # before the journal: a second start by mistake must not take it from the first
         fleet = Fleet(Journal(state), sheet_for, watch=watch)
         progress.step(f"http://{host}:{port}/ shows the vehicles; rows go to /v1/rows")

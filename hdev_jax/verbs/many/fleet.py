@@ -14,10 +14,12 @@ import jax
 import numpy as np
 
 from hdev_jax import progress
+from hdev_jax.diagnosis.candidates.own import known_effects
 from hdev_jax.errors import InputError
 from hdev_jax.inference.sheet import read_sheet
 from hdev_jax.logs.presets import PRESETS, is_preset
 from hdev_jax.many import FleetResult, Source, Workers, computed, fleet_result, looking_again, sources, vehicle_record
+from hdev_jax.physics import Effect
 from hdev_jax.report.many import fleet_page, fleet_text
 from hdev_jax.rundir import Run, atomic_file, open_run
 from hdev_jax.targets import TARGETS
@@ -36,6 +38,7 @@ def fleet(
     price: float | None = None,
     fdr: float = 0.05,
     *,
+    effects: str | Path | None = None,
     out: str | Path,
     trust: bool = False,
     workers: int = 1,
@@ -50,6 +53,7 @@ def fleet(
     - `vehicles`: one sheet for all, a folder of sheets NAME.toml, or a CSV table with the columns `vehicle`, `sheet`
       and, if wanted, `type`.
     - `price` of a kWh. `fdr`: the highest adjusted p-value, within each vehicle and over the fleet.
+    - `effects`: a Python file of your own effects, which the search tries and a sheet may declare.
     - `trust`: search even where a unit or a sign seems to be wrong.
     - `workers`: processes on this machine; or `scheduler`: the address of a Dask cluster. Both need the extra `fleet`.
     - `out`: a folder for the page, `fleet.json`, tables and `vehicles/NAME.json`; an interrupted run resumes from it.
@@ -70,18 +74,20 @@ def fleet(
     rules = None if adapter is None or is_preset(adapter) else Path(adapter).resolve()
     if rules is not None and not rules.is_file():
         raise InputError(f"--adapter {adapter}: no such file, and no preset; there are {', '.join(PRESETS)}")
+    library = known_effects(effects)
     seed = seed_of(seed)
     given = [logs] if isinstance(logs, str | Path) else list(logs)
     each, notes = sources(given, vehicles)
     config = {
         "verb": "fleet", "logs": [str(p) for p in given], "vehicles": str(vehicles), "count": len(each),
-        "vehicles_sha256": _fingerprint(each), "adapter": None if adapter is None else str(adapter),
+        "vehicles_sha256": _fingerprint(each, library), "adapter": None if adapter is None else str(adapter),
         "adapter_sha256": None if rules is None else digest(rules), "target": target, "price": price,
+        **({} if effects is None else {"effects": str(effects), "effects_sha256": digest(Path(effects))}),
         "fdr": fdr, **({"trust": True} if trust else {}), "seed": seed, "x64": bool(jax.config.read("jax_enable_x64")),
     }  # fmt: skip
     common = {
         "adapter": None if adapter is None else str(rules or adapter), "target": target, "fdr": fdr, "seed": seed,
-        "trust": trust,
+        "trust": trust, "effects": None if effects is None else str(Path(effects).resolve()),
     }  # fmt: skip
     with open_run(out, config, seed=seed) as run:
         if run.done:
@@ -92,7 +98,7 @@ def fleet(
             raise InputError(f"none of {len(records)} vehicles could be used; the first: {first['message']}")
         progress.step("what the vehicles tell together")
         again = looking_again(_tasks(each, common), Workers(workers, scheduler), progress.step)
-        result = fleet_result(records, fdr=fdr, seed=seed, price=price, notes=notes, again=again)
+        result = fleet_result(records, fdr=fdr, seed=seed, price=price, notes=notes, again=again, library=library)
         progress.step("writing the report")
         run.place(run.kept("fleet"))
         answer = _answer(result, _command(config, out), price)
@@ -100,21 +106,21 @@ def fleet(
     return answer
 
 
-def _fingerprint(each: Sequence[Source]) -> str:
+def _fingerprint(each: Sequence[Source], library: Mapping[str, type[Effect]]) -> str:
     """Of names, sheets and files, the files by size and time: reading all of them twice is too much for a fleet."""
     sha = hashlib.sha256()
     sheets: dict[str, str] = {}
     for s in each:
         stamps = [(f, (stat := os.stat(f)).st_size, stat.st_mtime_ns) for f in s.files]
         if s.sheet is not None and s.sheet not in sheets:
-            sheets[s.sheet] = digest(Path(s.sheet)) + _map_digest(s.sheet)
+            sheets[s.sheet] = digest(Path(s.sheet)) + _map_digest(s.sheet, library)
         sha.update(repr((s.name, stamps, s.kind, s.missing, sheets.get(s.sheet or ""))).encode())
     return sha.hexdigest()
 
 
-def _map_digest(sheet: str) -> str:
+def _map_digest(sheet: str, library: Mapping[str, type[Effect]]) -> str:
     try:
-        path = read_sheet(sheet).map_path
+        path = read_sheet(sheet, library=library).map_path
     except InputError:  # said of each vehicle that has it
         return ""
     return "" if path is None else digest(path)
@@ -152,8 +158,8 @@ def _tasks(each: Sequence[Source], common: Mapping[str, Any]) -> list[dict[str, 
 
 def _command(config: Mapping[str, Any], out: str | Path) -> str:
     parts = ["hdev", "fleet", *config["logs"], "--vehicles", config["vehicles"]]
-    for option in ("adapter", "target", "price"):
-        if config[option] is not None:
+    for option in ("adapter", "target", "effects", "price"):
+        if config.get(option) is not None:
             parts += [f"--{option}", str(config[option])]
     parts += ["--fdr", str(config["fdr"])] if config["fdr"] != 0.05 else []
     parts += ["--trust"] if config.get("trust") else []

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
+from hdev_jax.diagnosis.candidates.own import Effects, known_effects
 from hdev_jax.errors import InputError
 from hdev_jax.export.exported import Exported
 from hdev_jax.export.kernel import Kernel, kernel_of
@@ -15,7 +16,7 @@ from hdev_jax.export.programs import onnx, stablehlo
 from hdev_jax.export.simulators import fastsim, sumo
 from hdev_jax.rundir import atomic_file
 from hdev_jax.verbs.arguments import names_of
-from hdev_jax.verbs.opening import Effects, Vehicles, known_effects, sheet_of
+from hdev_jax.verbs.opening import Vehicles, sheet_of
 
 __all__ = ["FORMATS", "SCHEMA", "export"]
 
