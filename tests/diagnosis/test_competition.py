@@ -22,7 +22,7 @@ from hdev_jax.diagnosis.competition.needed import backward, classes
 from hdev_jax.diagnosis.competition.refit import _crossed, as_reported, fitted, joined, refit, widened, without
 from hdev_jax.diagnosis.competition.state import Found, State
 from hdev_jax.diagnosis.diagnose import training_of
-from hdev_jax.diagnosis.gates.rejection import Kind
+from hdev_jax.diagnosis.gates.rejection import Kind, Rejection
 from hdev_jax.diagnosis.scores.evidence import Score
 from hdev_jax.diagnosis.scores.scores import score_all
 from hdev_jax.diagnosis.training import Training
@@ -198,6 +198,23 @@ def test_the_competition_ends_with_what_is_there(two):
     assert {v.id for v in state.verdicts} == {*LIKELY} - {*PLANTED}
     assert {v.rejection.kind for v in state.verdicts} <= {*Kind} - {Kind.FOUND, Kind.DECLARED}
     assert [f.alike for f in classes(score_all(rows, state.fit), state)] == [f.alike for f in state.found]
+
+
+def test_what_takes_no_place_any_more_is_no_rival_of_another(two):
+    """In resampled sets of trips stronger ones come first: the other waits, unless they were taken out twice."""
+    problem, rows = two
+    state = declared(rows, problem)
+    best = round_of(rows, state).scores.best
+    other = min(PLANTED, key=lambda k: best[k].gain)
+    round_ = round_of(rows, state)
+    assert forward(round_, only={other}) is None
+    assert round_.reasons[other].kind is Kind.UNSTABLE
+    twice = Rejection(Kind.SUPERFLUOUS, {"beside": other, "times": 2})
+    out = replace(state, removed=dict.fromkeys({*best} - {other}, twice))
+    round_ = round_of(rows, out)
+    new = forward(round_, only={other})
+    assert new is not None, round_.reasons
+    assert new.ids == (other,)
 
 
 # --- a joint refit ---------------------------------------------------------------------------------------------------
