@@ -56,7 +56,7 @@ def effects_map(records: Sequence[Record], effects: Sequence[Mapping[str, Any]])
             s = scan.get(forms.get(id_, "")) or max(own, key=lambda s: abs(_z(s)), default=None)
             if s is not None:
                 z[i, j] = _z(s)
-    fig = figure(WIDTH, 2.0 + 0.17 * len(there))
+    fig = figure(WIDTH, 2.0 + max(0.17 * len(there), 1.3))  # the label of the colours has to fit
     ax = fig.add_subplot()
     colours = colormaps["RdBu_r"].with_extremes(bad="0.8")
     image = ax.imshow(z, cmap=colours, vmin=-STRONGEST, vmax=STRONGEST, aspect="auto", interpolation="nearest")
