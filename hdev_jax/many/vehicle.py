@@ -1,5 +1,6 @@
 """One vehicle of a fleet: read, calibrated and diagnosed, with its energy by cause, as plain values."""
 
+import hashlib
 import math
 import time
 import tomllib
@@ -36,7 +37,8 @@ def vehicle_record(task: Mapping[str, Any]) -> dict[str, Any]:
     """The diagnosis of one vehicle's log, as plain values for JSON. It raises nothing: a bad log gives a message.
 
     **Arguments:** `task`, plain values: `name`, `files`, `whole`, `sheet`, `kind` and `missing` of its `Source`;
-    `adapter`, `target`, `fdr`, `seed`, `trust`; `effects`, if given, a file of a user's own.
+    `adapter`, `target`, `fdr`, `seed`, `trust`; if given, `effects`, a file of a user's own,
+    and its `effects_sha256`.
 
     **Returns:** `name`, `type`, `status`, `message`, `seconds`. The status is "done", "suspect" (a unit or a sign is in
     doubt, and no effect was searched), "refused" (the input is at fault) or "failed" (a fault of this program). A
@@ -90,11 +92,16 @@ def scanned_again(task: Mapping[str, Any]) -> dict[str, Any]:
 def _library(task: Mapping[str, Any]) -> Mapping[str, type[Effect]]:
     """The library, with the user's own effects."""
     own = task.get("effects")
-    return LIBRARY if own is None else _with_own(own, Path(own).stat().st_mtime_ns)
+    return LIBRARY if own is None else _with_own(own, task["effects_sha256"])
 
 
-@cache  # the same classes for all vehicles, which share what was compiled with them; read again where it was changed
-def _with_own(file: str, _changed: int) -> Mapping[str, type[Effect]]:
+@cache  # the same classes for all vehicles, which share what was compiled with them
+def _with_own(file: str, sha256: str) -> Mapping[str, type[Effect]]:
+    path = Path(file)
+    if not path.is_file():
+        raise InputError(f"--effects {file}: not on this machine; every worker needs the file at this path")
+    if hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
+        raise InputError(f"--effects {file}: not the file that the command started with; every worker needs that one")
     return known_effects(file)
 
 

@@ -14,7 +14,6 @@ from hdev_jax.online.live import Live
 from hdev_jax.online.state import Now, State, start
 from hdev_jax.online.stream import Arrived, Stream, channels_of, target_in
 from hdev_jax.online.watch import Alarm, Watch
-from hdev_jax.physics import LIBRARY
 
 __all__ = ["Followed", "plain", "plain_alarm"]
 
@@ -52,10 +51,9 @@ class Followed:
         """The state, once it is known which columns rows have. Raises `InputError`."""
         self.columns = sorted(names)
         self.target = target_in(self.columns, self.target)
-        key = (augmented_sheet(self.sheet, {}, {}), tuple(self.columns), self.target, self.watching)
-        if self.sheet.library is not LIBRARY:
-            state, self.watch, self.notes = self._begun()
-        elif key in _BEGUN:
+        known = tuple(self.sheet.library.values())
+        key = (augmented_sheet(self.sheet, {}, {}), tuple(self.columns), self.target, self.watching, known)
+        if key in _BEGUN:
             state, self.watch, self.notes = _BEGUN[key]
         else:
             if len(_BEGUN) >= MOST_BEGUN:
@@ -69,7 +67,7 @@ class Followed:
 
     def _begun(self) -> tuple[State, Watch | None, list[str]]:
         """The state before the first row, what is watched beside it, and notes."""
-        channels = channels_of(self.columns)
+        channels = channels_of(self.columns, self.sheet.library)
         state, notes = start(self.sheet, channels, self.target)  # type: ignore[arg-type]
         watch = Watch.of(state, self.sheet.library) if self.watching else None
         if watch is not None:

@@ -15,7 +15,7 @@ from hdev_jax.logs.log import KINEMATICS, MEASURED
 from hdev_jax.logs.readers.raw import Raw
 from hdev_jax.online.form import NEEDED, Form
 from hdev_jax.online.running import Running, running_channels
-from hdev_jax.physics import LIBRARY
+from hdev_jax.physics import LIBRARY, Effect
 from hdev_jax.targets import TARGETS, target_of
 from hdev_jax.units import J_PER_WH
 
@@ -239,9 +239,9 @@ class Arrived:
         return Arrived(trip, np.array([at[c] if c in at else row.get(c, np.nan) for c in form.columns], dtype=float))
 
 
-def channels_of(names: Iterable[str]) -> tuple[str, ...]:
+def channels_of(names: Iterable[str], library: Mapping[str, type[Effect]] = LIBRARY) -> tuple[str, ...]:
     """The columns of rows that the kernel or any effect of the library reads."""
-    known = {*READ, *(c for e in LIBRARY.values() for c in e.reads())}
+    known = {*READ, *(c for e in library.values() for c in e.reads())}
     return tuple(sorted({*names} & known - {*NEEDED, *KINEMATICS, *MEASURED} | {*running_channels(names)}))
 
 

@@ -61,7 +61,9 @@ def split_options(verb: argparse.ArgumentParser) -> None:
 
 def effects_option(verb: argparse.ArgumentParser) -> None:
     """A file of a user's own effects."""
-    file_argument(verb, "--effects", "FILE.py", "effects of your own, which the search tries and a sheet may declare")
+    file_argument(
+        verb, "--effects", "FILE.py", "effects of your own, which are searched or watched for and a sheet may declare"
+    )
 
 
 def out_options(verb: argparse.ArgumentParser) -> None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import hashlib
 import importlib.util
 import io
 import json
@@ -19,6 +20,7 @@ from hdev_jax import cli, compiling
 from hdev_jax.fleet import synthetic_log
 from hdev_jax.many import Workers, computed, vehicle_record
 from hdev_jax.many import workers as workers_module
+from hdev_jax.many.vehicle import scanned_again
 from hdev_jax.verbs.many import fleet as verb_module
 
 SEARCHED = ("auxiliary_power", "headwind")
@@ -267,3 +269,21 @@ def test_effects_of_ones_own_are_searched_declared_and_pooled(logs, tmp_path):
     assert (pooled["type"], pooled["named_in"], pooled["unit"]) == ("truck", 4, "W/s")
     assert abs(pooled["value"] - 100.0) < 4 * pooled["sd"] < 40.0
     assert "--effects" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_worker_with_another_file_of_effects_or_none_says_so(logs, tmp_path):
+    """Also where a type's vehicles are scanned again with an effect of one's own in their models."""
+    mine = tmp_path / "mine.py"
+    mine.write_text(OWN)
+    task = {
+        "name": "V0", "files": [str(logs / "logs" / "V0.csv")], "whole": False, "sheet": str(logs / "truck.toml"),
+        "kind": "", "missing": "", "adapter": None, "target": None, "fdr": 0.05, "seed": 0, "trust": False,
+        "effects": str(mine), "effects_sha256": hashlib.sha256(mine.read_bytes()).hexdigest(),
+    }  # fmt: skip
+    with library_of(SEARCHED):
+        again = scanned_again({**task, "beside": {"slow_drift": {"w_per_s": [10.0, 5.0]}}})
+    assert (again["message"], "slow_drift" in {s["id"] for s in again["scan"].values()}) == ("", False)
+    other = vehicle_record({**task, "effects_sha256": "0"})
+    assert (other["status"], other["message"].partition(": ")[2][:8]) == ("refused", "not the ")
+    gone = vehicle_record({**task, "effects": str(tmp_path / "gone.py")})
+    assert (gone["status"], gone["message"].partition(": ")[2][:11]) == ("refused", "not on this")

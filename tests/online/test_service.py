@@ -412,8 +412,9 @@ def test_brakes_that_drag_let_go_on_the_rest_of_the_trip(tmp_path, sheets, rows)
 
 def test_a_sheet_may_declare_an_effect_of_ones_own(sheets, rows, tmp_path):
     class Lamp(Effect):
-        """A load of so much all the time."""
+        """A load of so much while it is lit."""
 
+        needs: ClassVar[tuple[str, ...]] = ("lit",)
         id: ClassVar[str] = "lamp"
         label: ClassVar[str] = "lamp"
         stage: ClassVar[Stage] = "battery"
@@ -422,7 +423,7 @@ def test_a_sheet_may_declare_an_effect_of_ones_own(sheets, rows, tmp_path):
         power_w: Any
 
         def power(self, row: Row, car: Car, point: Point) -> Any:
-            return self.power_w
+            return self.power_w * row.channels["lit"]
 
     (tmp_path / "own").mkdir()
     default = (sheets / "default.toml").read_text()
@@ -430,12 +431,18 @@ def test_a_sheet_may_declare_an_effect_of_ones_own(sheets, rows, tmp_path):
     (tmp_path / "own" / "lit.toml").write_text(f"{default}\n[effects.lamp]\npower_w = 36000.0\n")
     with pytest.raises(InputError, match="lamp"):
         sheets_in(tmp_path / "own")
-    client = TestClient(
-        app_of(Fleet(Journal(":memory:"), sheets_in(tmp_path / "own", library([Lamp])), watch=False), TOKENS)
-    )
+    sheet_for, place = sheets_in(tmp_path / "own", library([Lamp])), str(tmp_path / "state.sqlite")
+    fleet = Fleet(Journal(place), sheet_for, watch=False, effects_sha256="1")
+    client = TestClient(app_of(fleet, TOKENS))
     for vehicle in ("plain", "lit"):
-        sent = client.post("/v1/rows", json={"rows": named(rows[:20], vehicle)}, headers=A)
+        sent = client.post("/v1/rows", json={"rows": named([{**r, "lit": 1.0} for r in rows[:20]], vehicle)}, headers=A)
         assert sent.status_code == 200, sent.text
     # of the first row: no error before it is known, which the next one's prediction takes up
     seen = {v: client.get(f"/v1/vehicles/{v}", headers=A).json()["recent"][0]["predicted"] for v in ("plain", "lit")}
     assert seen["lit"] - seen["plain"] == pytest.approx(36000.0 * rows[0]["duration_s"] / 3600.0)
+    of = fleet._of(sheet_for("a", "lit"))
+    fleet.close()
+    for sha256 in ("1", "2"):  # a state that is kept is not one of another effect of this id
+        again = Fleet(Journal(place), sheet_for, watch=False, effects_sha256=sha256)
+        assert (again._of(sheet_for("a", "lit")) == of) is (sha256 == "1")
+        again.close()

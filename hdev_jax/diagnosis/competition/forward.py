@@ -31,9 +31,9 @@ class Round:
     tested: list[str] = field(default_factory=list)
 
     def asked(self, s: Score) -> Asked:
-        """What the gates look at for a candidate of this round: what cannot be added is no rival of it."""
-        out = frozenset((*self.reasons, *self.state.refused, *self.state.barred))
-        return Asked(s, self.scores, self.training.trip, self.rng, out)
+        """What the gates look at for a candidate of this round."""
+        out = frozenset((*self.reasons, *self.state.refused))
+        return Asked(s, self.scores, self.training.trip, self.rng, out, self.state.barred)
 
     def passes(self, s: Score) -> bool:
         """Whether a candidate passes the gates of its score."""

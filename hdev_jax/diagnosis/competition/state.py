@@ -82,7 +82,7 @@ class State:
 
     @property
     def barred(self) -> frozenset[str]:
-        """What takes no place any more: taken out twice, or exchanged for another."""
+        """What takes no place any more: removed twice, exchanged for another, or removed at the end."""
         return frozenset(id_ for id_, why in self.removed.items() if why.numbers.get("times", 2) > 1)
 
     @property

@@ -28,13 +28,15 @@ RESAMPLES = 100  # sets of clusters: a share to ± 5 points
 
 @dataclass(frozen=True)
 class Asked:
-    """What a gate looks at: a score among all `scores`, the trips' ids by row, what is out already, and draws."""
+    """What a gate looks at: a score among all `scores`, the trips' ids by row, draws, what is `out` in this round, and
+    what is `barred`: takes no place any more."""
 
     score: Score
     scores: Scores
     trip: np.ndarray
     rng: np.random.Generator
     out: frozenset[str] = frozenset()
+    barred: frozenset[str] = frozenset()
 
     @property
     def unit(self) -> str:
@@ -195,13 +197,14 @@ def alike(
 
 def _stability(a: Asked) -> float:
     """`Asked.stability`. Its rivals are the candidates with p at most 0.01 before any correction that no joint refit or
-    placebo has turned down."""
+    placebo has turned down, without what takes no place any more, unless it is of its class."""
     scores, chosen = a.scores, a.score
     settings, g = scores.settings, scores.white.count
     names = {chosen.candidate.id, *of_class(a)[:MOST_IN_CLASS]}
+    out = {*scores.absorbed_by, *a.out, *(a.barred - names)}
     rivals = [
         s for s in scores.best.values()
-        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in {*scores.absorbed_by, *a.out}
+        if s.plain == chosen.plain and s.p <= 0.01 and s.candidate.id not in out
         and plausible(s, settings) and _worth_naming(replace(a, score=s)) is None
     ]  # fmt: skip
     rivals = [chosen, *sorted((s for s in rivals if s is not chosen), key=lambda s: -s.gain)[:7]]

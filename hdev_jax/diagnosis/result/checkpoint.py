@@ -19,6 +19,7 @@ from hdev_jax.physics import Vehicle
 
 __all__ = ["from_plain", "to_plain"]
 
+_TAG = "class:"  # which no id of an effect can be
 # What a state is made of. A vehicle is not among it, nor an effect: they are made again.
 _KEPT: dict[str, type] = {
     c.__name__: c
@@ -37,7 +38,7 @@ def to_plain(state: State) -> dict[str, Any]:
 def _plain(x: Any) -> Any:
     if _KEPT.get(type(x).__name__) is type(x):
         kept = {f.name: _plain(getattr(x, f.name)) for f in fields(x) if f.init and f.name != "vehicle"}
-        return {"class": type(x).__name__, **kept}
+        return {_TAG: type(x).__name__, **kept}
     if isinstance(x, Mapping):
         return {k: _plain(v) for k, v in x.items()}
     if isinstance(x, tuple | list):
@@ -54,7 +55,7 @@ def from_plain(plain: Mapping[str, Any], declared: Vehicle, training: Training) 
         if not isinstance(x, Mapping):
             return x
         values = {k: back(v) for k, v in x.items()}
-        name = values.pop("class", None)
+        name = values.pop(_TAG, None)
         if name == "Candidate":
             values["effect"] = training.library[values["effect"]]
         elif name == "Rejection":

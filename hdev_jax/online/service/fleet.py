@@ -31,9 +31,12 @@ class Fleet:
     from the journal ends in the same state.
     """
 
-    def __init__(self, journal: Journal, sheet_for: Callable[[str, str], Sheet], *, watch: bool = True):
+    def __init__(
+        self, journal: Journal, sheet_for: Callable[[str, str], Sheet], *, watch: bool = True,
+        effects_sha256: str | None = None,
+    ):  # fmt: skip
         self.journal: Journal = journal
-        self._sheet_for, self._watch = sheet_for, watch
+        self._sheet_for, self._watch, self._effects = sheet_for, watch, effects_sha256
         self._vehicles: dict[Key, Tracked] = {}
         self._names: dict[str, set[str]] = {}
         for name, vehicle in journal.vehicles():
@@ -125,7 +128,8 @@ class Fleet:
 
     def _of(self, sheet: Sheet) -> list[Any]:
         """What a state is of."""
-        return [augmented_sheet(sheet, {}, {}), self._watch, __version__]
+        own = [] if self._effects is None else [self._effects]
+        return [augmented_sheet(sheet, {}, {}), self._watch, __version__, *own]
 
     # --- kept --------------------------------------------------------------------------------------------------------
 

@@ -47,7 +47,9 @@ def fleet_pieces(result: FleetResult) -> list[tuple[str, bool]]:
     if not changed and not differ:
         asked = {"for_a_change": "changed", "against_type": "differs from its type"}
         none = " or ".join(what for k, what in asked.items() if s["tested"][k])
-        pieces.append((f"no vehicle {none}" if none else "changes were not looked for", True))
+        pieces.append((f"no vehicle {none}" if none else "", True))
+        if not s["tested"]["for_a_change"]:
+            pieces.append((", and changes were not looked for" if none else "changes were not looked for", not none))
     if found:
         shown = list(dict.fromkeys(f"{names.effect(e['id'])} ({e['type']})" for e in found))
         pieces += [("; shown by a type's vehicles together: ", False), (_few(shown), True)]

@@ -8,6 +8,7 @@ from hdev_jax import progress
 from hdev_jax.diagnosis.candidates.own import known_effects
 from hdev_jax.errors import InputError
 from hdev_jax.online.service import Fleet, Journal, sheets_in
+from hdev_jax.verbs.opening import digest_of_effects
 
 __all__ = ["serve"]
 
@@ -47,7 +48,7 @@ def serve(
     digests = None if tokens is None else _tokens(Path(tokens))
     sheet_for = sheets_in(sheets) if effects is None else sheets_in(sheets, known_effects(effects))
     with _bound(host, port) as at:  # before the journal: a second start by mistake must not take it from the first
-        fleet = Fleet(Journal(state), sheet_for, watch=watch)
+        fleet = Fleet(Journal(state), sheet_for, watch=watch, effects_sha256=digest_of_effects(effects))
         progress.step(f"http://{host}:{port}/ shows the vehicles; rows go to /v1/rows")
         try:
             app = app_of(fleet, digests)  # a page that is open listens for ever: it is cut off

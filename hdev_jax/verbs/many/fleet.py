@@ -74,7 +74,9 @@ def fleet(
     rules = None if adapter is None or is_preset(adapter) else Path(adapter).resolve()
     if rules is not None and not rules.is_file():
         raise InputError(f"--adapter {adapter}: no such file, and no preset; there are {', '.join(PRESETS)}")
-    library = known_effects(effects)
+    if not isinstance(effects, str | Path | None):
+        raise InputError("effects: a Python file is expected; workers cannot be sent classes")
+    library, own = known_effects(effects), None if effects is None else digest(Path(effects))
     seed = seed_of(seed)
     given = [logs] if isinstance(logs, str | Path) else list(logs)
     each, notes = sources(given, vehicles)
@@ -82,12 +84,13 @@ def fleet(
         "verb": "fleet", "logs": [str(p) for p in given], "vehicles": str(vehicles), "count": len(each),
         "vehicles_sha256": _fingerprint(each, library), "adapter": None if adapter is None else str(adapter),
         "adapter_sha256": None if rules is None else digest(rules), "target": target, "price": price,
-        **({} if effects is None else {"effects": str(effects), "effects_sha256": digest(Path(effects))}),
+        **({} if effects is None else {"effects": str(effects), "effects_sha256": own}),
         "fdr": fdr, **({"trust": True} if trust else {}), "seed": seed, "x64": bool(jax.config.read("jax_enable_x64")),
     }  # fmt: skip
     common = {
         "adapter": None if adapter is None else str(rules or adapter), "target": target, "fdr": fdr, "seed": seed,
         "trust": trust, "effects": None if effects is None else str(Path(effects).resolve()),
+        "effects_sha256": own,
     }  # fmt: skip
     with open_run(out, config, seed=seed) as run:
         if run.done:
