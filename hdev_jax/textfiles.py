@@ -1,12 +1,18 @@
-"""Reading a text file, or a TOML one, with one line for whatever is wrong with it."""
+"""Reading a text file, or a TOML one, with one line for whatever is wrong with it; a file's digest."""
 
+import hashlib
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from hdev_jax.errors import InputError
 
-__all__ = ["read_text", "read_toml"]
+__all__ = ["digest", "read_text", "read_toml"]
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file; empty where there is none."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def read_text(path: Path, what: str) -> str:

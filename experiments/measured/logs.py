@@ -27,7 +27,7 @@ from experiments.measured import page as pages
 from experiments.measured.road_load import PAIRS
 from experiments.measured.withheld import WITHHELD, compare_logs, write_adapter
 from experiments.runner.store import sources_of
-from hdev_jax.verbs.opening import digest
+from hdev_jax.textfiles import digest
 from hdev_jax.verbs.predict import correlated_pairs
 
 __all__ = ["Job", "jobs", "kept", "main"]

@@ -1,6 +1,5 @@
 """One vehicle of a fleet: read, calibrated and diagnosed, with its energy by cause, as plain values."""
 
-import hashlib
 import math
 import time
 import tomllib
@@ -27,6 +26,7 @@ from hdev_jax.many.scan import scan_beside, scan_of
 from hdev_jax.physics import LIBRARY, Effect
 from hdev_jax.problem import Problem, Split, implausible, prepare, split_trips, without_harmful_slope
 from hdev_jax.targets import TARGETS
+from hdev_jax.textfiles import digest
 
 __all__ = ["plain", "scanned_again", "vehicle_record"]
 
@@ -97,10 +97,9 @@ def _library(task: Mapping[str, Any]) -> Mapping[str, type[Effect]]:
 
 @cache  # the same classes for all vehicles, which share what was compiled with them
 def _with_own(file: str, sha256: str) -> Mapping[str, type[Effect]]:
-    path = Path(file)
-    if not path.is_file():
+    if not (there := digest(Path(file))):
         raise InputError(f"--effects {file}: not on this machine; every worker needs the file at this path")
-    if hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
+    if there != sha256:
         raise InputError(f"--effects {file}: not the file that the command started with; every worker needs that one")
     return known_effects(file)
 

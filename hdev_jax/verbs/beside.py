@@ -13,7 +13,7 @@ from hdev_jax.errors import InputError
 from hdev_jax.inference import Spread
 from hdev_jax.problem import Problem
 from hdev_jax.targets import TARGETS
-from hdev_jax.verbs.opening import digest
+from hdev_jax.textfiles import digest
 from hdev_jax.verbs.result import PREDICTIVE
 
 __all__ = ["beside_sheet", "covariance_of"]

@@ -20,11 +20,12 @@ from hdev_jax.logs import Log, log_from_frame, read_log
 from hdev_jax.physics import Effect
 from hdev_jax.problem import Problem, Split, prepare, split_trips, without_harmful_slope
 from hdev_jax.rundir import Run
+from hdev_jax.textfiles import digest
 from hdev_jax.verbs.arguments import names_of, seed_of
 from hdev_jax.verbs.result import Result
 
 __all__ = [
-    "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest", "digest_of_effects",
+    "Logs", "Opening", "Vehicles", "chosen_effects", "command_line", "digest_of_effects",
     "digest_of_vehicle", "log_of", "named", "opened", "sheet_of",
 ]  # fmt: skip
 
@@ -75,10 +76,6 @@ def chosen_effects(
     if not chosen:
         raise InputError("--only and --exclude leave no candidate")
     return chosen
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def named(given: Any) -> str:

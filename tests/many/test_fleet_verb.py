@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from planted import library_of
+from user_effect import USER_EFFECT
 
 from hdev_jax import cli, compiling
 from hdev_jax.fleet import synthetic_log
@@ -83,26 +84,7 @@ def same(a, b, where=""):
         assert a == b, where
 
 
-# What it adds is linear in the time since the start of the trip, which nothing in the library is.
-OWN = '''
-from typing import Any, ClassVar
-
-from hdev_jax.physics import Effect, Size
-
-
-class SlowDrift(Effect):
-    """A load that grows with the time since the start."""
-
-    id: ClassVar = "slow_drift"
-    label: ClassVar = "slow drift"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "k·t"
-    parameters: ClassVar = (Size("w_per_s", "W/s", 0.0, 1.0, 0.0, 200.0),)
-    w_per_s: Any
-
-    def power(self, row, car, point):
-        return self.w_per_s * row.time_s
-'''
+OWN = USER_EFFECT.replace("0.0, 100.0)", "0.0, 200.0)")
 
 
 def read(out: Path) -> dict:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from user_effect import USER_EFFECT
 
 from hdev_jax import cli
 from hdev_jax.diagnosis.candidates.own import known_effects
@@ -35,26 +36,6 @@ COLUMNS = [
     "vehicle_id", "trip_id", "time_s", "duration_s", "distance_m", "speed_start_mps", "speed_end_mps", "mass_kg",
     "grade_rad", "altitude_m", "ambient_temp_c", "wind_speed_mps", "wind_from_rad", "heading_rad", "gear", "energy_wh",
 ]  # fmt: skip
-
-# A user's own effect: what it adds is linear in the time since the start, which nothing in the library is.
-USER_EFFECT = '''
-from typing import Any, ClassVar
-
-from hdev_jax.physics import Choice, Effect, Shape, Size, Switch
-
-
-class SlowDrift(Effect):
-    """A load that grows with the time since the start."""
-
-    id: ClassVar = "slow_drift"
-    stage: ClassVar = "battery"
-    equation: ClassVar = "k·t"
-    parameters: ClassVar = (Size("w_per_s", "W/s", 0.0, 1.0, 0.0, 100.0),)
-    w_per_s: Any
-
-    def power(self, row, car, point):
-        return self.w_per_s * row.time_s
-'''
 
 
 def hdev(*argv: object) -> tuple[int, str]:

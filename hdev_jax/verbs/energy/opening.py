@@ -18,10 +18,11 @@ from hdev_jax.logs import Log
 from hdev_jax.problem import Problem, implausible, prepare
 from hdev_jax.rundir import open_run
 from hdev_jax.targets import TARGETS
+from hdev_jax.textfiles import digest
 from hdev_jax.verbs.arguments import seed_of
 from hdev_jax.verbs.beside import beside_sheet, covariance_of
 from hdev_jax.verbs.energy.result import EnergyResult
-from hdev_jax.verbs.opening import Logs, Vehicles, digest, digest_of_effects, digest_of_vehicle, log_of, named, sheet_of
+from hdev_jax.verbs.opening import Logs, Vehicles, digest_of_effects, digest_of_vehicle, log_of, named, sheet_of
 from hdev_jax.verbs.result import PREDICTIVE, Result
 from hdev_jax.verbs.states import given_states
 

@@ -23,9 +23,9 @@ from hdev_jax.physics import Effect
 from hdev_jax.report.many import fleet_page, fleet_text
 from hdev_jax.rundir import Run, atomic_file, open_run
 from hdev_jax.targets import TARGETS
+from hdev_jax.textfiles import digest
 from hdev_jax.verbs.arguments import seed_of
 from hdev_jax.verbs.energy.result import EnergyResult
-from hdev_jax.verbs.opening import digest
 
 __all__ = ["fleet"]
 
